@@ -331,7 +331,7 @@ BAD = {
     ),
     "one condition": (nothing, [*TRAIN, "{recordings}", "--conditions", "all"], ["--conditions", "one-condition"]),
     "unknown conditions": (nothing, [*TRAIN, "{recordings}", "--conditions", "colour"], ["conditions", "colour"]),
-    "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["window_ms"]),
+    "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["--window-ms: expected"]),
     "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
     "unknown parameter": (nothing, [*TRAIN, "{recordings}", "--parameters", "wheels=3"], ["cartpole", "wheels"]),
     "a parameter called name": (nothing, [*TRAIN, "{recordings}", "--parameters", "name=3"], ["cartpole", "'name'"]),
@@ -363,12 +363,12 @@ BAD = {
     "a minute that is none": (
         nothing,
         ["evaluate", "{policies}", "--recordings", "{recordings}", "--at-min", "nan"],
-        ["at_min"],
+        ["--at-min: expected"],
     ),
     "a minute before the first recording": (
         nothing,
         ["evaluate", "{policies}", "--recordings", "{recordings}", "--at-min", "-20"],
-        ["at_min", "0 min", "-20"],
+        ["--at-min: expected", "0 min", "-20"],
     ),
     "a finding of another name": (
         nothing,
@@ -569,7 +569,8 @@ def test_inspect_that_can_read_none_says_nothing_of_others(tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    ("options", "name"), [(["--window-ms", "10", "2"], "window_ms"), (["--burst-threshold", "7"], "burst_threshold")]
+    ("options", "name"),
+    [(["--window-ms", "10", "2"], "--window-ms"), (["--burst-threshold", "7"], "--burst-threshold")],
 )
 def test_inspect_refuses_its_options_before_the_files(
     options: list[str], name: str, recordings: Path, capsys: pytest.CaptureFixture[str]
@@ -578,6 +579,36 @@ def test_inspect_refuses_its_options_before_the_files(
     said = capsys.readouterr()
     assert said.out == "" and len(said.err.splitlines()) == 1
     assert said.err.startswith(f"animat: {name}: expected ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "begins"),
+    [
+        ("train --iterations -5", "--iterations: expected a whole number from 1 to 2000000000, got -5"),
+        ("train --duration-min -1", "--duration-min: expected positive minutes, got -1"),
+        ("train --pulse-cost -1", "--pulse-cost: expected at least 0, got -1"),
+        ("train --pulse-cost 1 --mapping none", "--pulse-cost: expected 0 without neurons, got 1"),
+        ("train --pulse-cost 1 --assess 3", "--pulse-cost: expected 0 with assessments"),
+        ("train --neural-observation --mapping none", "--neural-observation: expected True only with a mapping"),
+        ("train --shadowing drawn --mapping none", "--shadowing: expected a mapping with 'drawn', got none"),
+        ("train --goal higher", "--goal: 'higher': expected avoid"),
+        ("inspect --optimum unicycle .", "--optimum: expected one of arm, cartpole"),
+        ("record --interval-min -1", "--interval-min: expected more than 0 minutes"),
+        ("reproduce --workers 0", "--workers: expected at least 1, got 0"),
+        ("reproduce --seed -1", "--seed: expected at least 0, got -1"),
+        ("live --policies 0", "--policies: expected a whole number from 1"),
+        ("train unicycle", "robot: expected one of arm"),  # No option: it has its place.
+        ("train --out policies --mapping none", "policies: cannot be written"),  # A file, not the option.
+    ],
+)
+def test_an_error_of_an_argument_begins_with_its_option(
+    arguments: str, begins: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if "--out" in arguments:
+        (tmp_path / "policies").write_text("")
+    assert main(arguments.split()) == 1
+    assert capsys.readouterr().err.startswith(f"animat: {begins}")
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,10 @@ oracle = pytest.mark.oracle
 def test_a_place_that_is_no_scheduler_s_is_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "cluster.json").write_text("{")
     for where, words in (
-        ("no.json", "cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got 'no.json'"),
+        (
+            "no.json",
+            "animat: --cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got 'no.json'",
+        ),
         (str(tmp_path / "cluster.json"), "expected a scheduler's file, got one that holds no address"),
     ):
         assert main(["study", str(TINY), "--out", str(tmp_path / "out"), "--cluster", where]) == 1

@@ -418,7 +418,7 @@ def test_what_is_stepped_elsewhere_or_has_no_neurons_is_refused() -> None:
     for asked in ({"assess": 3}, {"shadowing": "drawn"}):
         with pytest.raises(InvalidArgument, match="robot: expected one that is stepped by JAX"):
             Training(host, "9-thresholds", **asked)  # type: ignore[arg-type]
-    with pytest.raises(InvalidArgument, match="shadowing: expected True or False without neurons, got 'drawn'"):
+    with pytest.raises(InvalidArgument, match="shadowing: expected a mapping with 'drawn', got none"):
         Training("cartpole", None, shadowing="drawn")
     with pytest.raises(InvalidArgument, match="assess: expected at least 1, got 0"):
         Training("cartpole", None, assess=0)

@@ -429,7 +429,7 @@ def test_a_cost_of_frequencies_is_refused_in_a_line(tmp_path: Path, capsys: pyte
     asked = ["train", "cartpole", "--recordings", str(tmp_path / "one.nwb"), "--out", str(tmp_path / "out")]
     assert main([*asked, "--pulse-cost", "0.1", "--burst-threshold", "1"]) == 1
     assert (
-        "pulse_cost: expected conditions that say the electrodes of all their pulses, got 5 Hz"
+        "--pulse-cost: expected conditions that say the electrodes of all their pulses, got 5 Hz"
         in capsys.readouterr().err
     )
     assert not (tmp_path / "out").exists()

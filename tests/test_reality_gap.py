@@ -796,7 +796,7 @@ class TestCommand:
         policy, out = str(folder / "policies" / "p0.safetensors"), tmp_path / "session"
         for option, value in (("--bins", "0"), ("--range-hz", "-5")):
             assert main(["run", policy, option, value, "--out", str(out)]) == 1
-            assert f"{option.strip('-').replace('-', '_')}: expected" in capsys.readouterr().err.splitlines()[-1]
+            assert f"{option}: expected" in capsys.readouterr().err.splitlines()[-1]
         assert not out.exists()
 
     @pytest.mark.parametrize(
@@ -804,16 +804,17 @@ class TestCommand:
         [
             (["--episodes", "0"], "--episodes: expected at least 1"),
             (["--seed", "-1"], "--seed: expected 0 or more"),
-            (["--pulses", "0"], "pulses: expected at least 1"),
-            (["--pause-s", "-1"], "pause_s: expected a finite number from 0"),
-            (["--warm-up", "-1"], "warm_up: expected a whole number from 0 to 100, got -1"),
-            (["--warm-up", "101"], "warm_up: expected a whole number from 0 to 100, got 101"),
-            (["--patience-s", "nan"], "patience_s: expected a finite number from 0"),
-            (["--patience-s", "0"], "patience_s: expected above 0 s"),
-            (["--budget-pulses", "-1"], "budget.pulses: expected 0 or more"),
-            (["--at-min", "nan"], "at_min"),
-            (["--at-min", "-1"], "at_min"),
-            (["--bins", "0"], "bins"),
+            (["--culture-seed", "-1"], "--culture-seed: expected 0 or more, got -1"),
+            (["--pulses", "0"], "--pulses: expected at least 1"),
+            (["--pause-s", "-1"], "--pause-s: expected a finite number from 0"),
+            (["--warm-up", "-1"], "--warm-up: expected a whole number from 0 to 100, got -1"),
+            (["--warm-up", "101"], "--warm-up: expected a whole number from 0 to 100, got 101"),
+            (["--patience-s", "nan"], "--patience-s: expected a finite number from 0"),
+            (["--patience-s", "0"], "--patience-s: expected above 0 s"),
+            (["--budget-pulses", "-1"], "--budget-pulses: expected 0 or more"),
+            (["--at-min", "nan"], "--at-min: expected"),
+            (["--at-min", "-1"], "--at-min: expected"),
+            (["--bins", "0"], "--bins: expected"),
             (["--bins", "10", "--simulator", "memory"], "--bins: expected none, as a simulator of kind memory has no"),
             (["--range-hz", "9", "--simulator", "empirical"], "--range-hz: expected none"),
             (["--out", "/dev/null"], "expected a folder for the session, got a file"),

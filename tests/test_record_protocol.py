@@ -102,7 +102,7 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
             "mine.json: frequency_hz: no such setting at the top; expected some of frequencies_hz",
         ),
         ('{"pulses": 0}', [], "mine.json: pulses: expected at least 1"),
-        ('{"setup_s": 700}', ["--sessions", "2"], "interval_min: expected at least"),
+        ('{"setup_s": 700}', ["--sessions", "2"], "--interval-min: expected at least"),
         (MINE.to_json(), ["--order", "mixed"], "--protocol: expected it alone, got --order too"),
         (MINE.to_json(), ["--pulses", "1", "--trials", "100"], "got --pulses, --trials too"),
     ],

@@ -21,6 +21,9 @@ from animat.report.minus import with_minus
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.style import save_figure
 from animat.robots import Cartpole
+from animat.studies.arms import arms_shown, what_parts
+from animat.studies.cultures import OverCultures, RanCultures
+from animat.studies.cultures_page import _in_short
 from animat.studies.differences import came_out_otherwise, decisions, explain
 from animat.studies.learned import beside_the_optimum, known_of, learned_of
 from animat.studies.optima import kinds_of, rough_kinds
@@ -63,6 +66,48 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     assert words.startswith("1 of 3 comparisons") and "For 2 there are too few policies" in words
     assert "otherwise" not in words
     assert "is not known, with so few policies" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
+
+
+def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
+    rows = [replace(ROW, robot=robot, outcome=outcome) for robot, outcome in (("arm", NONE), ("wheels", FIRST))]
+    words = _as_in_paper([replace(ROW, as_in_paper="yes"), *rows, replace(ROW, second="c")])
+    assert words.startswith("1 of 4 comparisons came out as in the paper")
+    assert words.endswith(
+        "3 came out differently: the paper found “b” better than “a”, but here “a” was better on wheels and no "
+        "difference was found on arm; the paper found “c” better than “a”, but here no difference was found on "
+        "cartpole."
+    )
+
+
+def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
+    study = paper_study()
+    told = dict(arms_shown(study).rows)
+    assert list(told) == [arm.name for arm in study.arms]
+    assert "depending on how many of nine thresholds it passes. Trained with shadowing" in told["9 thresholds"]
+    assert "above the median gives the motor command +1" in told["control"] and "drawn at random" in told["control"]
+    assert told["before training"].startswith("New networks") and "hadowing" not in told["before training"]
+    assert "without shadowing: on the simulator of the first recording" in told["without shadowing"]
+    assert told["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
+    (fixed,) = arms_shown(Study(arms=(Arm("fixed", percentiles="first"),))).rows
+    assert fixed[1].endswith("Thresholds are fixed, by the first recording.")
+    parts = {each.name: list(what_parts(each, study.arm("1 threshold"))) for each in study.arms}
+    assert parts["1 threshold"] == parts["before training"] == []
+    assert parts["without shadowing"] == [
+        "“1 threshold” is trained with shadowing: during training, each newer recording replaces the simulator of the "
+        "neurons."
+    ]
+    assert parts["control"] == ["In “control” the delivered stimulus is drawn at random, whatever the policy chooses."]
+    assert [each.split("”")[0] for each in parts["linear"]] == ["In “linear", "In “1 threshold"]
+
+
+def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
+    names = [("control and 1 threshold", robot) for robot in ("cartpole", "navigation")]
+    rows = [OverCultures(*name, 4, 1.0, 2.0, 1.0, None, None, larger_in=4, holds_in=4, tested=4) for name in names]
+    section = _in_short(paper_study(), RanCultures(Path(), {}, {}, {}, tuple(rows), None))
+    (_, first), (_, second) = section.points
+    assert first.endswith("In “control” the delivered stimulus is drawn at random, whatever the policy chooses.")
+    assert first.startswith(second)
+    assert section.tables[0].title == "The arms"
 
 
 def test_an_outcome_that_the_correction_takes_back_says_so() -> None:

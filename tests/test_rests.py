@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import stand_in_cl
 import stand_in_maxlab
+from animat.cli import main
 from animat.closed_loop.agents import Agent, AnyCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -123,6 +124,27 @@ def test_rests_are_recorded_sorted_and_read_as_other_trials(pulses: int, tmp_pat
 def test_places_that_are_empty_or_twice_the_same_are_refused(places: list[Any]) -> None:
     with pytest.raises(InvalidArgument, match=r"^places: expected"):
         check_places(places)
+
+
+def test_a_protocol_of_rests_alone_is_recorded_with_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    culture = small_culture()
+    with culture:
+        sites = culture.stimulation_electrodes
+    write_nwb(recorded(culture, NONE, sites[:1]), tmp_path / "some.nwb")
+    (tmp_path / "none.json").write_text('{"frequencies_hz": [20], "trials": 12, "places": ["none"]}')
+    (tmp_path / "places.json").write_text('["none"]')
+    given = ["record", "--culture", "replay", "--recordings", str(tmp_path / "some.nwb"), "--sessions", "1"]
+    for option, name in (("--protocol", "none.json"), ("--places", "places.json")):
+        assert main([*given, option, str(tmp_path / name), "--out", str(tmp_path / f"of {name}")]) == 0
+        said = capsys.readouterr().err.splitlines()
+        assert [line for line in said if line.startswith('warning: places: the only one is "none", so nothing is ever')]
+    # What is made of it says so, and is refused.
+    assert main(["inspect", str(tmp_path / "of none.json")]) == 1
+    assert "!! nothing was delivered: all 12 stimuli are rests" in capsys.readouterr().out
+    protocol = Protocol(places=("none", (1, 2)))
+    assert not protocol.is_rest and not Protocol().is_rest and Protocol(places=("none",)).is_rest
 
 
 def test_after_an_emergency_stop_there_is_no_rest_either() -> None:

@@ -208,7 +208,8 @@ def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -
 
 
 def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
-    (tmp_path / "tune.json").write_text(json.dumps({"tune": {"trials": 5}, "study": {"robots": [{"name": "arm"}]}}))
+    tune = {"trials": 5, "together": 3, "rungs": 3}
+    (tmp_path / "tune.json").write_text(json.dumps({"tune": tune, "study": {"robots": [{"name": "arm"}]}}))
     told = [
         {"trial": 0, "settings": {"discount": 0.98765}, "state": "complete", "returns": [[1.0, 2.0], [3.0, 5.0]]},
         {"trial": 1, "settings": {"discount": 0.9}, "state": "stopped", "returns": [[50.0, 60.0]]},
@@ -220,12 +221,35 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     assert rows["trials done"] == "3 of 5"
     assert [rows[name] for name in ("complete", "stopped early", "diverged")] == [1, 1, 1]
     # One that came further counts before one that did well at the first rung.
-    assert rows["best so far"] == "trial 0, 4.0"
-    assert block(found, "Journal")["rows"][-1] == [0, "complete", 4.0, "discount 0.9877"]
-    finals = [{"trial": 0, "mean_return": 3.0}, {"trial": 1, "mean_return": 6.25}]
+    assert rows["best so far"] == "trial 0, 4" and rows["under way"] == "nothing"
+    journal = block(found, "Journal")["rows"]
+    assert journal[-1] == [0, "complete", "4.00", "discount 0.9877"]
+    assert [row[1:3] for row in journal[:2]] == [["diverged", "none"], ["stopped early", "55.00"]]
+    drawn = {each["name"]: (each["x"], each["y"]) for each in block(found, "Return of each trial")["series"]}
+    assert drawn == {"best so far": ([0, 1], [4, 4]), "complete": ([0], [4]), "stopped early": ([1], [55])}
+    notices = tmp_path / ".unfinished" / ".told"
+    notices.mkdir(parents=True)
+    (notices / "rung-2+trials-3+4.json").write_text("[0.5, null]")
+    with exclusive_lock(tmp_path):
+        found = TuningView(tmp_path).view(None, 8.0)
+    assert facts(found, "Trials")["under way"] == "trials 3 to 4, rung 2 of 3"
+    # No job says more than how far it is.
+    assert block(found, "Running")["head"] == ["job", "done"]
+    assert block(found, "Running")["rows"] == [["trials 3, 4, rung 2", "50 %"]]
+    assert block(found, "Return of each trial")["until"] == 4
+    finals = [
+        {"trial": 0, "mean_return": None},
+        {"trial": 2, "mean_return": -10.0},
+        {"trial": 1, "mean_return": 6.25, "standard_error": 0.5, "settings": {"batch": 64}},
+    ]
     (tmp_path / "results.json").write_text(json.dumps({"best": {"trial": 1}, "finals": finals}))
     found = TuningView(tmp_path).view(None, 8.0)
-    assert facts(found, "Trials")["best, retrained"] == "trial 1, 6.2"
+    assert facts(found, "Trials")["best, retrained"] == "trial 1, 6.25"
+    assert block(found, "Retrained")["rows"] == [
+        [1, "6.25", "0.5000", "batch 64"],
+        [2, "-10.00", "none", ""],
+        [0, "none", "none", ""],
+    ]
     assert "Running" not in [each["title"] for each in found["blocks"]]
 
 

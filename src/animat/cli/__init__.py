@@ -11,6 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import tyro
@@ -111,7 +112,7 @@ def _run(given: list[str]) -> int:
         with heard_everywhere(), _watched(command):
             results = command.run()
     except AnimatError as error:
-        print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"animat: {_by_option(command, ' '.join(str(error).split()))}", file=sys.stderr)
         _say_notes(error)
         return 1
     except KeyboardInterrupt as error:
@@ -141,6 +142,21 @@ def _run(given: list[str]) -> int:
         print(json.dumps(as_json(results)))
     # Of several files, some of which could not be read or used, as was said on the way.
     return 1 if results.get("unreadable") or results.get("unusable") else 0
+
+
+_BUDGET = {"budget.pulses": "budget_pulses", "budget.pulses_per_electrode": "budget_per_electrode"}
+"""The options of arguments that have another name in Python."""
+
+
+def _by_option(command: Command, message: str) -> str:
+    """A message that begins with the name of an argument, beginning with that of the option it was given by."""
+    argument, _, rest = message.partition(": ")
+    name = _BUDGET.get(argument, argument)
+    options = {field.name for field in dataclasses.fields(command) if "Positional" not in str(field.type)}
+    given = (each if isinstance(each, tuple) else (each,) for each in vars(command).values())
+    # A file or a folder may have the name of an option.
+    paths = {str(path) for each in given for path in each if isinstance(path, Path)}
+    return f"--{name.replace('_', '-')}: {rest}" if name in options - paths else message
 
 
 def _watched(command: Command) -> contextlib.AbstractContextManager[None]:

@@ -53,7 +53,10 @@ class Inspect(Responding):
         if self.out is not None:
             expect_writable(self.out)
         if self.optimum is not None:
-            robot_named(self.optimum)
+            try:
+                robot_named(self.optimum)
+            except InvalidArgument as error:
+                raise InvalidArgument(f"--optimum: {str(error).removeprefix('robot: ')}") from error
         by = None if self.conditions is None else conditions_named(self.conditions)
         window_ms = self.window_ms or DEFAULT_WINDOW_MS
         check_window(window_ms)

@@ -92,6 +92,7 @@ class Live(Stimulating):
                 f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
                 f"{self.culture}: a live run records the culture itself"
             )
+        self._expect_culture_seed()
         default_speed = 30.0 if simulated else 1.0
         timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
         robot = robot_named(self.robot)

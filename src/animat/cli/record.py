@@ -81,6 +81,12 @@ class Record:
         protocol = None if self.culture == "synthetic" else self._protocol()
         if protocol is not None and self.protocol is not None:
             _say_too_fast(protocol)
+        if protocol is not None and protocol.is_rest:
+            print(
+                'warning: places: the only one is "none", so nothing is ever delivered, and no robot can be driven by '
+                "such recordings; to stimulate, add groups of electrodes",
+                file=sys.stderr,
+            )
         _expect_no_others(self.out)
         with Bar("recording") as progress:
             if self.culture == "synthetic":

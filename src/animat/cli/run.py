@@ -102,6 +102,7 @@ class Run(Stimulating):
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        self._expect_culture_seed()
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
         if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from animat.errors import InvalidFile, LoopEnded
+from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
@@ -38,6 +38,11 @@ class Stimulating:
     """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
+
+    def _expect_culture_seed(self) -> None:
+        """Raise for a seed that no culture has; what makes the culture would call it `seed`, as the policies' is."""
+        if self.culture_seed is not None and self.culture_seed < 0:
+            raise InvalidArgument(f"--culture-seed: expected 0 or more, got {self.culture_seed}")
 
     def _of_the_loop(self) -> dict[str, Any]:
         """Settings of the closed loop."""

@@ -59,8 +59,9 @@ class Cluster(Executor):
         # What is lost is told by what becomes of the work.
         for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        address = _address(where)
         try:
-            self._client = distributed.Client(_address(where), timeout=_CONNECT_S, set_as_default=False)
+            self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise AnimatError(
                 f"cluster: {where}: no scheduler answers ({first_line(error)}); start it again"

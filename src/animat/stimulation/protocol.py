@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, SkipValidation
 from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, record
-from animat.stimulation.places import Places, check_places, count_places
+from animat.stimulation.places import NONE, Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
 Order = Literal["blocked", "mixed"]
@@ -121,6 +121,11 @@ class Protocol:
     def n_places(self) -> int:
         """How many places there are; 0: the culture's patterns are used."""
         return count_places(self.places)
+
+    @property
+    def is_rest(self) -> bool:
+        """Whether it delivers nothing at all: its only place is `"none"`."""
+        return self.places == (NONE,)
 
     def to_json(self) -> str:
         """As one line of JSON, the way a recording's file keeps it under `"protocol"`."""

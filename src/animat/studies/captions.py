@@ -6,9 +6,10 @@ What stands in braces is filled in for the study (`animat.studies.publishing`).
 from __future__ import annotations
 
 HEADLINE = (
-    "A line an arm, at the last recording that it was evaluated on; further right is better. Small dots: each policy's "
-    "mean return. Large dot: their interquartile mean, with its 95 % interval; an arrow says that the interval goes on "
-    "beyond the axis. Crosses: random actions. Bars: the optimal return, where it is known. {policies} policies an arm."
+    "Each line is an arm, explained in the table below, at the last recording that it was evaluated on; further right "
+    "is better. Small dots: each policy's mean return. Large dot: their interquartile mean (that of the middle half), "
+    "with its 95 % interval; an arrow says that the interval goes on beyond the axis. Crosses: random actions. Bars: "
+    "the optimal return, which no controller can exceed, where it is known. {policies} policies an arm."
 )
 
 CULTURE: dict[str, tuple[str, str]] = {

@@ -7,8 +7,10 @@ from pathlib import Path
 from animat.report.html import Picture, Section, cell, table_of, write_page
 from animat.report.over_cultures import Compared, draw_over_cultures
 from animat.report.style import FORMATS, save_figure
+from animat.studies.arms import arms_shown, many_arms, what_parts
 from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
 from animat.studies.places import REPORT
+from animat.studies.specification import Compared as Comparison
 from animat.studies.specification import Study
 from animat.studies.tabulating import LEVEL
 
@@ -24,7 +26,7 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         sections.append(_in_short(study, found))
     sections.append(_each(found))
     cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
-    lead = f"{cultures}; {len(study.arms)} arms with {study.policies} policies each on every one."
+    lead = f"{cultures}. {many_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
 
 
@@ -35,7 +37,14 @@ def _drawn(found: RanCultures, i: int, row: OverCultures) -> Compared:
 
 
 def _in_short(study: Study, found: RanCultures) -> Section:
-    points = tuple((f"{row.robot}, {row.comparison}", _told(study, row)) for row in found.summary)
+    points, explained = [], set[str]()
+    for row in found.summary:
+        compared = next(each for each in study.comparisons if each.name == row.comparison)
+        parts = list(what_parts(study.arm(compared.first), study.arm(compared.second)))
+        # Each where it comes first.
+        words = " ".join([_told(compared, row), *(each for each in parts if each not in explained)])
+        points.append((f"{row.robot}, {row.comparison}", words))
+        explained |= set(parts)
     table = table_of(
         "Over cultures",
         found.summary,
@@ -62,15 +71,14 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         f"{len(found.comparisons)} cultures.",
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
-    return Section("Results in short", (), points, (table,), (picture,))
+    return Section("Results in short", (), tuple(points), (arms_shown(study), table), (picture,))
 
 
 def _interval(row: OverCultures) -> str:
     return "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"
 
 
-def _told(study: Study, row: OverCultures) -> str:
-    compared = next(each for each in study.comparisons if each.name == row.comparison)
+def _told(compared: Comparison, row: OverCultures) -> str:
     larger = (
         f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of {row.cultures} "
         "cultures"

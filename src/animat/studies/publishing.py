@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -16,6 +16,7 @@ from animat.report.headline import ArmReturns, draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.style import FORMATS, save_figure
 from animat.stimulation.protocol import Presentation
+from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.episodes import DataFrame
@@ -39,7 +40,7 @@ from animat.studies.shown import (
 )
 from animat.studies.simulating import controllability, load_timeline, read_series
 from animat.studies.specification import Arm, RobotSpec, Study
-from animat.studies.tabulating import AIM, LEFT_OUT, LEVEL, SECOND, all_episodes, performances
+from animat.studies.tabulating import AIM, FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
 
 
@@ -87,10 +88,8 @@ def _lead(study: Study) -> str:
     neurons = {"virtual": "a virtual culture", "synthetic": "synthetic responses", "files": "recordings"}[
         study.culture.kind
     ]
-    return (
-        f"{robots.capitalize()}, driven through {neurons}: {len(study.arms)} arms with {study.policies} "
-        f"policies each, " + ", ".join(f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots) + "."
-    )
+    trained = " and ".join(f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots)
+    return f"{robots.capitalize()}, driven through {neurons}. {many_arms(study)}, trained for {trained}."
 
 
 def _headline(study: Study, results: Results, table: DataFrame) -> list[ArmReturns]:
@@ -109,17 +108,25 @@ def _short(
 ) -> Section:
     """How the best arm does on each robot, what comes of it without the culture, and how many comparisons hold."""
     chosen = {arm.name for arm in study.arms if arm.trained and arm.through_neurons and arm.delivery == "chosen"}
-    sentences = []
+    sentences, explained = [], []
     for spec in study.robots:
         of_robot = [row for row in headline if row.robot == spec.name]
         best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.mean, default=None)
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
-            sentences.append(f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}{at_random}")
+            means = f"In “{best.arm}” {mapped(study.arm(best.arm))}"
+            words = f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}{at_random}"
+            sentences.append(words if means in explained else f"{words} {means}")
+            explained.append(means)
     rows = results.comparisons
     printed = [row for row in rows if row.paper_p is not None]
     if printed:
-        sentences.append(_as_in_paper(printed))
+        otherwise = [row for row in printed if row.as_in_paper == "no"]
+        parts = [each for row in otherwise for each in what_parts(study.arm(row.first), study.arm(row.second))]
+        explain = [each for each in dict.fromkeys(parts) if each not in explained]
+        if otherwise:
+            explain.append("The section “Differences from the paper” says what is known about the reasons.")
+        sentences.append(" ".join([_as_in_paper(printed), *explain]))
     elif rows:
         found = sum(row.outcome == SECOND for row in rows)
         sentences.append(f"In {found} of {len(rows)} comparisons the second arm was found to be better.")
@@ -136,7 +143,7 @@ def _short(
         (*(f"figures/{file.name}" for file in drawn[1:]), "tables/scores.csv"),
         narrow,
     )
-    return Section("Results in short", tuple(sentences), pictures=(picture,))
+    return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_shown(study),))
 
 
 def _beside(row: ArmReturns) -> str:
@@ -188,12 +195,24 @@ def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
         which = "comparison comes" if len(rows) == 1 else f"{len(rows)} comparisons come"
         return f"Whether the {which} out as in the paper is not known, with so few policies."
     comparisons = "1 comparison" if len(rows) == 1 else f"{len(rows)} comparisons"
-    words = f"{told['yes']} of {comparisons} came out as in the paper: the same one better, at p < {LEVEL:g}."
+    words = f"{told['yes']} of {comparisons} came out as in the paper: the same arm was better, at p < {LEVEL:g}."
     if told["cannot tell"]:
         words += f" For {told['cannot tell']} there are too few policies."
     if told["no"]:
-        words += f" {told['no']} came out otherwise: highlighted, and explained under Differences from the paper."
+        differ = "; ".join(_otherwise([row for row in rows if row.as_in_paper == "no"]))
+        words += f" {told['no']} came out differently: {differ}."
     return words
+
+
+def _otherwise(rows: Sequence[ComparedReturns]) -> Iterator[str]:
+    """The comparisons that came out otherwise than in the paper, and how: those of the same arms together."""
+    for first, second in dict.fromkeys((row.first, row.second) for row in rows):
+        on: dict[str, list[str]] = {}
+        for row in (row for row in rows if (row.first, row.second) == (first, second)):
+            on.setdefault(row.outcome, []).append(row.robot)
+        better = [f"“{first}” was better on {' and '.join(on[FIRST])}"] if FIRST in on else []
+        none = [f"no difference was found on {' or '.join(on[NONE])}"] if NONE in on else []
+        yield f"the paper found “{second}” better than “{first}”, but here {' and '.join(better + none)}"
 
 
 def _scores(study: Study, results: Results) -> Section:
@@ -330,25 +349,9 @@ def _done(study: Study, results: Results) -> Section:
     ]
     points.append(("Evaluation", _ACTIONS[study.actions]))
     points += [("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT]
-    for arm in study.arms:
-        said = [f"mapping {arm.mapping}" if arm.through_neurons else "the robot is moved directly"]
-        if arm.through_neurons:
-            said.append(_SHADOWING[arm.shadowing])
-        if arm.delivery == "shuffled":
-            said.append("the delivered stimulus is drawn at random, in training and in evaluation")
-        if arm.percentiles == "first":
-            said.append("fixed percentiles, those of the first recording")
-        if not arm.trained:
-            said.append("not trained")
-        points.append((f"Arm: {arm.name}", "; ".join(said) + "."))
     return Section("How it was done", points=tuple(points))
 
 
-_SHADOWING: dict[bool | str, str] = {
-    True: "simulators refreshed during training",
-    False: "the first simulator throughout",
-    "drawn": "each episode draws one of the simulators",
-}
 _ACTIONS = {
     "most probable": "Policies take their most probable action.",
     "drawn": "Policies draw their actions, as in training.",

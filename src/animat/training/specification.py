@@ -135,7 +135,7 @@ class Training:
                 f"pulse_cost: expected 0 with assessments, which are by the task's own return, got {self.pulse_cost:g}"
             )
         if self.shadowing == "drawn" and self.mapping is None:
-            raise InvalidArgument("shadowing: expected True or False without neurons, got 'drawn'")
+            raise InvalidArgument("shadowing: expected a mapping with 'drawn', got none")
         if self.is_varied and isinstance(self.robot, HostRobot):
             raise InvalidArgument(f"robot: expected one that is stepped by JAX to be assessed, got {self.robot.name}")
         for name, allowed in (

@@ -155,8 +155,10 @@ def _done(done: dict[str, int], width: Width) -> dict[str, Any]:
 
 def running_table(told: dict[str, tuple[float, str, float]], width: Width = "two-thirds") -> dict[str, Any]:
     """What runs."""
-    rows = [[name, f"{100 * share:.0f} %", note] for name, (share, note, _) in told.items()]
-    return table("Running", ["job", "done", "what it says"], rows, "" if rows else "nothing runs now", width=width)
+    says = any(note for _, note, _ in told.values())
+    rows = [[name, f"{100 * share:.0f} %", *([note] if says else [])] for name, (share, note, _) in told.items()]
+    head = ["job", "done", *(["what it says"] if says else [])]
+    return table("Running", head, rows, "" if rows else "nothing runs now", width=width)
 
 
 def results_table(folder: Path, width: Width = "whole") -> dict[str, Any]:

@@ -115,6 +115,13 @@ def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Fin
 def _timing(responses: Responses, recording: Recording, assignment: Assignment) -> Iterator[Finding]:
     start_ms, end_ms = responses.window_ms
     stimuli = recording.stimuli
+    if stimuli.is_rest.all():
+        message = (
+            f"nothing was delivered: all {len(stimuli)} stimuli are rests, so the window from {start_ms:g} to "
+            f"{end_ms:g} ms holds no response; record places with electrodes"
+        )
+        yield Finding("dead-window", "refuse", message)
+        return
     read = stimuli.is_last_of_presentation
     gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
     # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.

@@ -1,0 +1,71 @@
+"""The arms of a study in words: how a response becomes a command in each, and how it is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from animat.report.html import Table
+from animat.studies.specification import Arm, Study
+
+_MAPPED = {
+    "1-threshold": "a response above the median gives the motor command +1, and one below it −1.",
+    "9-thresholds": "a response gives one of ten motor commands from −1 to +1, depending on how many of nine "
+    "thresholds it passes.",
+    "linear": "the motor command rises with the response along a straight line, from −1 for the smallest response "
+    "recorded to +1 for the largest.",
+    "none": "there are no neurons, and policies give the motor commands themselves.",
+}
+REFRESHED = "with shadowing: during training, each newer recording replaces the simulator of the neurons."
+_SHADOWED: dict[bool | str, str] = {
+    True: f"Trained {REFRESHED}",
+    False: "Trained without shadowing: on the simulator of the first recording throughout.",
+    "drawn": "In training, each episode draws one of the recordings, whose simulator is used.",
+}
+SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy chooses."
+
+
+def many_arms(study: Study) -> str:
+    """What an arm is, and how many there are: a sentence and the beginning of one."""
+    arms = f"There {'is 1 arm' if len(study.arms) == 1 else f'are {len(study.arms)} arms'}"
+    policies = "1 policy" if study.policies == 1 else f"{study.policies} policies"
+    return f"An arm is one way to train policies. {arms} with {policies} each"
+
+
+def mapped(arm: Arm) -> str:
+    """How a response becomes a command in an arm: a sentence without its capital."""
+    return _MAPPED.get(arm.mapping, f"responses become motor commands by the mapping {arm.mapping}.")
+
+
+def what_parts(first: Arm, second: Arm) -> Iterator[str]:
+    """What two arms differ in, where a name does not say it: a sentence each."""
+    for arm, other in ((first, second), (second, first)):
+        if arm.shadowing is True and other.shadowing is False:
+            yield f"“{arm.name}” is trained {REFRESHED}"
+        if arm.delivery == "shuffled" != other.delivery:
+            yield f"In “{arm.name}” {SHUFFLED}"
+        if arm.mapping != other.mapping:
+            yield f"In “{arm.name}” {mapped(arm)}"
+
+
+def arms_shown(study: Study) -> Table:
+    """The arms and what each of them is."""
+    return Table(
+        "The arms",
+        ("arm", "what it is"),
+        tuple((arm.name, " ".join(_in_words(arm))) for arm in study.arms),
+        note="Commands are the robot's, from −1 to +1. Medians and thresholds are percentiles of the recorded "
+        "responses.",
+    )
+
+
+def _in_words(arm: Arm) -> Iterator[str]:
+    if not arm.trained:
+        yield "New networks, as they are before training."
+    said = mapped(arm)
+    yield said[:1].upper() + said[1:]
+    if arm.through_neurons and arm.trained:
+        yield _SHADOWED[arm.shadowing]
+    if arm.delivery == "shuffled":
+        yield f"{SHUFFLED[:1].upper()}{SHUFFLED[1:-1]}, in training and in evaluation."
+    if arm.percentiles == "first":
+        yield "Thresholds are fixed, by the first recording."
