@@ -32,18 +32,15 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     silent = int(np.count_nonzero(count == 0))
     if silent:
         mostly = silent > MOSTLY_SILENT * n
-        message = f"{silent:,} of {n:,} channels are silent; they count in rates per channel" + (
-            ": route electrodes where the culture fires" if mostly else ""
-        )
+        message = f"{silent:,} of {n:,} channels are silent; they count in rates per channel"
+        message += ": route electrodes where the culture fires" if mostly else ""
         yield Finding("silent-channels", "warning" if mostly else "note", message, float(silent))
     fast = count > FAST_HZ * recording.duration_s if recording.duration_s > 0 else np.zeros(n, dtype=bool)
     most = (count > HOLDS_MOST * n_spikes) if n >= SEVERAL and n_spikes >= 10 * n else np.zeros(n, dtype=bool)
     noisy = np.flatnonzero(fast | most)
     if len(noisy):
         share = float(count[noisy].sum() / n_spikes)
-        names = ", ".join(str(label) for label in channels.label[noisy[:NAMED]]) + (
-            ", ..." if len(noisy) > NAMED else ""
-        )
+        names = ", ".join(channels.label[noisy[:NAMED]]) + (", ..." if len(noisy) > NAMED else "")
         message = (
             f"{len(noisy):,} of {n:,} channels ({names}) fire as no neurons do and hold {100 * share:.0f} % of all "
             "spikes: they carry noise; raise their threshold or leave them out of the routing"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from animat.records import Number, Whole, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 _MOST_BYTES = 2**24
 
@@ -148,8 +149,7 @@ class Selection:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
-        with atomic_write(path) as beside:
-            beside.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
+        write_whole(Path(path), json.dumps(self.to_dict(), indent=1) + "\n")
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Selection:
@@ -214,22 +214,11 @@ def select_electrodes(
     worth = (scan.amplitude_uv * scan.excitatory_score)[recording]
     stimulation = recording[np.lexsort((scan.electrode[recording], -worth))][: rule.stimulation_sites]
     electrodes = np.sort(scan.electrode[stimulation])
+    patterns = draw_patterns(
+        array, electrodes, seed=seed, patterns=rule.patterns, size=rule.pattern_size, spacing_um=rule.pattern_spacing_um
+    )
     return Selection(
-        array=array,
-        recording=np.sort(scan.electrode[recording]),
-        stimulation=electrodes,
-        patterns=draw_patterns(
-            array,
-            electrodes,
-            seed=seed,
-            patterns=rule.patterns,
-            size=rule.pattern_size,
-            spacing_um=rule.pattern_spacing_um,
-        ),
-        rule=rule,
-        seed=seed,
-        scanned=len(scan),
-        passed=len(passed),
+        array, np.sort(scan.electrode[recording]), electrodes, patterns, rule, seed, len(scan), len(passed)
     )
 
 

@@ -184,11 +184,8 @@ def _detect(
             done += 1
             progress.update(done, n, f"{sum(map(len, samples)):,} spikes")
     empty = np.empty(0, np.int64)
-    return (
-        np.concatenate([empty, *samples]),
-        np.concatenate([empty, *channels]),
-        np.concatenate([np.zeros((0, 2)), *saturations]),
-    )
+    found = np.concatenate([empty, *samples]), np.concatenate([empty, *channels])
+    return *found, np.concatenate([np.zeros((0, 2)), *saturations])
 
 
 def _findings(
@@ -224,10 +221,7 @@ def _findings(
         message = (
             f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
             f"{longest:.1f} ms; they are blanked until then"
-            + (
-                ": rates in an earlier window are too low, use one that begins later"
-                if share >= 0.05 and longest > 2
-                else ""
-            )
         )
-        yield Finding("saturated-channels", "note" if share < 0.05 or longest <= 2.0 else "warning", message, share)
+        is_much = share >= 0.05 and longest > 2
+        message += ": rates in an earlier window are too low, use one that begins later" if is_much else ""
+        yield Finding("saturated-channels", "warning" if is_much else "note", message, share)

@@ -193,9 +193,8 @@ PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) 
 def unavailable_filters(dataset: h5py.Dataset) -> str:
     """The compression filters of a dataset that are not installed here, in words; empty where all are."""
     created = dataset.id.get_create_plist()
-    filters = [created.get_filter(i) for i in range(created.get_nfilters())]
     names = []
-    for code, _, _, name in filters:
+    for code, _, _, name in map(created.get_filter, range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(code):
             words = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
             words = words.partition("\0")[0].strip()
