@@ -240,11 +240,10 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         UnusableData: as `halved` does.
         InvalidArgument: for a kind or a readout that there is not.
     """
-    n_readouts = responses.read_hz.shape[1] if responses.read_hz.ndim == 2 else None
-    if (readout is None) != (n_readouts is None) or (readout is not None and not 0 <= readout < (n_readouts or 0)):
-        raise InvalidArgument(f"readout: expected which of {n_readouts or 1} readouts, None of one, got {readout}")
-    rng = np.random.default_rng(seed)
-    halves = halved(responses, readout)
+    n = len(responses.readouts)
+    if (readout is None) != (n == 1) or not 0 <= (readout or 0) < n:
+        raise InvalidArgument(f"readout: expected which of {n} readouts, None of one, got {readout}")
+    rng, halves = np.random.default_rng(seed), halved(responses, readout)
     kinds: tuple[str, ...] = get_args(Kind)
     if kind is not None and kind not in kinds:
         raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")
