@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -63,3 +64,18 @@ def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> No
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
+
+
+def briefly(record: Any) -> str:
+    """A dataclass in a line or a few, to be its `__repr__`."""
+    shown = (f"{field.name}={_brief(getattr(record, field.name))}" for field in fields(record) if field.repr)
+    return f"{type(record).__name__}({', '.join(shown)})"
+
+
+def _brief(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, tuple | list | dict) and len(value) > 6:
+        return f"<{len(value)} values>"
+    text = repr(value)
+    return text if len(text) <= 200 else f"<{type(value).__name__}>"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
+from inspect import getattr_static
+from types import FunctionType
 from typing import Any, final
 
 import numpy as np
@@ -15,7 +17,6 @@ from animat.cultures.observed import Observed, Spikes, assembled, more_left_out,
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import Admitted
-from animat.cultures.sealing import refuse_overrides
 from animat.errors import AnimatError, InvalidArgument
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
@@ -285,3 +286,34 @@ class Culture(Openable):
             offset_s += block.duration_s
         with turns as guard:
             guard.check(stimuli, self.now_s)
+
+
+_BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
+"""They are called before whatever the base class has, or in its place."""
+
+
+def refuse_overrides(cls: type, base: type, *, leaving: Collection[str]) -> None:
+    """Refuse a subclass in which anything but abstract methods of the base class is replaced, private or not.
+
+    Args:
+        cls: the subclass; wherever it has a name from, what stands before `base` among its bases counts.
+        base: whose methods and properties are called.
+        leaving: names that may be replaced though they are not abstract.
+
+    Raises:
+        TypeError: naming the first one.
+    """
+    own = {
+        name: member
+        for kind in reversed(base.__mro__)
+        for name, member in vars(kind).items()
+        if kind.__module__.startswith(f"{__package__}.")
+        and isinstance(member, FunctionType | property | classmethod)
+        and not getattr(member, "__isabstractmethod__", False)
+        and name not in leaving
+    } | {name: getattr_static(base, name, None) for name in _BEFORE_ALL}
+    for name, member in own.items():
+        if getattr_static(cls, name, None) is not member:
+            raise TypeError(
+                f"{cls.__name__}.{name}: final in {base.__name__}; implement the methods that its description names"
+            )

@@ -17,7 +17,7 @@ from animat.evaluation.rollouts import Actor
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.capabilities import capability
+from animat.robots.base import capability
 
 EPISODES = 64
 """Of each actor: a state of each, met with the goal of each other one."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from animat.brief import briefly
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
@@ -29,9 +28,9 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress, in_phase
 from animat.recordings.findings import Finding
-from animat.robots.base import Robot
-from animat.robots.capabilities import lacking
+from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
+from animat.tables import briefly
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation, ShuffledDelivery, TrialCosts, unwrapped
 

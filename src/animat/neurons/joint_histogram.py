@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.brief import briefly
 from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, quantile_of
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 _BELOW_ONE = float(np.nextafter(np.float32(1.0), np.float32(0.0)))
 

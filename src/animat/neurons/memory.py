@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
-from animat.brief import briefly
 from animat.neurons.history import NO_MEMORY, Memory, Ranked, left_by
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0)

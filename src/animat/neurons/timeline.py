@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
@@ -21,6 +20,7 @@ from animat.responses.condition import Condition, other_stimulus
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
+from animat.tables import briefly
 
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument
 from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
 from animat.neurons.kinds import Kind, fit_simulator
@@ -28,6 +27,7 @@ from animat.neurons.prediction import (
 from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import usual_kind
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 MARGINAL = "marginal"
 """The name of the baseline: all conditions' responses in one distribution."""

@@ -45,7 +45,7 @@ from animat.reality_gap.table import RealityGap
 from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
 from animat.responses.condition import other_stimulus
-from animat.robots.capabilities import lacking
+from animat.robots.base import lacking
 from animat.robots.grid import grid_for, no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike

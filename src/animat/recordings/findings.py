@@ -65,6 +65,6 @@ def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
             warnings.setdefault(finding.name, []).append(finding)
     for name, alike in warnings.items():
         # The number that is farthest from 0, or the nearest where few is bad.
-        sign = -1 if name in ("few-samples", "no-difference") else 1
-        worst = max(alike, key=lambda finding, sign=sign: sign * abs(finding.value or 0.0))
+        sizes = [abs(finding.value or 0.0) for finding in alike]
+        worst = alike[sizes.index(min(sizes) if name in ("few-samples", "no-difference") else max(sizes))]
         yield worst.message + (f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else "")

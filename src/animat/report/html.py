@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import os
+import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,9 +13,19 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from animat.errors import InvalidFile
-from animat.report.minus import MINUS, with_minus
 from animat.report.style import PNG_DPI
 from animat.writing import write_whole
+
+MINUS = "\u2212"
+
+# Not within a word, a range such as 2-10, an option or a file's name; the exponent's of 1.5e-05 is one.
+_HYPHEN = re.compile(r"(?:(?<![\w.\-/])-(?=\.?\d))|(?<=\de)-(?=\d)")
+
+
+def with_minus(text: str) -> str:
+    """A text with a minus sign before each negative number, in place of a hyphen."""
+    return _HYPHEN.sub(MINUS, text)
+
 
 TEMPLATE = "report.html.j2"
 

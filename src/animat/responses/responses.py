@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import Mismatch
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
 from animat.stimulation.protocol import Presentation
+from animat.tables import briefly
 
 
 @dataclass(frozen=True, eq=False)

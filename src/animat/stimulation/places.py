@@ -110,8 +110,8 @@ def electrodes_of(
         y_of_um = dict(zip(electrodes.tolist(), y_um.tolist(), strict=True))
         halves = electrodes_of("halves", electrodes, x_um, y_um)
         # Of each half some electrodes, evenly from its smallest to its largest y.
-        in_order = (sorted(half, key=lambda electrode: (y_of_um[electrode], electrode)) for half in halves)
-        left, right = (tuple(sorted(half[rank] for rank in evenly(len(half), SITES))) for half in in_order)
+        sorted_halves = (sorted(half, key=lambda electrode: (y_of_um[electrode], electrode)) for half in halves)
+        left, right = (tuple(sorted(half[rank] for rank in evenly(len(half), SITES))) for half in sorted_halves)
         return left, right, tuple(sorted(left + right)), left[:1]
     columns, rows = CUT[places]
     found = []

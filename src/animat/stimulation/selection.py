@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
+from animat.tables import briefly
 from animat.writing import write_whole
 
 _MOST_BYTES = 2**24

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
 from animat.stimulation.plain import number, seconds, whole_number
 from animat.stimulation.pulse import Pulse
-from animat.tables import FASTEST_HZ, UNKNOWN, expect_rising_times, freeze
+from animat.tables import FASTEST_HZ, UNKNOWN, briefly, expect_rising_times, freeze
 
 _ONLY_INT = frozenset({int})
 NOTHING = -2

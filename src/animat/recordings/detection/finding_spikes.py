@@ -13,8 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from animat.progress import Progress, Silent
 from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
-from animat.recordings.detection.negative_peaks import find_negative_peaks
-from animat.recordings.detection.noise import median_noise_uv
+from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding

@@ -26,8 +26,7 @@ import numpy as np
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
-from animat.recordings.formats.choice import choose
-from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file, unavailable_filters
+from animat.recordings.formats.hdf5 import Hdf5File, choose, hdf5_file, unavailable_filters
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN

@@ -12,9 +12,8 @@ import h5py
 import numpy as np
 
 from animat.errors import InvalidFile
-from animat.recordings.formats.choice import choose
 from animat.recordings.formats.cl1 import read_cl1
-from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, hdf5_file, unavailable_filters
+from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, unavailable_filters
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
 from animat.recordings.formats.nwb_of_others import read_other_nwb
@@ -58,9 +57,9 @@ def open_traces(
         else:
             traces = _nwb(file, part, base)
     stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
-    start_s = min(base.start_s, traces.start_s)
-    span = {"start_s": start_s, "duration_s": stop_s - start_s}
-    return traces, replace(base, channels=traces.channels, sampling_rate_hz=traces.sampling_rate_hz, **span)
+    start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
+    base = replace(base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s)
+    return traces, replace(base, duration_s=stop_s - start_s)
 
 
 def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
