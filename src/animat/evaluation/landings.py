@@ -108,14 +108,9 @@ class Motion:
         """
         grid, n = self._grid, len(self._u)
         at_once = max(1, min(grid.n_rows, _NODES_AT_ONCE // (grid.along.stored * n)))
-        shape = (n, grid.n_rows, grid.along.stored)
-        landings = Landings(
-            np.empty(shape[:2], np.int32),
-            np.empty((*shape[:2], len(grid.rows)), np.float32),
-            np.empty(shape, np.int32),
-            np.empty(shape, np.float32),
-            np.empty(shape, np.float32),
-        )
+        rows, nodes = (n, grid.n_rows), (n, grid.n_rows, grid.along.stored)
+        kinds = (rows, np.int32), ((*rows, len(grid.rows)), np.float32), (nodes, np.int32), (nodes, np.float32)
+        landings = Landings(*(np.empty(shape, kind) for shape, kind in (*kinds, kinds[-1])))
         for start in range(0, grid.n_rows, at_once):
             # The last block starts earlier instead of being shorter: one shape is compiled.
             start = min(start, grid.n_rows - at_once)

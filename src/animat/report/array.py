@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float64
 
@@ -25,16 +27,8 @@ def draw_array(recording: Recording) -> Figure:
     axes = figure.subplots()
     # A few channels of a very high rate must not leave all others dark.
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
-    drawn = axes.scatter(
-        channels.x_um[known],
-        channels.y_um[known],
-        c=rate_hz[known],
-        vmin=0,
-        vmax=max(highest_hz, 1e-9),
-        cmap="cividis",
-        s=9,
-        linewidths=0,
-    )
+    of_rates: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
+    drawn = axes.scatter(channels.x_um[known], channels.y_um[known], s=9, linewidths=0, **of_rates)
     bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
     bar.set_label("firing rate, stimulated time included (Hz)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
