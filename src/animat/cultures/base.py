@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failing import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, presented, with_rests
+from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, stimulus_table, with_rests
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import Admitted
@@ -196,14 +196,10 @@ class Culture(Openable):
             raise InvalidArgument("stimuli: expected at least one in a trial, got none")
         start_min = self.now_s / 60
         observed = self.deliver(stimuli, stimuli[-1].time_s + until_ms * 1e-3)
-        return presented(
-            stimuli,
-            observed,
-            channels=self.channels,
-            sampling_rate_hz=self.sampling_rate_hz,
-            start_min=start_min,
-            presentation=presentation,
-        )
+        table = stimulus_table(stimuli, observed.stimulus_time_s)
+        # From 0 s on its own clock.
+        span = 0.0, observed.duration_s, start_min
+        return Recording(*observed.spikes, self.channels, table, self.sampling_rate_hz, *span, presentation)
 
     @final
     def schedule(self, protocol: Protocol, seed: int = 0) -> Schedule:

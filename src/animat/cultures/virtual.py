@@ -19,7 +19,7 @@ from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import MAXONE
-from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.scan import ScannedActivity
 from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
 from animat.stimulation.stimulus import Stimulus
@@ -326,7 +326,10 @@ class VirtualCulture(Culture):
 
         x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
         half_um = MAXONE.pitch_um / 2
-        return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, _strength(stimulus.pulse))
+        # The charge of the largest cathodic phase, in those of the published pulse.
+        cathodic = max(-phase.charge for phase in stimulus.pulse.phases)
+        strength = max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)
+        return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, strength)
 
     def _on_channels(self, time_s: Float64[np.ndarray, " spikes"], neuron: Int64[np.ndarray, " spikes"]) -> Spikes:
         """Every spike once on each channel that sees its neuron."""
@@ -362,9 +365,3 @@ def _with_floats(settings: Settings) -> Settings:
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
             changed[field.name] = _with_floats(value)
     return dataclasses.replace(settings, **changed)
-
-
-def _strength(pulse: Pulse) -> float:
-    """Charge of the largest cathodic phase, in those of the published pulse."""
-    cathodic = max(-phase.charge for phase in pulse.phases)
-    return max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)
