@@ -97,6 +97,11 @@ Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
 """Of a table of records: their names, and the field or a function of a record that gives the cell."""
 
 
+def columns_of(*fields: str) -> Columns:
+    """Columns that are called as their fields are, in words."""
+    return [(name.replace("_", " "), name) for name in fields]
+
+
 def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) -> Table:
     """A table with a row a record; `more` as of `Table`."""
     rows = tuple(tuple(of(each) if callable(of) else getattr(each, of) for _, of in columns) for each in records)

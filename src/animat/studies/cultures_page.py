@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from animat.report.html import Picture, Section, cell, table_of, write_page
+from animat.report.html import Picture, Section, cell, columns_of, table_of, write_page
 from animat.report.over_cultures import Compared, draw_over_cultures
 from animat.report.style import FORMATS, save_figure
 from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
@@ -22,7 +22,9 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"over-cultures.{ending}")
         sections.append(_in_short(study, found))
-    sections.append(_each(found))
+    points = [(name, f"finished: {name}/{REPORT}") for name in found.ran]
+    points += [(name, f"failed: {why}") for name, why in found.failed.items()]
+    sections.append(Section("Each culture", points=tuple(points)))
     cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
     lead = f"{cultures}; {len(study.arms)} arms with {study.policies} policies each on every one."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
@@ -40,11 +42,7 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         "Over cultures",
         found.summary,
         [
-            ("comparison", "comparison"),
-            ("robot", "robot"),
-            ("mean first", "mean_first"),
-            ("mean second", "mean_second"),
-            ("difference", "difference"),
+            *columns_of("comparison", "robot", "mean_first", "mean_second", "difference"),
             ("95 % interval", _interval),
             ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
             ("significantly better in", "found_better"),
@@ -78,9 +76,3 @@ def _told(study: Study, row: OverCultures) -> str:
     if not row.tested:
         return f"{larger}; with so few policies no test finds a difference in one culture."
     return f"{larger}; it is found to be better (p < {LEVEL:g}) in {row.found_better}."
-
-
-def _each(found: RanCultures) -> Section:
-    points = [(name, f"finished: {name}/{REPORT}") for name in found.ran]
-    points += [(name, f"failed: {why}") for name, why in found.failed.items()]
-    return Section("Each culture", points=tuple(points))

@@ -24,18 +24,13 @@ def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name
     import pandas as pd
 
     hints = get_type_hints(kind)
+    dtypes = {int: "int64", str: object, str | None: object}
     columns = {name: pd.Series([first for first, _ in named], dtype=object)}
     for each in fields(kind):
         values = [getattr(row, each.name) for _, row in named]
-        columns[each.name] = pd.Series(values, dtype=_dtype(hints[each.name]))
+        columns[each.name] = pd.Series(values, dtype=dtypes.get(hints[each.name], "float64"))
     strings = [column for column, values in columns.items() if values.dtype == object]
     encodings = {column: "utf8" if column in strings else "infer" for column in columns}
     with atomic_write(path) as beside:
         fastparquet.write(str(beside), pd.DataFrame(columns), object_encoding=encodings, write_index=False)
     return True
-
-
-def _dtype(hint: Any) -> Any:
-    if hint is int:
-        return "int64"
-    return object if hint in (str, str | None) else "float64"
