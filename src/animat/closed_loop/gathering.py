@@ -24,9 +24,15 @@ from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 from animat.writing import atomic_write
 
+LOG_FILE = "session.log"
+RECORDING_FILE = "session.nwb"
+TICKS_FILE = "ticks.csv"
+STOP_FILE = "STOP"
+"""In a session's folder: whoever makes it, empty or not, ends the session as Ctrl-C does."""
+
 
 class Pulses:
-    """Grows by what was seen in each stretch of time."""
+    """The pulses of a session, column by column: half a million take 50 MB, and not a gigabyte."""
 
     def __init__(self) -> None:
         self._time_s, self._frequency_hz = array("d"), array("d")
@@ -65,13 +71,6 @@ class Pulses:
             electrodes=electrodes,
             presentation=np.array(self._presentation, np.int64),
         )
-
-
-LOG_FILE = "session.log"
-RECORDING_FILE = "session.nwb"
-TICKS_FILE = "ticks.csv"
-STOP_FILE = "STOP"
-"""In a session's folder: whoever makes it, empty or not, ends the session as Ctrl-C does."""
 
 
 class Gathered:

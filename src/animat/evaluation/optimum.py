@@ -16,8 +16,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 from animat.environment import Environment
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, layers_of, nodes_for
-from animat.evaluation.landings import Motion
-from animat.evaluation.outcomes import Outcomes, side_by_side
+from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.history import AT_FIRST

@@ -110,8 +110,7 @@ class PlainColumns:
     def _channels(self, n_spikes: int, noted: list[Finding]) -> tuple[Channels, Int64[np.ndarray, " spikes"]]:
         """The channel table, and the row of each spike in it."""
         values = _column("spike_channel", self.spike_channel, n_spikes, "one channel a spike")
-        nameless = int(np.count_nonzero(values == "" if _is_text(values) else values != values))
-        if nameless:
+        if nameless := int(np.count_nonzero(values == "" if _is_text(values) else values != values)):
             raise UnusableData(f"spike_channel: expected a channel for each spike, got {nameless} without one")
         if not _is_text(values):
             values = _whole("spike_channel", values)

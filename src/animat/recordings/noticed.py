@@ -47,8 +47,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield from channel_findings(recording)
     yield from time_findings(recording)
     yield from _stimulus_rows(recording)
-    unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest))
-    if unknown:
+    if unknown := int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest)):
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
@@ -67,8 +66,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
         yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_A_SPIKE else "note", message, ratio)
     last = recording.stimuli.is_last_of_presentation
-    same = int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1]))
-    if same:
+    if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
         message = (
             f"{same:,} of {len(times_s):,} stimuli come at the very time of the one before, and the response is "
             "counted for each: where they are the electrodes of one stimulus, put these into one row"
@@ -96,8 +94,7 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     channels = recording.channels
     n, n_spikes = len(channels), len(recording.spike_times_s)
     count = np.bincount(recording.spike_channels, minlength=n)
-    silent = int(np.count_nonzero(count == 0))
-    if silent:
+    if silent := int(np.count_nonzero(count == 0)):
         mostly = silent > MOSTLY_SILENT * n
         message = f"{silent:,} of {n:,} channels are silent; they count in rates per channel"
         message += ": route electrodes where the culture fires" if mostly else ""

@@ -16,6 +16,7 @@ from animat.errors import InvalidFile
 from animat.report.style import PNG_DPI
 from animat.writing import write_whole
 
+TEMPLATE = "report.html.j2"
 MINUS = "\u2212"
 
 # Not within a word, a range such as 2-10, an option or a file's name; the exponent's of 1.5e-05 is one.
@@ -25,9 +26,6 @@ _HYPHEN = re.compile(r"(?:(?<![\w.\-/])-(?=\.?\d))|(?<=\de)-(?=\d)")
 def with_minus(text: str) -> str:
     """A text with a minus sign before each negative number, in place of a hyphen."""
     return _HYPHEN.sub(MINUS, text)
-
-
-TEMPLATE = "report.html.j2"
 
 
 @dataclass(frozen=True)

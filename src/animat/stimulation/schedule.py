@@ -134,7 +134,9 @@ def make_schedule(
         orders = [rng.permutation(np.repeat(np.arange(n_conditions), each))]
     if places:
         return Schedule(protocol, seed, _at_places(protocol, orders, patterns, places))
-    read = [_balanced(rng, protocol.patterns, each) for _ in range(n_frequencies)]
+    # Each pattern as often as the others, one round after the other, each round in random order.
+    rounds = range(-(-each // protocol.patterns))
+    read = [np.concatenate([rng.permutation(protocol.patterns) for _ in rounds])[:each] for _ in range(n_frequencies)]
     taken = [0] * n_frequencies
     blocks, presentation = [], 0
     for order in orders:
@@ -188,12 +190,6 @@ def _block(
     end_s = on_ticks(time_s[-1:] + protocol.tail_s)[0]
     stimuli = Stimuli(time_s, frequency_hz, pattern, electrodes, presentation)
     return Block(protocol.setup_s, float(end_s), stimuli)
-
-
-def _balanced(rng: np.random.Generator, patterns: int, trials: int) -> Int64[np.ndarray, " trials"]:
-    """Each pattern as often as the others, one round after the other, each round in random order."""
-    rounds = -(-trials // patterns)
-    return np.concatenate([rng.permutation(patterns) for _ in range(rounds)])[:trials]
 
 
 def _train(rng: np.random.Generator, protocol: Protocol, last: int) -> Int64[np.ndarray, " pulses"]:

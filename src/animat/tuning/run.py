@@ -34,15 +34,13 @@ from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, returns_file, same_shapes, timeline_file
 
 MANIFEST = "tune.json"
+FINALS = "finals"
 
 
 def describe_tuning(tuning: Tuning, sources: dict[str, str]) -> dict[str, Any]:
     """What decides how a tuning comes out, as of a study (`describe_study`), with a fingerprint over all of it."""
     versions = {**describe_study(tuning.study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
     return with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
-
-
-FINALS = "finals"
 
 
 def tune(

@@ -193,8 +193,7 @@ def _findings(
     n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
-    dead = int(np.count_nonzero(is_dead(noise_uv)))
-    if dead:
+    if dead := int(np.count_nonzero(is_dead(noise_uv))):
         message = (
             f"{dead:,} of {n:,} channels are dead (less than {DEAD:g} of the median noise): no spike can be found on "
             "them, and they count in rates per channel; leave them out of the routing next time"

@@ -83,8 +83,7 @@ def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndar
     yield from _without_condition(recording.stimuli, assignment)
     read = recording.stimuli.is_last_of_presentation
     n_read = int(np.count_nonzero(read))
-    late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
-    if late:
+    if late := int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside)):
         message = f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out"
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
@@ -110,8 +109,7 @@ def _timing(responses: Responses, recording: Recording, assignment: Assignment) 
     read = stimuli.is_last_of_presentation
     gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
     # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
-    overlapping = int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6)))
-    if overlapping:
+    if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
         message = (
             f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
             f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window"
