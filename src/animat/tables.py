@@ -23,15 +23,21 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
     """Turn the named attributes into read-only arrays of these types and of one length."""
     length = None
     for attribute, dtype in dtypes.items():
-        array = np.array(getattr(table, attribute), dtype=dtype)
+        array = read_only(table, attribute, dtype)
         if array.ndim == 0 or (length is not None and len(array) != length):
             raise UnusableData(
                 f"{attribute}: expected {length if length is not None else 'a column of'} values in {name}, "
                 f"got shape {array.shape}"
             )
         length = len(array)
-        array.setflags(write=False)
-        object.__setattr__(table, attribute, array)
+
+
+def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
+    """Turn an attribute of a frozen dataclass into an array that nobody changes; returns it."""
+    array = np.array(getattr(table, attribute), dtype=dtype)
+    array.setflags(write=False)
+    object.__setattr__(table, attribute, array)
+    return array
 
 
 def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]:

@@ -49,12 +49,12 @@ class Picture:
     @property
     def data(self) -> str:
         """The PNG as a data address."""
-        return _address(_bytes(self.file))
+        return _address(self.file)
 
     @property
     def narrow_data(self) -> str | None:
         """The PNG for a telephone as a data address, where there is one of its own."""
-        return None if self.narrow is None else _address(_bytes(self.narrow))
+        return None if self.narrow is None else _address(self.narrow)
 
     @property
     def width_px(self) -> int:
@@ -154,8 +154,8 @@ def _bytes(file: Path) -> bytes:
         raise InvalidFile(f"{file}: expected a figure, got none: {error.strerror or error}") from error
 
 
-def _address(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def _address(file: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(_bytes(file)).decode()
 
 
 def cell(value: Any) -> str:

@@ -18,7 +18,7 @@ from animat.records import Number, Whole, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
-from animat.tables import briefly
+from animat.tables import briefly, read_only
 from animat.writing import write_whole
 
 _MOST_BYTES = 2**24
@@ -91,11 +91,9 @@ class Selection:
 
     def __post_init__(self) -> None:
         for name, dimensions in (("recording", 1), ("stimulation", 1), ("patterns", 2)):
-            values = np.array(getattr(self, name), dtype=np.int64)
+            values = read_only(self, name, np.int64)
             if values.ndim != dimensions:
                 raise InvalidArgument(f"selection.{name}: expected {dimensions} dimensions, got {values.shape}")
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
             if values.size:
                 self.array.position_um(values.ravel())
         for name in ("recording", "stimulation"):
