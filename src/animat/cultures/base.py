@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from inspect import getattr_static
 from types import FunctionType
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 from jaxtyping import Int64
@@ -16,7 +16,7 @@ from animat.cultures.failing import as_device_failure
 from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, stimulus_table, with_rests
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
-from animat.cultures.safety import Admitted
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import AnimatError, InvalidArgument
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
@@ -313,3 +313,23 @@ def refuse_overrides(cls: type, base: type, *, leaving: Collection[str]) -> None
             raise TypeError(
                 f"{cls.__name__}.{name}: final in {base.__name__}; implement the methods that its description names"
             )
+
+
+class ComputedCulture(Culture):
+    """A culture that a program computes: a delivery comes to its end within its call, and nothing is to be let go of.
+
+    Closed and opened again it is where it was. Arguments as of `Culture`.
+    """
+
+    ends_within_s: ClassVar[float] = -1
+
+    @property
+    def device_limits(self) -> Limits:
+        """`SIMULATED_LIMITS`."""
+        return SIMULATED_LIMITS
+
+    def _halt(self) -> None:
+        """Do nothing: the guard refuses the next delivery."""
+
+    def _close(self) -> None:
+        """Do nothing."""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.cultures.base import Culture
+from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
+from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
 from animat.plain_file import expect_plain_file
@@ -38,7 +38,7 @@ WARM_UP_S = 5.0
 """Passes before anything is measured: a fresh tissue is not in its stride."""
 
 
-class VirtualCulture(Culture):
+class VirtualCulture(ComputedCulture):
     """A simulated culture; `docs/virtual-culture.md` says what of.
 
     When it is first opened the array is scanned and electrodes are chosen; then the tissue is put back to where it was,
@@ -63,8 +63,6 @@ class VirtualCulture(Culture):
     """
 
     name: ClassVar[str] = "virtual"
-    # A delivery is computed, and comes to its end.
-    ends_within_s: ClassVar[float] = -1
 
     def __init__(
         self,
@@ -149,11 +147,6 @@ class VirtualCulture(Culture):
     def n_patterns(self) -> int:
         """How many patterns it has, known before it is opened."""
         return (self._rule or SelectionRule()).patterns if self._selection is None else len(self._selection.patterns)
-
-    @property
-    def device_limits(self) -> Limits:
-        """`SIMULATED_LIMITS`."""
-        return SIMULATED_LIMITS
 
     @property
     def now_s(self) -> float:
@@ -345,14 +338,6 @@ class VirtualCulture(Culture):
             self._now_ns = min(now_ns, round(self.tissue.now_s * NS))
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
-
-    def _halt(self) -> None:
-        # Delivery happens within a call, and the guard refuses the next one.
-        pass
-
-    def _close(self) -> None:
-        # The tissue lives on: a culture that is opened again is where it was.
-        pass
 
 
 def _with_floats(settings: Settings) -> Settings:
