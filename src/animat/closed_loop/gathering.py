@@ -113,7 +113,9 @@ class Gathered:
         header, outline, stimuli = self._header, self.outline, self._pulses.stimuli()
         words = {
             **header.provenance,
-            "session_description": _described(header),
+            "session_description": "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who "
+            f"chose the stimuli changes from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this "
+            "file says whose each stimulus was, and what came of it.",
             "recorded_at": header.recorded_at,
             "closed_loop": header.loop,
             "closed_loop_ended": f"{ending.by}: {ending.message}",
@@ -219,11 +221,3 @@ def unanswered_pulses(outline: Outline) -> int:
 def in_words(left_out: Mapping[str, int]) -> str:
     """What the session does not have."""
     return ", ".join(f"{count} {what}" for what, count in left_out.items())
-
-
-def _described(header: Header) -> str:
-    return (
-        "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
-        f"from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this file says whose each "
-        "stimulus was, and what came of it."
-    )

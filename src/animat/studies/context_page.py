@@ -152,7 +152,7 @@ def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
         ("best coupling", "coupling"),
         ("policies", "policies"),
         ("optimum", lambda row: row.optimum if row.best_known is None else f"≥ {cell(row.best_known)}"),
-        ("gap", _gap),
+        ("gap", lambda row: None if row.gap is None else _least(row) + _hundredths(row.gap)),
         ("score, 95 %", _score),
         ("bits", "bits"),
     ]
@@ -178,10 +178,6 @@ def _on_the_culture(rows: Sequence[ContextRow]) -> Table:
         "predicted for the same policies."
     )
     return table_of("On the culture, in closed loop", rows, columns, note=note, beside=TABLE)
-
-
-def _gap(row: ContextRow) -> str | None:
-    return None if row.gap is None else _least(row) + _hundredths(row.gap)
 
 
 def _score(row: ContextRow) -> str | None:

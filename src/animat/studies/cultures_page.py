@@ -43,7 +43,7 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         found.summary,
         [
             *columns_of("comparison", "robot", "mean_first", "mean_second", "difference"),
-            ("95 % interval", _interval),
+            ("95 % interval", lambda row: "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"),
             ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
             ("significantly better in", "found_better"),
         ],
@@ -61,10 +61,6 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
     return Section("Results in short", (), points, (table,), (picture,))
-
-
-def _interval(row: OverCultures) -> str:
-    return "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"
 
 
 def _told(study: Study, row: OverCultures) -> str:
