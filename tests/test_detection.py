@@ -17,8 +17,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
-from animat.recordings.detection.negative_peaks import find_negative_peaks
-from animat.recordings.detection.noise import median_noise_uv
+from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.settings import Detection
 from animat.recordings.raw import ArrayTraces, in_microvolts
 from animat.recordings.recording import Channels

@@ -23,7 +23,7 @@ from animat.goals.region import Ball, Range
 from animat.goals.robot import RobotWithGoal, body_and_goal, robot_of, with_goal, without_goal
 from animat.goals.text import read_goal
 from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, Shuttle, SwingUp, robot_named
-from animat.robots.capabilities import lacking
+from animat.robots.base import lacking
 from animat.robots.checking import check_robot
 from animat.robots.grid import grid_for, no_grid
 from animat.training.sac import shaped

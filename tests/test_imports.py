@@ -14,7 +14,6 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
 GROUND = (
-    "brief",
     "compilation",
     "ctrl_c",
     "devices",

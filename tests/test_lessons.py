@@ -26,8 +26,7 @@ from animat.goals.robot import with_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.robots import ROBOTS, Cartpole, SwingUp, robot_named
 from animat.robots.base import Quantity, Robot
-from animat.training.assessment import assess
-from animat.training.course import Course, programs_with_ranges, rows_of
+from animat.training.course import Course, assess, programs_with_ranges, rows_of
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group, train_group
 from animat.training.lessons import Lesson, expect_lessons, read_lessons

@@ -30,10 +30,10 @@ from animat.errors import (
     UnusableData,
 )
 from animat.live import shadowing
-from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
 from animat.live.recording import record_within
 from animat.live.shadowing import LiveRun, live
+from animat.live.trainers import Exchange
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from animat.reality_gap.answered import Answered
-from animat.reality_gap.passes import Passes
+from animat.reality_gap.answered import Answered, Passes
 from animat.reality_gap.predicting import Predicted
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.responses.condition import Condition

@@ -39,7 +39,7 @@ from animat.robots import (
     robot_named,
     robot_to_dict,
 )
-from animat.robots.capabilities import WITHOUT, lacking
+from animat.robots.base import WITHOUT, lacking
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.specification import RobotSpec, Study

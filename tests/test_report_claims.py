@@ -15,9 +15,8 @@ from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Group, Pair, draw_comparisons
 from animat.report.controls import Controls, draw_controls
 from animat.report.headline import ArmReturns, draw_headline
-from animat.report.html import Picture, Section, write_page
+from animat.report.html import Picture, Section, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.minus import with_minus
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.style import save_figure
 from animat.robots import Cartpole

@@ -19,12 +19,12 @@ from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
-from animat.studies.draws import draw_seed
 from animat.studies.recording import Record
 from animat.studies.run import run_study
 from animat.studies.simulating import Fit, controllability, load_timeline
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
+from animat.studies.task import draw_seed
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import TrainGroup
 from animat.training.lessons import Lesson

@@ -24,7 +24,6 @@ from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.robots import Navigation
-from animat.studies.draws import draw_seed
 from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, tabulated, write_episodes
 from animat.studies.evaluating import Evaluate
 from animat.studies.optima import FindOptima, read_optima
@@ -36,6 +35,7 @@ from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, named_mapping
 from animat.studies.tabulating import References, Tabulate, _known
+from animat.studies.task import draw_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
 from animat.wrappers import ShuffledDelivery

@@ -21,8 +21,8 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile
+from animat.watch.app import stop_session
 from animat.watch.session import SessionView
-from animat.watch.stopping import stop_session
 from animat.watch.tail import Tail
 from watching import session_in
 

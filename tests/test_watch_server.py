@@ -16,7 +16,7 @@ from animat.closed_loop.log import LogWriter, read_log
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
-from animat.tuning.folder import MANIFEST as TUNING
+from animat.tuning.run import MANIFEST as TUNING
 from animat.watch.found import _MARKS, find
 from watching import OWN, PORT, TOKEN, asked, session_in
 

@@ -22,10 +22,10 @@ from animat.studies.toml import read_study
 from animat.watch.cultures import CulturesView
 from animat.watch.held import is_held
 from animat.watch.recording import RecordingView
-from animat.watch.speed import Speed
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
+from animat.watch.view import Speed
 from animat.writing import exclusive_lock
 
 TINY = Path(__file__).parent / "tiny_study.toml"
@@ -285,7 +285,7 @@ def test_a_folder_is_held_while_a_run_has_locked_it(tmp_path: Path) -> None:
 
 def test_speed_is_that_of_the_last_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     speed, now_s = Speed(), [0.0]
-    monkeypatch.setattr("animat.watch.speed.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("animat.watch.view.time.monotonic", lambda: now_s[0])
     assert speed.left_s(10) is None
     for second in range(201):
         now_s[0] = float(second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -22,15 +23,21 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
     """Turn the named attributes into read-only arrays of these types and of one length."""
     length = None
     for attribute, dtype in dtypes.items():
-        array = np.array(getattr(table, attribute), dtype=dtype)
+        array = read_only(table, attribute, dtype)
         if array.ndim == 0 or (length is not None and len(array) != length):
             raise UnusableData(
                 f"{attribute}: expected {length if length is not None else 'a column of'} values in {name}, "
                 f"got shape {array.shape}"
             )
         length = len(array)
-        array.setflags(write=False)
-        object.__setattr__(table, attribute, array)
+
+
+def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
+    """Turn an attribute of a frozen dataclass into an array that nobody changes; returns it."""
+    array = np.array(getattr(table, attribute), dtype=dtype)
+    array.setflags(write=False)
+    object.__setattr__(table, attribute, array)
+    return array
 
 
 def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]:
@@ -48,8 +55,7 @@ def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
 
 def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
     """Refuse times that are not finite, or not within a century (UnusableData, by the name of the column)."""
-    bad = np.count_nonzero(~np.isfinite(times_s))
-    if bad:
+    if bad := np.count_nonzero(~np.isfinite(times_s)):
         raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
     far = np.abs(times_s) > CENTURY_S
     if np.any(far):
@@ -63,3 +69,18 @@ def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> No
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
+
+
+def briefly(record: Any) -> str:
+    """A dataclass in a line or a few, to be its `__repr__`."""
+    shown = (f"{field.name}={_brief(getattr(record, field.name))}" for field in fields(record) if field.repr)
+    return f"{type(record).__name__}({', '.join(shown)})"
+
+
+def _brief(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, tuple | list | dict) and len(value) > 6:
+        return f"<{len(value)} values>"
+    text = repr(value)
+    return text if len(text) <= 200 else f"<{type(value).__name__}>"

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from animat.environment import Animat, Environment, Responded, RobotState, State, Uniforms
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.base import Quantity, Robot
-from animat.robots.capabilities import capability
+from animat.robots.base import Quantity, Robot, capability
 from animat.robots.host import HostRobot
 
 Delivery = Literal["chosen", "shuffled"]

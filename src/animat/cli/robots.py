@@ -50,7 +50,7 @@ class Robots:
 def _told(name: str) -> dict[str, Any]:
     from animat.registry import is_ours
     from animat.robots import robot_named, robot_to_dict
-    from animat.robots.capabilities import WITHOUT, lacking
+    from animat.robots.base import WITHOUT, lacking
     from animat.robots.checking import check_robot
 
     robot = robot_named(name)

@@ -80,7 +80,7 @@ def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
     from animat.lined_up import lined_up
     from animat.studies.cultures import run_over_cultures
     from animat.studies.cultures_page import write_cultures_page
-    from animat.studies.parquet import MISSING
+    from animat.studies.results import MISSING
 
     began = time.monotonic()
     with command.at_work("study") as how:

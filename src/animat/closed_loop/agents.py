@@ -9,8 +9,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from jaxtyping import Float, Float64
 
-from animat.robots.base import Robot
-from animat.robots.capabilities import capability
+from animat.robots.base import Robot, capability
 
 LoopDelivery = Literal["chosen", "shuffled", "silent", "yoked"]
 """What the culture is given; a training (`animat.wrappers.Delivery`) has the first two alone."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
+
+import numpy as np
 
 from animat.closed_loop.header import Header
 from animat.closed_loop.log import Record, Records
 from animat.closed_loop.outline import Outline, electrode_pulses_of
-from animat.closed_loop.pulses import Pulses
 from animat.closed_loop.tick import Ending
 from animat.closed_loop.tick_table import TickTable
 from animat.errors import AnimatError, InvalidFile
@@ -18,7 +20,8 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
-from animat.stimulation.stimulus import NOTHING
+from animat.stimulation.stimulus import NOTHING, Stimuli
+from animat.tables import UNKNOWN
 from animat.writing import atomic_write
 
 LOG_FILE = "session.log"
@@ -26,6 +29,48 @@ RECORDING_FILE = "session.nwb"
 TICKS_FILE = "ticks.csv"
 STOP_FILE = "STOP"
 """In a session's folder: whoever makes it, empty or not, ends the session as Ctrl-C does."""
+
+
+class Pulses:
+    """The pulses of a session, column by column: half a million take 50 MB, and not a gigabyte."""
+
+    def __init__(self) -> None:
+        self._time_s, self._frequency_hz = array("d"), array("d")
+        self._pattern, self._presentation = array("q"), array("q")
+        self._electrodes, self._widths = array("q"), array("q")
+
+    def add(self, seen: Mapping[str, Any]) -> None:
+        """The pulses of a stretch, from the words of its record."""
+        for frequency_hz, pattern, presentation, electrodes in seen["stimuli"]:
+            self._frequency_hz.append(frequency_hz)
+            self._pattern.append(pattern)
+            self._presentation.append(presentation)
+            self._electrodes.extend(electrodes)
+            self._widths.append(len(electrodes))
+        if seen["tick"]:
+            self._time_s.extend(seen["tick"]["pulse_time_s"])
+
+    @property
+    def last_s(self) -> float:
+        """When the last one came; 0 before any."""
+        return self._time_s[-1] if self._time_s else 0.0
+
+    def stimuli(self) -> Stimuli:
+        """As the table of a recording.
+
+        Raises:
+            UnusableData: for columns that do not fit together.
+        """
+        widths = np.array(self._widths, np.int64)
+        electrodes = np.full((len(widths), int(np.max(widths, initial=0)) if len(widths) else 1), UNKNOWN)
+        electrodes[np.arange(electrodes.shape[1])[None, :] < widths[:, None]] = self._electrodes
+        return Stimuli(
+            time_s=np.array(self._time_s, np.float64),
+            frequency_hz=np.array(self._frequency_hz, np.float64),
+            pattern=np.array(self._pattern, np.int64),
+            electrodes=electrodes,
+            presentation=np.array(self._presentation, np.int64),
+        )
 
 
 class Gathered:
@@ -68,7 +113,9 @@ class Gathered:
         header, outline, stimuli = self._header, self.outline, self._pulses.stimuli()
         words = {
             **header.provenance,
-            "session_description": _described(header),
+            "session_description": "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who "
+            f"chose the stimuli changes from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this "
+            "file says whose each stimulus was, and what came of it.",
             "recorded_at": header.recorded_at,
             "closed_loop": header.loop,
             "closed_loop_ended": f"{ending.by}: {ending.message}",
@@ -174,11 +221,3 @@ def unanswered_pulses(outline: Outline) -> int:
 def in_words(left_out: Mapping[str, int]) -> str:
     """What the session does not have."""
     return ", ".join(f"{count} {what}" for what, count in left_out.items())
-
-
-def _described(header: Header) -> str:
-    return (
-        "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who chose the stimuli changes "
-        f"from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this file says whose each "
-        "stimulus was, and what came of it."
-    )

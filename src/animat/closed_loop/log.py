@@ -25,7 +25,6 @@ from typing import Any, BinaryIO, NamedTuple, overload
 import numpy as np
 from jaxtyping import Float64, Int, Int64
 
-from animat.closed_loop.former import in_todays_words
 from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import expect_plain_file
 from animat.writing import keep_name
@@ -266,3 +265,27 @@ def words_of(path: Path, data: bytes) -> dict[str, Any]:
     if not isinstance(words, dict):
         raise InvalidFile(f"{path}: expected names and values in every record, got {type(words).__name__}")
     return in_todays_words(words)
+
+
+_RECORD = {"contenders": "agents", "sentence": "message"}
+_LOOP = {"lead_in": "warm_up", "following": "adaptive"}
+_TICK = {"contender": "agent"}
+_HANDLED = {"lead-in": "warm-up"}
+
+
+def in_todays_words(words: dict[str, Any]) -> dict[str, Any]:
+    """A record's words by the names of today."""
+    words = _renamed(words, _RECORD)
+    if isinstance(loop := words.get("loop"), dict):
+        words["loop"] = _renamed(loop, _LOOP)
+    if isinstance(tick := words.get("tick"), dict):
+        words["tick"] = tick = _renamed(tick, _TICK)
+        if isinstance(handled := tick.get("handled"), str):
+            tick["handled"] = _HANDLED.get(handled, handled)
+    return words
+
+
+def _renamed(words: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    if names.keys().isdisjoint(words):
+        return words
+    return {names.get(name, name): value for name, value in words.items()}

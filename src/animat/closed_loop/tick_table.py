@@ -6,29 +6,19 @@ import csv
 from collections.abc import Mapping, Sequence
 from typing import Any, TextIO
 
-HEAD = (
-    "tick",
-    "time_s",
-    "agent",
-    "episode",
-    "iteration",
-    "chosen",
-    "delivered",
-    "frequency_hz",
-    "patterns",
-    "pulse_times_s",
-    "electrode_pulses",
-    "spikes",
-    "rate_hz",
-    "active_ratio",
-    "is_burst",
-    "handled",
-    "command",
-    "reward",
-)
-"""Before the observation. `time_s` is that of the pulse that the response was read after, on the session's clock."""
+HEAD = {
+    "tick": "number",
+    "time_s": "read_after_s",
+    **{name: name for name in ("agent", "episode", "iteration", "chosen", "delivered", "frequency_hz", "patterns")},
+    "pulse_times_s": "pulse_time_s",
+    **{name: name for name in ("electrode_pulses", "spikes", "rate_hz", "active_ratio", "is_burst", "handled")},
+    **{name: name for name in ("command", "reward")},
+}
+"""Columns before the observation, and their names in a tick's words. `time_s` is that of the pulse that the response
+was read after, on the session's clock."""
 
-TAIL = ("is_terminated", "is_truncated", "late_s", "decided_s", "wall_s")
+TAIL = {"is_terminated": "terminated", "is_truncated": "truncated"}
+TAIL |= {name: name for name in ("late_s", "decided_s", "wall_s")}
 """After it."""
 
 
@@ -50,7 +40,7 @@ class TickTable:
         self, file: TextIO, conditions: Sequence[str], observed: Sequence[str], readouts: Sequence[str] = ()
     ) -> None:
         self._writer = csv.writer(file, lineterminator="\n")
-        self._conditions, self._observed, self._readouts = conditions, len(observed), len(readouts)
+        self._conditions, self._n_observed, self._n_readouts = conditions, len(observed), len(readouts)
         names = [name.replace(" ", "_") for name in readouts]
         names = list(readouts) if len(set(names)) < len(names) else names
         commands = [f"command_{name}" for name in names] if len(names) > 1 else ["command"]
@@ -63,37 +53,15 @@ class TickTable:
         Raises:
             OSError: if it cannot be written.
         """
-        self._writer.writerow(_row(tick, self._conditions, self._observed, self._readouts))
-
-
-def _row(tick: Mapping[str, Any], conditions: Sequence[str], observed: int, readouts: int) -> list[Any]:
-    command = tick["command"]
-    row = [
-        tick["number"],
-        tick["read_after_s"],
-        tick["agent"],
-        tick["episode"],
-        tick["iteration"],
-        conditions[tick["chosen"]],
-        conditions[tick["delivered"]],
-        tick["frequency_hz"],
-        " ".join(map(str, tick["patterns"])),
-        " ".join(map(str, tick["pulse_time_s"])),
-        tick["electrode_pulses"],
-        tick["spikes"],
-        tick["rate_hz"],
-        tick["active_ratio"],
-        int(tick["is_burst"]),
-        tick["handled"],
-        *(command if isinstance(command, Sequence) else (command,) * max(1, readouts)),
-        tick["reward"],
-        *(tick["readout_hz"] if readouts else ()),
-        *(tick["observation"] or (None,) * observed),
-        int(tick["terminated"]),
-        int(tick["truncated"]),
-        tick["late_s"],
-        tick["decided_s"],
-        tick["wall_s"],
-    ]
-    # What is not equal to itself is NaN.
-    return [value if value == value else None for value in row]
+        command = tick["command"]
+        told = {name: " ".join(map(str, tick[name])) for name in ("patterns", "pulse_time_s")}
+        told |= {name: self._conditions[tick[name]] for name in ("chosen", "delivered")}
+        flags = {name: int(tick[name]) for name in ("is_burst", "terminated", "truncated")}
+        known = {**tick, **told, **flags}
+        row = [known[name] for name in HEAD.values()]
+        row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, self._n_readouts)
+        row += tick["readout_hz"] if self._n_readouts else ()
+        row += tick["observation"] or (None,) * self._n_observed
+        row += (known[name] for name in TAIL.values())
+        # What is not equal to itself is NaN.
+        self._writer.writerow([value if value == value else None for value in row])

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, final
+from inspect import getattr_static
+from types import FunctionType
+from typing import Any, ClassVar, final
 
 import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failing import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, presented, with_rests
+from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, stimulus_table, with_rests
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
-from animat.cultures.safety import Admitted
-from animat.cultures.sealing import refuse_overrides
+from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import AnimatError, InvalidArgument
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
@@ -195,14 +196,10 @@ class Culture(Openable):
             raise InvalidArgument("stimuli: expected at least one in a trial, got none")
         start_min = self.now_s / 60
         observed = self.deliver(stimuli, stimuli[-1].time_s + until_ms * 1e-3)
-        return presented(
-            stimuli,
-            observed,
-            channels=self.channels,
-            sampling_rate_hz=self.sampling_rate_hz,
-            start_min=start_min,
-            presentation=presentation,
-        )
+        table = stimulus_table(stimuli, observed.stimulus_time_s)
+        # From 0 s on its own clock.
+        span = 0.0, observed.duration_s, start_min
+        return Recording(*observed.spikes, self.channels, table, self.sampling_rate_hz, *span, presentation)
 
     @final
     def schedule(self, protocol: Protocol, seed: int = 0) -> Schedule:
@@ -285,3 +282,54 @@ class Culture(Openable):
             offset_s += block.duration_s
         with turns as guard:
             guard.check(stimuli, self.now_s)
+
+
+_BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
+"""They are called before whatever the base class has, or in its place."""
+
+
+def refuse_overrides(cls: type, base: type, *, leaving: Collection[str]) -> None:
+    """Refuse a subclass in which anything but abstract methods of the base class is replaced, private or not.
+
+    Args:
+        cls: the subclass; wherever it has a name from, what stands before `base` among its bases counts.
+        base: whose methods and properties are called.
+        leaving: names that may be replaced though they are not abstract.
+
+    Raises:
+        TypeError: naming the first one.
+    """
+    own = {
+        name: member
+        for kind in reversed(base.__mro__)
+        for name, member in vars(kind).items()
+        if kind.__module__.startswith(f"{__package__}.")
+        and isinstance(member, FunctionType | property | classmethod)
+        and not getattr(member, "__isabstractmethod__", False)
+        and name not in leaving
+    } | {name: getattr_static(base, name, None) for name in _BEFORE_ALL}
+    for name, member in own.items():
+        if getattr_static(cls, name, None) is not member:
+            raise TypeError(
+                f"{cls.__name__}.{name}: final in {base.__name__}; implement the methods that its description names"
+            )
+
+
+class ComputedCulture(Culture):
+    """A culture that a program computes: a delivery comes to its end within its call, and nothing is to be let go of.
+
+    Closed and opened again it is where it was. Arguments as of `Culture`.
+    """
+
+    ends_within_s: ClassVar[float] = -1
+
+    @property
+    def device_limits(self) -> Limits:
+        """`SIMULATED_LIMITS`."""
+        return SIMULATED_LIMITS
+
+    def _halt(self) -> None:
+        """Do nothing: the guard refuses the next delivery."""
+
+    def _close(self) -> None:
+        """Do nothing."""

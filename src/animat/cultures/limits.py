@@ -121,16 +121,10 @@ def is_multiple(value: float, step: float) -> bool:
 
 _IS_AS_TIGHT: dict[str, Callable[[Any, Any], bool]] = {
     "kind": operator.eq,
-    "amplitude": operator.le,
     "phase_us": lambda ours, device: device[0] <= ours[0] and ours[1] <= device[1],
-    "charge_per_phase": operator.le,
-    "net_charge": operator.le,
-    "net_charge_per_session": operator.le,
-    "electrodes_at_once": operator.le,
-    "stimuli_per_electrode_s": operator.le,
-    "stimuli_per_s": operator.le,
-    "stimuli_per_session": operator.le,
-    "phases_per_pulse": operator.le,
+    **dict.fromkeys(("amplitude", "charge_per_phase", "net_charge", "net_charge_per_session"), operator.le),
+    **dict.fromkeys(("stimuli_per_electrode_s", "stimuli_per_s", "stimuli_per_session"), operator.le),
+    **dict.fromkeys(("electrodes_at_once", "phases_per_pulse"), operator.le),
     "alternates": operator.ge,
     "phase_step_us": is_multiple,
     # The device's own, for which 0 stands: another one would have the guard judge a pulse that nobody delivers.

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.recording import Channels, RecordedCulture, Recording
-from animat.stimulation.protocol import Presentation
 from animat.stimulation.schedule import Schedule
 from animat.stimulation.stimulus import Stimuli, Stimulus
 from animat.tables import padded
@@ -79,29 +78,6 @@ def stimulus_table(stimuli: Sequence[Stimulus], time_s: Float64[np.ndarray, " st
     )
 
 
-def presented(
-    stimuli: Sequence[Stimulus],
-    observed: Observed,
-    *,
-    channels: Channels,
-    sampling_rate_hz: float,
-    start_min: float,
-    presentation: Presentation | None,
-) -> Recording:
-    """One presentation as a recording; arguments as of `assembled`."""
-    return Recording(
-        spike_times_s=observed.spikes.time_s,
-        spike_channels=observed.spikes.channel,
-        channels=channels,
-        stimuli=stimulus_table(stimuli, observed.stimulus_time_s),
-        sampling_rate_hz=sampling_rate_hz,
-        start_s=0.0,
-        duration_s=observed.duration_s,
-        start_min=start_min,
-        presentation=presentation,
-    )
-
-
 def assembled(
     schedule: Schedule,
     observed: Sequence[Observed],
@@ -127,6 +103,7 @@ def assembled(
     """
     starts_s = np.cumsum([0.0, *(block.duration_s for block in observed)])
     tables = [block.stimuli for block in schedule.blocks]
+    columns = {each.name: np.concatenate([getattr(table, each.name) for table in tables]) for each in fields(Stimuli)}
 
     def on_samples(parts: Sequence[Float64[np.ndarray, " times"]]) -> Float64[np.ndarray, " times"]:
         # Adding the blocks' starts leaves rounding errors behind.
@@ -137,13 +114,7 @@ def assembled(
         spike_times_s=on_samples([block.spikes.time_s for block in observed]),
         spike_channels=np.concatenate([block.spikes.channel for block in observed]),
         channels=channels,
-        stimuli=Stimuli(
-            time_s=on_samples([block.stimulus_time_s for block in observed]),
-            frequency_hz=np.concatenate([table.frequency_hz for table in tables]),
-            pattern=np.concatenate([table.pattern for table in tables]),
-            electrodes=np.concatenate([table.electrodes for table in tables]),
-            presentation=np.concatenate([table.presentation for table in tables]),
-        ),
+        stimuli=Stimuli(**columns | {"time_s": on_samples([block.stimulus_time_s for block in observed])}),
         sampling_rate_hz=sampling_rate_hz,
         start_s=0.0,
         # Blocks may end between two samples: what is moved to the next one is still within. Not for a rounding error.

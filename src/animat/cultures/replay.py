@@ -8,9 +8,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from animat.cultures.base import Culture
+from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
+from animat.cultures.safety import Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import Stimulus
@@ -23,7 +23,7 @@ REACH_S = 1.0
 """How much of what followed a stimulus is its answer, unless another one came sooner: beyond any response window."""
 
 
-class ReplayCulture(Culture):
+class ReplayCulture(ComputedCulture):
     """A culture made of recordings: a stimulus at f is answered by the spikes that followed a recorded one at f.
 
     The last pulse of a presentation is answered by one that was the last of a recorded presentation, the others by
@@ -46,8 +46,6 @@ class ReplayCulture(Culture):
     """
 
     name: ClassVar[str] = "replay"
-    # A delivery is computed, and comes to its end.
-    ends_within_s: ClassVar[float] = -1
 
     def __init__(
         self,
@@ -101,11 +99,6 @@ class ReplayCulture(Culture):
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
         """The patterns of the first recording, in the order of their numbers."""
         return self._patterns
-
-    @property
-    def device_limits(self) -> Limits:
-        """`SIMULATED_LIMITS`."""
-        return SIMULATED_LIMITS
 
     @property
     def now_s(self) -> float:
@@ -197,13 +190,6 @@ class ReplayCulture(Culture):
         self._now_ns += round(duration_s * NS)
         kept = self._pending_ns >= self._now_ns
         self._pending_ns, self._pending_channel = self._pending_ns[kept], self._pending_channel[kept]
-
-    def _halt(self) -> None:
-        # Delivery happens within a call, and the guard refuses the next one.
-        pass
-
-    def _close(self) -> None:
-        pass
 
 
 def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from jaxtyping import Int64
-from numpy import ndarray
-
 from animat.cultures.base import Culture
 from animat.cultures.virtual import VirtualCulture
 from animat.recordings.findings import Finding
@@ -64,19 +61,14 @@ def other_patterns(recording: Recording, culture: Culture) -> Finding | None:
         recording: of the culture.
         culture: open.
     """
-    recorded, there = _sets(recording.stimuli.electrodes), _sets(culture.patterns)
+    tables = recording.stimuli.electrodes, culture.patterns
+    recorded, there = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)
     strange = recorded - there - {frozenset()}
     if not strange:
         return None
-    return Finding(
-        "other-patterns",
-        "warning",
+    message = (
         f"{len(strange)} of the {len(recorded)} sets of electrodes that were stimulated in the recordings are no "
         "pattern of this culture: through other electrodes it answers otherwise (a CL1's patterns are drawn by "
-        "--culture-seed, a MaxOne's are those of --selection)",
-        float(len(strange)),
+        "--culture-seed, a MaxOne's are those of --selection)"
     )
-
-
-def _sets(electrodes: Int64[ndarray, "patterns size"]) -> set[frozenset[int]]:
-    return {frozenset(row) - {UNKNOWN} for row in electrodes.tolist()}
+    return Finding("other-patterns", "warning", message, float(len(strange)))

@@ -74,7 +74,11 @@ def record_virtual_series(
     with exclusive_lock(folder):
         # And again now that nobody writes: another run may have ended in between.
         _expect_series(files, fresh, protocol, interval_min)
-        _remove_leftovers(folder)
+        # What a killed run was just writing; no reader takes such files for whole ones.
+        UnderWay(folder).remove()
+        for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
+            for leftover in folder.glob(f"{name}.*.partial*"):
+                clear_away(leftover)
         _record(make_culture, protocol, files, interval_min, needs_state, progress)
     return files
 
@@ -106,10 +110,13 @@ def _record(
         for session, recording in record_when_due(
             culture, protocol, files, left, 0.0, 60 * interval_min, culture.seed, progress
         ):
-            if files[session].exists():
-                _expect_equal(files[session], recording)
-            else:
-                write_nwb(recording, files[session])
+            if not (file := files[session]).exists():
+                write_nwb(recording, file)
+            elif not read_recording(file).equals(recording):
+                raise Mismatch(
+                    f"{file}: expected what recording it again gives, got another culture's, protocol's or version's "
+                    "recording: remove it, or choose another folder"
+                )
             # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
             culture.save_state(folder / STATE_FILE, sessions=session + 1)
 
@@ -151,14 +158,6 @@ def record_when_due(
 def _order(seed: int, session: int) -> int:
     """The seed of a session's schedule: other cultures and other sessions have other orders."""
     return seed * 10_000 + session
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Remove what a killed run was just writing; no reader takes such files for whole ones."""
-    UnderWay(folder).remove()
-    for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
-        for leftover in folder.glob(f"{name}.*.partial*"):
-            clear_away(leftover)
 
 
 def _is_behind(culture: VirtualCulture, state: Path, sessions: int, needs_state: bool) -> bool:
@@ -236,10 +235,7 @@ def _expect_series(files: list[Path], culture: VirtualCulture, protocol: Protoco
 
 def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, session: int, start_s: float) -> None:
     there = read_recording(file)
-    expected = {
-        **culture.settings,
-        "protocol_seed": str(_order(culture.seed, session)),
-    }
+    expected = culture.settings | {"protocol_seed": str(_order(culture.seed, session))}
     if difference := difference_from(expected, protocol, there):
         raise Mismatch(
             f"{file}: expected a recording of the same culture and protocol, got another ({difference}): remove it, or "
@@ -247,14 +243,6 @@ def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, s
         )
     if abs(there.start_min * 60 - start_s) > 1e-6:
         raise Mismatch(f"{file}: expected a recording at {start_s / 60:g} min, got one at {there.start_min:g} min")
-
-
-def _expect_equal(file: Path, again: Recording) -> None:
-    if not read_recording(file).equals(again):
-        raise Mismatch(
-            f"{file}: expected what recording it again gives, got another culture's, protocol's or version's "
-            "recording: remove it, or choose another folder"
-        )
 
 
 def difference_from(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:

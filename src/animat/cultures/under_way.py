@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -64,15 +65,7 @@ def _columns(recording: Recording) -> dict[str, Any]:
         "channel_label": channels.label,
         "channel_electrode": channels.electrode,
         "channel_xy_um": np.column_stack([channels.x_um, channels.y_um]),
-        "stimulus_time_s": stimuli.time_s,
-        "stimulus_frequency_hz": stimuli.frequency_hz,
-        "stimulus_pattern": stimuli.pattern,
-        "stimulus_electrodes": stimuli.electrodes,
-        "stimulus_presentation": stimuli.presentation,
-        "sampling_rate_hz": recording.sampling_rate_hz,
-        "start_min": recording.start_min,
-        "start_s": recording.start_s,
-        "duration_s": recording.duration_s,
-        **({} if presentation is None else {"presentation_order": presentation.order}),
-        **({} if presentation is None else {"presentation_pulses": presentation.pulses}),
+        **{f"stimulus_{each.name}": getattr(stimuli, each.name) for each in fields(stimuli)},
+        **{name: getattr(recording, name) for name in ("sampling_rate_hz", "start_min", "start_s", "duration_s")},
+        **({} if presentation is None else {f"presentation_{name}": of for name, of in vars(presentation).items()}),
     }

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.cultures.base import Culture
+from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
-from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
+from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import MAXONE
-from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.scan import ScannedActivity
 from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
 from animat.stimulation.stimulus import Stimulus
@@ -38,7 +38,7 @@ WARM_UP_S = 5.0
 """Passes before anything is measured: a fresh tissue is not in its stride."""
 
 
-class VirtualCulture(Culture):
+class VirtualCulture(ComputedCulture):
     """A simulated culture; `docs/virtual-culture.md` says what of.
 
     When it is first opened the array is scanned and electrodes are chosen; then the tissue is put back to where it was,
@@ -63,8 +63,6 @@ class VirtualCulture(Culture):
     """
 
     name: ClassVar[str] = "virtual"
-    # A delivery is computed, and comes to its end.
-    ends_within_s: ClassVar[float] = -1
 
     def __init__(
         self,
@@ -149,11 +147,6 @@ class VirtualCulture(Culture):
     def n_patterns(self) -> int:
         """How many patterns it has, known before it is opened."""
         return (self._rule or SelectionRule()).patterns if self._selection is None else len(self._selection.patterns)
-
-    @property
-    def device_limits(self) -> Limits:
-        """`SIMULATED_LIMITS`."""
-        return SIMULATED_LIMITS
 
     @property
     def now_s(self) -> float:
@@ -326,7 +319,10 @@ class VirtualCulture(Culture):
 
         x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
         half_um = MAXONE.pitch_um / 2
-        return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, _strength(stimulus.pulse))
+        # The charge of the largest cathodic phase, in those of the published pulse.
+        cathodic = max(-phase.charge for phase in stimulus.pulse.phases)
+        strength = max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)
+        return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, strength)
 
     def _on_channels(self, time_s: Float64[np.ndarray, " spikes"], neuron: Int64[np.ndarray, " spikes"]) -> Spikes:
         """Every spike once on each channel that sees its neuron."""
@@ -343,14 +339,6 @@ class VirtualCulture(Culture):
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
 
-    def _halt(self) -> None:
-        # Delivery happens within a call, and the guard refuses the next one.
-        pass
-
-    def _close(self) -> None:
-        # The tissue lives on: a culture that is opened again is where it was.
-        pass
-
 
 def _with_floats(settings: Settings) -> Settings:
     """The same settings with 18 as 18.0 where a fraction may stand: one culture is then told in one text."""
@@ -362,9 +350,3 @@ def _with_floats(settings: Settings) -> Settings:
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
             changed[field.name] = _with_floats(value)
     return dataclasses.replace(settings, **changed)
-
-
-def _strength(pulse: Pulse) -> float:
-    """Charge of the largest cathodic phase, in those of the published pulse."""
-    cathodic = max(-phase.charge for phase in pulse.phases)
-    return max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)

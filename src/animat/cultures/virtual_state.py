@@ -73,14 +73,9 @@ def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state
     }
     arrays = {f"state_{name}": values for name, values in snapshot.state._asdict().items()}
     arrays |= {f"kicks_{name}": values for name, values in snapshot.kicks._asdict().items()}
+    held = {name: getattr(state, name) for name in _HELD}
     with atomic_write(path) as beside, beside.open("wb") as file:
-        np.savez_compressed(
-            file,
-            head=np.array(json.dumps(head)),
-            held_ns=state.held_ns,
-            held_neuron=state.held_neuron,
-            **arrays,
-        )
+        np.savez_compressed(file, head=np.array(json.dumps(head)), **held, **arrays)
 
 
 def read_state(path: str | os.PathLike[str], settings: Mapping[str, str], tissue: Tissue) -> VirtualState:
@@ -134,12 +129,7 @@ def read_state(path: str | os.PathLike[str], settings: Mapping[str, str], tissue
 
 
 def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
-    """The state's description and its arrays; nothing is read of a file with others, or with larger ones.
-
-    Args:
-        path: the file.
-        lengths: of each array that belongs into it, the most bytes that it has.
-    """
+    """The state's description and its arrays; nothing of a file with others than of these most bytes by name."""
     try:
         # Opened here, because numpy leaves a damaged file open.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
 from animat.coding.decoder import decoded
-from animat.coding.mapping import Mapping, Thresholds
+from animat.coding.mapping import Thresholds
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
@@ -115,9 +115,14 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     if simulator is None:
         raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
     if isinstance(animat.mapping, Thresholds):
-        levels, probabilities = _steps(animat.mapping, simulator)
+        # Every level's probability, from the shares of responses below each level.
+        below = np.asarray(_shares_below(animat.mapping, simulator), np.float64)
+        probabilities = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
+        levels = np.tile(np.array(animat.mapping.levels), (len(below), 1))
     else:
-        levels, probabilities = _quantiles(animat.mapping, simulator)
+        commands = animat.mapping.command(simulator.evenly_drawn(_QUANTILES), simulator.percentiles)
+        levels = np.asarray(commands, np.float64)
+        probabilities = np.full(levels.shape, 1 / _QUANTILES)
     n_actions = animat.n_conditions
     if is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: every action leads to the mixture of all.
@@ -252,13 +257,6 @@ def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[
     return middle - half * np.cos(np.pi * np.arange(n_smooth) / (n_smooth - 1)), True
 
 
-def _steps(mapping: Thresholds, simulator: NeuronSimulator) -> tuple[np.ndarray, np.ndarray]:
-    """Every level's probability, from the shares of responses below each level."""
-    below = np.asarray(_shares_below(mapping, simulator), np.float64)
-    probabilities = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
-    return np.tile(np.array(mapping.levels), (len(below), 1)), probabilities
-
-
 @partial(jax.jit, static_argnums=0)
 def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Array, "conditions thresholds"]:
     """The quantiles at which the command steps up to each level but the lowest, by bisection."""
@@ -280,9 +278,3 @@ def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Arra
 
     levels = jnp.asarray(mapping.levels[1:], jnp.float32)
     return jax.vmap(lambda c: jax.vmap(lambda level: share_below(c, level))(levels))(jnp.arange(simulator.n_conditions))
-
-
-def _quantiles(mapping: Mapping, simulator: NeuronSimulator) -> tuple[np.ndarray, np.ndarray]:
-    """The commands at evenly spaced quantiles of each condition."""
-    levels = np.asarray(mapping.command(simulator.evenly_drawn(_QUANTILES), simulator.percentiles), np.float64)
-    return levels, np.full(levels.shape, 1 / _QUANTILES)

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
 
 from animat.environment import Animat, Environment
 from animat.evaluation.commands import mean_commands
@@ -100,8 +99,12 @@ def interventions_of(
     """
     animat = unwrapped(environment)
     assert isinstance(animat, Animat)
-    fields = animat.robot, animat.mapping, animat.n_conditions
-    ideal = IdealActuator(*fields, _stretched(mean_commands(environment, simulator)[1]))
+    # Mean commands from -1 to 1, of each command; 0 where all are equal.
+    means = mean_commands(environment, simulator)[1]
+    low, high = means.min(axis=0), means.max(axis=0)
+    stretched = np.where(high > low, 2 * (means - low) / np.where(high > low, high - low, np.inf) - 1, 0.0)
+    levels = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
+    ideal = IdealActuator(animat.robot, animat.mapping, animat.n_conditions, levels)
 
     def control(name: str, meaning: str, changed: Environment[Any], culture: NeuronSimulator = simulator) -> Control:
         return Control(name, meaning, changed, culture, policies, n_policies)
@@ -141,11 +144,3 @@ def _without_effect(
         Control("silent", "the culture always answers 0", environment, silent, policies, n_policies, False),
         Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),
     ]
-
-
-def _stretched(means: Float64[np.ndarray, "actions *commands"]) -> tuple[Any, ...]:
-    """From -1 to 1, of each command; 0 where all are equal."""
-    low, high = means.min(axis=0), means.max(axis=0)
-    even = np.where(high > low, high - low, np.inf)
-    stretched = np.where(high > low, 2 * (means - low) / even - 1, 0.0)
-    return tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())

@@ -13,7 +13,7 @@ from animat.environment import Environment
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.capabilities import capability
+from animat.robots.base import capability
 
 
 @final

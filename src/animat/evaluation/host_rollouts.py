@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +23,6 @@ AT_ONCE = 64
 
 _LAST = threading.local()
 """The bodies of a thread's last wave: to make new ones takes longer than many an episode."""
-
-
-class Acting(Protocol):
-    """Whoever picks actions (`animat.evaluation.rollouts.Actor`)."""
-
-    def act(self, environment: Environment[Any], observation: Array, uniforms: Array) -> Array:
-        """An action for each scaled observation."""
 
 
 class Counts(NamedTuple):
@@ -118,7 +111,7 @@ def paths_on_host(
 def _wave(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
-    actors: Acting,
+    actors: Any,
     keys: Key[Array, " actors"],
     seeds: Sequence[tuple[int, ...]],
     counted: int,
@@ -186,14 +179,14 @@ def _started(environment: Environment[Any], keys: Key[Array, " actors"], episode
 def _iteration(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
-    actors: Acting,
+    actors: Any,
     keys: Key[Array, " actors"],
     iteration: Array,
     state: State,
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array, Array]:
     """Commands, the state that the neurons leave, what was delivered, and whether the answer was P50 or more."""
 
-    def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array, Array]:
+    def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn
         uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales

@@ -17,7 +17,7 @@ from animat.evaluation.rollouts import Actor
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.capabilities import capability
+from animat.robots.base import capability
 
 EPISODES = 64
 """Of each actor: a state of each, met with the goal of each other one."""
@@ -80,7 +80,7 @@ def goal_information(
     Raises:
         InvalidArgument: for continuous actions, or a robot whose goal cannot be switched (`Robot.with_goal_of`).
     """
-    capability(environment.robot, "with_goal_of")
+    switch = capability(environment.robot, "with_goal_of")
     if environment.n_actions is None:
         raise InvalidArgument("environment: expected discrete actions for a goal information in bits")
     rng = np.random.default_rng([seed, 41])
@@ -101,16 +101,12 @@ def goal_information(
     # Sums of the same numbers in another order may differ in the last bit.
     reached = np.sum(np.array(null) >= _plug_in(pairs, environment.n_actions).mean() - 1e-9)
     p = float((1 + reached) / (1 + PERMUTATIONS))
-    most = float(np.log2(min(environment.n_actions, _count_goals(environment, states))))
-    return GoalInformation(interval_of_mean(of_each), p, most)
-
-
-def _count_goals(environment: Environment[Any], states: Any) -> int:
-    """Of the goals of all states, how many look different at one of them."""
+    # Of the goals of all states, those that look different at one of them.
     robots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states.robot)
-    own = jax.tree.map(lambda x: x[0], robots)
-    switched = jax.vmap(capability(environment.robot, "with_goal_of"), (None, 0))(own, robots)
-    return len(np.unique(np.asarray(jax.vmap(environment.robot.observe)(switched)), axis=0))
+    switched = jax.vmap(switch, (None, 0))(jax.tree.map(lambda x: x[0], robots), robots)
+    n_goals = len(np.unique(np.asarray(jax.vmap(environment.robot.observe)(switched)), axis=0))
+    most = float(np.log2(min(environment.n_actions, n_goals)))
+    return GoalInformation(interval_of_mean(of_each), p, most)
 
 
 def conditional_information(

@@ -16,9 +16,8 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 from animat.environment import Environment
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, layers_of, nodes_for
-from animat.evaluation.landings import Motion
-from animat.evaluation.outcomes import Outcomes, side_by_side
-from animat.evaluation.statistics import Interval
+from animat.evaluation.landings import Motion, Outcomes, side_by_side
+from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.history import AT_FIRST
 from animat.neurons.memory import MemorySimulator
@@ -101,21 +100,21 @@ class Optimum:
         return bracket_findings(self.value, self.grid_error, self.monte_carlo, self.standard_error)
 
 
-def bracket_findings(value: float, grid_error: float, monte_carlo: float, standard_error: float) -> tuple[Finding, ...]:
+def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
     """A warning where a value parts from its controller's return by more than 3 standard errors and the grid's error.
 
     Args:
-        value, grid_error, monte_carlo, standard_error: as in `Optimum`.
+        value, grid_error, monte_carlo, error: as in `Optimum`.
     """
     apart = value - monte_carlo
-    if not abs(apart) > max(_ALIKE, 3 * standard_error + grid_error):
+    if not abs(apart) > max(_ALIKE, 3 * error + grid_error):
         return ()  # Neither has NaN, where the controller was not run, anything to tell.
-    told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± "
+    told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± {error:.2f}"
     if apart > 0:
-        told += f"{standard_error:.2f} differ: the optimal return lies between the two"
+        told += " differ: the optimal return lies between the two"
     else:
         told += (
-            f"{standard_error:.2f}, which is achievable, differ: the grid is too rough, take a higher resolution (or "
+            ", which is achievable, differ: the grid is too rough, take a higher resolution (or "
             f"the {CLASSES} classes of what a memory simulator remembers are)"
         )
     return (Finding("optimum", "warning", told, apart),)
@@ -187,22 +186,12 @@ def best_returns(
         tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
         values = programme.run(tables, seed)
         for case in range(len(batch)):
-            known, unknown = (
-                _mean_with_error(None if tables is None else programme.play(tables, case, episodes, seed, clock=clock))
-                for clock in (True, False)
-            )
-            optima.append(
-                Optimum(
-                    value=float(values[case]),
-                    grid_error=float(abs(values[case] - rough[case])),
-                    monte_carlo=known[0],
-                    standard_error=known[1],
-                    without_clock=unknown[0],
-                    without_clock_standard_error=unknown[1],
-                    episodes=episodes,
-                    nodes=fine.size,
-                )
-            )
+            run = math.nan, math.nan, math.nan, math.nan
+            if tables is not None:
+                known, unknown = (programme.play(tables, case, episodes, seed, clock=clock) for clock in (True, False))
+                run = float(known.mean()), standard_error(known), float(unknown.mean()), standard_error(unknown)
+            grid_error = float(abs(values[case] - rough[case]))
+            optima.append(Optimum(float(values[case]), grid_error, *run, episodes, fine.size))
             progress.update(len(optima), len(cases), f"optimum {values[case]:.1f}")
     return tuple(optima)
 
@@ -224,12 +213,6 @@ def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, ac
     """An iteration of every episode; of the module, so that it is compiled once, with the clock and without."""
     uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
     return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
-
-
-def _mean_with_error(returns: Float64[np.ndarray, " episodes"] | None) -> tuple[float, float]:
-    if returns is None:
-        return math.nan, math.nan
-    return float(returns.mean()), float(returns.std(ddof=1) / math.sqrt(len(returns)))
 
 
 def _costs_of(environment: Environment[Any], n_actions: int) -> Float32[np.ndarray, " actions"]:
@@ -309,22 +292,9 @@ class _Programme:
             self.bounds = lowest, highest
             if tables is not None:
                 tables.keep(remaining, values.reshape(shape))
-            bellman_backup(
-                values,
-                landings.rows,
-                landings.row_places,
-                landings.nodes,
-                landings.places,
-                landings.rewards,
-                grid.row_offsets,
-                pairs,
-                weights,
-                costs_of_layers,
-                remaining,
-                np.float32(lowest),
-                np.float32(highest),
-                before,
-            )
+            ends = np.float32(lowest), np.float32(highest)
+            led_to = grid.row_offsets, pairs, weights, costs_of_layers
+            bellman_backup(values, *landings, *led_to, remaining, *ends, before)
             values, before = before, values
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
         first = np.array([AT_FIRST])
@@ -347,22 +317,11 @@ class _Programme:
         chosen = np.zeros(episodes, np.int32)
         for iteration, key in enumerate(jax.random.split(others, limit)):
             remaining = limit - 1 - iteration if clock else limit - 1
-            landings = self._motion.from_states(state.robot)
-            look_ahead(
-                tables.values(remaining, self._layers[case]),
-                landings.rows,
-                landings.row_places,
-                landings.nodes[:, :, 0],
-                landings.places[:, :, 0],
-                landings.rewards[:, :, 0],
-                self._grid.row_offsets,
-                self._layer(case, state.neurons),
-                pairs,
-                outcomes.weights,
-                self._costs[case],
-                remaining,
-                chosen,
-            )
+            rows, row_places, *along = self._motion.from_states(state.robot)
+            landings = rows, row_places, *(each[:, :, 0] for each in along)
+            values, layers = tables.values(remaining, self._layers[case]), self._layer(case, state.neurons)
+            led_to = layers, pairs, outcomes.weights, self._costs[case]
+            look_ahead(values, *landings, self._grid.row_offsets, *led_to, remaining, chosen)
             action = actions[np.minimum(chosen, len(actions) - 1)]
             before, state = state, _step(environment, episodes, key, state, action, simulator)
             returns += np.where(going, np.asarray(net_reward(before, state), np.float64), 0.0)

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
-from animat.brief import briefly
 from animat.coding.mapping import N_PERCENTILES
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
@@ -24,6 +23,7 @@ from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import MOST_AT_ONCE
 from animat.robots.host import HostRobot
+from animat.tables import briefly
 from animat.training.networks import Layer, Network, as_commands, draw_action, likeliest_action
 from animat.training.policy import Policy
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from animat.brief import briefly
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
@@ -27,11 +26,11 @@ from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Progress, in_phase
+from animat.progress import Progress, Silent, in_phase
 from animat.recordings.findings import Finding
-from animat.robots.base import Robot
-from animat.robots.capabilities import lacking
+from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
+from animat.tables import briefly
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation, ShuffledDelivery, TrialCosts, unwrapped
 
@@ -237,7 +236,7 @@ def evaluate(
     first = first_of_alike(policies, alike, "evaluate it alone")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, which the policies were trained on, got {robot.name}")
-    body = robot or first.robot
+    body, progress = robot or first.robot, progress or Silent()
 
     findings: tuple[Finding, ...] = ()
     simulator: NeuronSimulator | None = None
@@ -269,14 +268,16 @@ def evaluate(
     if interventions and simulator is None:
         raise InvalidArgument("interventions: expected policies that act through neurons, got ones without")
     acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
-    every = controls_of(environment, simulator, _action_labels(first), networks, n)
+    labels = [condition.label for condition in first.conditions]
+    if first.mapping is None:
+        labels = [f"{command:+g}" for command in first.commands or ()]
+    every = controls_of(environment, simulator, labels, networks, n)
     acting += [control for control in every if controls is None or control.name in controls]
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
     steps = len(acting) + searches + (optimum_resolution is not None)
     if searches:
-        if progress is not None:
-            progress.update(0, steps, "best coupling")
+        progress.update(0, steps, "best coupling")
         reflex = best_coupling(environment, simulator, seed=seed)
         acting.append(Control("coupling", "the best reflex: no memory, no goal", environment, simulator, reflex))
     if controls is None and (without := lacking(body).get("heuristic")):
@@ -289,16 +290,13 @@ def evaluate(
         changed = each.environment is not environment or each.simulator is not simulator
         given = None if of_trials is None else ran.presented @ of_trials * each.is_stimulated / episodes
         rows.append(Row(each.name, each.meaning, ran, changed, given, first.pulse_cost))
-        if progress is not None:
-            progress.update(len(rows), steps, each.name)
+        progress.update(len(rows), steps, each.name)
     optimum, no_optimum, net_optimum = None, None, None
     if optimum_resolution is not None:
-        if progress is not None:
-            progress.update(len(rows), steps, "optimal return")
+        progress.update(len(rows), steps, "optimal return")
+        are_fixed = fixed_from_min is not None
         try:
-            optimum = _optimum(
-                environment, simulator, timeline, minute, fixed_from_min is not None, optimum_resolution, seed
-            )
+            optimum = _optimum(environment, simulator, timeline, minute, are_fixed, optimum_resolution, seed)
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
         # Conditions of few responses would promise what is not there.
@@ -316,6 +314,10 @@ def evaluate(
                 context = least_context_gap(*beside, np.concatenate(agents), body.return_range[1])
         elif not optimum.left_out:
             context = context_gap(*beside, optimum)
+    work = None
+    if interventions:
+        phase = in_phase(progress, "whose work it is")
+        work = whose_work(trained_in, simulator, networks, n, episodes=episodes, seed=seed, progress=phase)
     return Evaluation(
         body.name,
         None if first.mapping is None else first.mapping.name,
@@ -328,17 +330,7 @@ def evaluate(
         fixed_from_min,
         context,
         objectives_of(body),
-        whose_work(
-            trained_in,
-            simulator,
-            networks,
-            n,
-            episodes=episodes,
-            seed=seed,
-            progress=in_phase(progress, "whose work it is"),
-        )
-        if interventions
-        else None,
+        work,
         net_optimum,
     )
 
@@ -354,16 +346,8 @@ def _optimum(
 ) -> Optimum:
     """The optimal return; with its interval, without conditions of few responses, where responses are known."""
     environment = unwrapped(environment)
-    if not (isinstance(environment, Animat) and simulator is not None and timeline and minute is not None):
-        return best_return(environment, simulator, resolution=resolution, seed=seed)
-    if not timeline.responses:
+    if not isinstance(environment, Animat) or minute is None or timeline is None or not timeline.responses:
         return best_return(environment, simulator, resolution=resolution, seed=seed)
     case = Counted.of(environment, timeline, minute, are_fixed=are_fixed)
     best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed)
     return case.known(best, resolution=resolution, seed=seed)
-
-
-def _action_labels(policy: Policy) -> list[str]:
-    if policy.mapping is not None:
-        return [condition.label for condition in policy.conditions]
-    return [] if policy.commands is None else [f"{command:+g}" for command in policy.commands]

@@ -5,13 +5,14 @@ Whoever shows such a return says so in these words: training, evaluation, and th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from animat.errors import Mismatch
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
-from animat.responses.condition import other_stimulus
+from animat.responses.condition import Condition, other_stimulus
+from animat.responses.readouts import Readouts
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
 
@@ -114,24 +115,29 @@ NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", 
 predicts is asked for, and a loop has none."""
 
 
-def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
-    """Where simulators are otherwise than those that a policy was trained on.
+def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts: Readouts) -> None:
+    """Raise unless a policy can act through these.
 
     Raises:
-        Mismatch: for other conditions, stimuli or readouts: it cannot act through them.
+        Mismatch: for other conditions, stimuli or readouts than it was trained on.
     """
-    if policy.conditions != timeline.conditions:
+    if policy.conditions != tuple(conditions):
         raise Mismatch(
             f"conditions: expected {', '.join(c.label for c in policy.conditions)}, which the policies pick from, got "
-            f"recordings with {', '.join(c.label for c in timeline.conditions)}"
+            f"recordings with {', '.join(c.label for c in conditions)}"
         )
-    if others := other_stimulus(policy.conditions, timeline.conditions):
-        raise Mismatch(f"conditions: {others} in the recordings")
-    if policy.readouts != timeline.readouts:
+    if others := other_stimulus(policy.conditions, conditions):
+        raise Mismatch(f"conditions: {others} in the recordings: take those that the policies were trained on")
+    if policy.readouts != readouts:
         raise Mismatch(
             f"readouts: expected {', '.join(policy.readouts.names)}, of the electrodes that the policies were trained "
-            f"on, got {', '.join(timeline.readouts.names)}, of others"
+            f"on, got {', '.join(readouts.names)}, of others"
         )
+
+
+def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
+    """Where simulators are otherwise than those that a policy was trained on; errors as of `expect_conditions`."""
+    expect_conditions(policy, timeline.conditions, timeline.readouts)
     found = []
     if policy.window_ms != timeline.window_ms:
         message = f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}"

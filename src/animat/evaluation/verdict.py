@@ -78,20 +78,18 @@ class Verdict:
 
     def __str__(self) -> str:
         few = {name: each for name, each in self.controls.items() if not each.can_tell}
-        reported = (
-            f"{name} (p = {self.controls[name].p:.2g}; their return is larger in "
-            f"{100 * self.controls[name].wins:.0f} % of the pairs of episodes)"
-            for name in self.not_outperformed
-            if name not in few
-        )
-        said = (
-            [f"the policies do not outperform {', '.join(reported)}"] if set(self.not_outperformed) - set(few) else []
-        )
+        reported = [
+            f"{name} (p = {each.p:.2g}; their return is larger in {100 * each.wins:.0f} % of the pairs of episodes)"
+            for name, each in self.controls.items()
+            if not each.is_outperformed and each.can_tell
+        ]
+        said = [f"the policies do not outperform {', '.join(reported)}"] if reported else []
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
             said.append(
-                f"{_episodes(fewest.policies)} of the policies beside {fewest.control} of a control are too few to "
-                f"tell (p < {OUTPERFORMED_P:g}) whether the policies outperform {', '.join(few)}"
+                f"{fewest.policies} episode{'' if fewest.policies == 1 else 's'} of the policies beside "
+                f"{fewest.control} of a control are too few to tell (p < {OUTPERFORMED_P:g}) whether the policies "
+                f"outperform {', '.join(few)}"
             )
         if not said:
             least = min(each.wins for each in self.controls.values())
@@ -100,7 +98,3 @@ class Verdict:
                 f"{100 * least:.0f} % of the pairs of episodes or more)"
             )
         return "; ".join(said)
-
-
-def _episodes(number: int) -> str:
-    return f"{number} episode{'' if number == 1 else 's'}"

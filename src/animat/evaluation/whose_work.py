@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.brief import briefly
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
@@ -20,6 +19,7 @@ from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.records import as_json
+from animat.tables import briefly
 from animat.wrappers import unwrapped
 
 AS_THEY_ARE = "as they are"

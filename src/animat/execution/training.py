@@ -136,16 +136,15 @@ def train(
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)
-        policies = {f"p{i}": _load(folder, f"p{i}.safetensors") for i in range(training.policies)}
+        policies = {}
+        for i in range(training.policies):
+            policies[f"p{i}"] = policy = Policy.load(folder / f"p{i}.safetensors")
+            if len(policy.assessments):
+                policies[f"p{i}"] = replace(policy, best=Policy.load(folder / BEST / f"p{i}.safetensors"))
         if training.episodes_assessed and not (folder / TABLE).exists():
             write_assessments(folder, policies)
         curves.finish(policies)
     return policies
-
-
-def _load(folder: Path, file: str) -> Policy:
-    policy = Policy.load(folder / file)
-    return replace(policy, best=Policy.load(folder / BEST / file)) if len(policy.assessments) else policy
 
 
 @final

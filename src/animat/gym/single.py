@@ -11,8 +11,7 @@ from jaxtyping import Float32, UInt8
 from animat.errors import InvalidArgument
 from animat.gym.compiled import CompiledAnimat
 from animat.gym.setup import set_up
-from animat.robots.base import Robot
-from animat.robots.capabilities import capability
+from animat.robots.base import Robot, capability
 from animat.robots.drawing import draw_robot
 
 

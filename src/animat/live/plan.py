@@ -102,11 +102,7 @@ def check_plan(
     check_episodes("episodes", episodes)
     of_the_loop = {name: value for name, value in settings.items() if name not in _NOT_OF_THE_LOOP}
     conditions = tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in protocol.frequencies_hz)
-    given: dict[str, Any] = {
-        "pulses": protocol.pulses,
-        "pulse": protocol.pulse,
-        "patterns": protocol.patterns,
-    } | of_the_loop
+    given = {name: getattr(protocol, name) for name in ("pulses", "pulse", "patterns")} | of_the_loop
     Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **given)
     expect_no_file(folder, "the live run")
     if folder.exists() and any(each.name != LOCK for each in folder.iterdir()):

@@ -22,10 +22,9 @@ from animat.cultures.series import STATE_FILE
 from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
-from animat.live.exchange import Exchange
 from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan
 from animat.live.recording import record_within
-from animat.live.trainers import Trainers
+from animat.live.trainers import Exchange, Trainers
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline

@@ -3,20 +3,109 @@
 from __future__ import annotations
 
 import os
+import pickle
+import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from animat.errors import AnimatError
 from animat.execution.pinned import PinnedProcesses
-from animat.execution.task import Done, carry_out
-from animat.live.alongside import TrainAlongside
-from animat.live.exchange import Exchange
-from animat.training.group import Group
+from animat.execution.task import Done, Task, carry_out, report, reported
+from animat.neurons.simulator import NeuronSimulator
+from animat.progress import Progress
+from animat.training.group import Group, SideBySide, save_policies
+from animat.writing import write_whole
 
+_FINISH = "finish"
 KEEP_S = 10.0
 """Seconds between times that the policies are written as they are: what a killed run costs of training."""
+
+
+class Exchange:
+    """A folder of one run alone, in which one process publishes simulators and others look; its files are whole."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def publish(self, number: int, start_min: float, simulator: NeuronSimulator) -> None:
+        """Put up a simulator, its arrays on the host; the one with the largest number is in force."""
+        write_whole(self.folder / f"{number:06}.simulator", pickle.dumps((number, start_min, simulator)))
+
+    def newest(self, known: int) -> tuple[int, float, NeuronSimulator] | None:
+        """Number, minute and simulator of the newest, if its number is larger than the one that is known."""
+        newest = max((int(file.stem) for file in self.folder.glob("[0-9]*.simulator")), default=known)
+        if newest <= known:
+            return None
+        read: tuple[int, float, NeuronSimulator] = pickle.loads((self.folder / f"{newest:06}.simulator").read_bytes())
+        return read
+
+    def report(self, first: int, words: dict[str, Any]) -> None:
+        """Say how the group whose first policy is this one does, as plain data."""
+        report(self.folder / f"p{first}.json", words)
+
+    def reported(self, first: int) -> dict[str, Any] | None:
+        """What a group said last; None if it has not begun."""
+        words: dict[str, Any] | None = reported(self.folder / f"p{first}.json")
+        return words
+
+    def finish(self) -> None:
+        """Say that training is to end at the next chunk."""
+        (self.folder / _FINISH).touch()
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether training is to end."""
+        return (self.folder / _FINISH).exists()
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TrainAlongside(Task):
+    """Train a group of policies, before each chunk on the newest simulator of the exchange.
+
+    It says which of them it uses, its swaps, and how far it is, by the exchange too, which also tells when to end.
+    Every `keep_s` seconds the policies are written as they are.
+    """
+
+    group: Group
+    exchange: Exchange
+    keep_s: float
+
+    @property
+    def grows_with(self) -> dict[str, object]:
+        return {"algorithm": self.group.training.algorithm}
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        training = self.group.training
+        training.register()
+        swaps: list[dict[str, Any]] = []
+        # The policies tell what they were trained on, the last of it known only in the end.
+        group = replace(self.group, provenance={**self.group.provenance, "swaps": swaps})
+        together = SideBySide(group)
+        number, simulator, index, kept_s = -1, None, 0, time.monotonic()
+        told: dict[str, Any] = {"using": number, "iterations": 0, "mean_return": float("nan"), "swaps": []}
+        while not (self.exchange.is_finished and index):
+            newer = self.exchange.newest(number)
+            if newer is not None:
+                number, start_min, simulator = newer
+                swaps.append({"chunk": index, "iterations": told["iterations"], "recorded_at_min": start_min})
+                told["using"] = number
+                told["swaps"].append({"swap": number, **swaps[-1]})
+                self.exchange.report(group.members[0], told)
+            if simulator is None:
+                raise AnimatError("live: expected a simulator in the exchange before training began, got none")
+            told["mean_return"] = together.train(index, simulator)
+            if time.monotonic() - kept_s > self.keep_s:
+                save_policies(group, together.policies(), folder)
+                kept_s = time.monotonic()
+            index += 1
+            told["iterations"] = training.chunk(index)[0] * training.algorithm.environments
+            self.exchange.report(group.members[0], told)
+        return save_policies(group, together.policies(), folder)
 
 
 class Trainers:

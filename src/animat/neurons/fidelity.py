@@ -82,12 +82,8 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     """
     median_hz = np.asarray(simulator.percentiles, np.float32)[..., 5]
     kept, read_hz = ~responses.is_burst, responses.read_hz.astype(np.float32)
-    in_data = np.array(
-        [
-            np.mean(read_hz[kept & (responses.condition == c)] >= median_hz, axis=0)
-            for c in range(len(responses.conditions))
-        ]
-    )
+    conditions = range(len(responses.conditions))
+    in_data = np.array([np.mean(read_hz[kept & (responses.condition == c)] >= median_hz, axis=0) for c in conditions])
     x = _drawn_after_each(simulator) if isinstance(simulator, MemorySimulator) else _evenly_drawn(simulator, 20_000)
     above = 0
     if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):

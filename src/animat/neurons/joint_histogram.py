@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.brief import briefly
 from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, quantile_of
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 _BELOW_ONE = float(np.nextafter(np.float32(1.0), np.float32(0.0)))
 
@@ -57,11 +57,8 @@ class JointHistogramSimulator(NeuronSimulator):
         # float32 rounds a uniform just under 1 times a count up to the count.
         trial = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
         shares = (jnp.asarray(self.ranks)[condition, trial] + (uniform * count - trial)) / count
-        return jax.vmap(quantile_of)(
-            jnp.asarray(self.cumulative)[:, condition],
-            jnp.asarray(self.edges_hz),
-            jnp.clip(shares, 0.0, _BELOW_ONE),
-        )
+        cumulative, edges_hz = jnp.asarray(self.cumulative)[:, condition], jnp.asarray(self.edges_hz)
+        return jax.vmap(quantile_of)(cumulative, edges_hz, jnp.clip(shares, 0.0, _BELOW_ONE))
 
 
 def fit_joint_histogram(

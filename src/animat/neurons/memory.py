@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
-from animat.brief import briefly
 from animat.neurons.history import NO_MEMORY, Memory, Ranked, left_by
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0)
@@ -189,14 +189,8 @@ def _found(ranked: Ranked) -> Memory:
 
     if is_as_good(NO_MEMORY, _CERTAIN):
         return NO_MEMORY
-    found = max(
-        (
-            memory
-            for memory in errors
-            if memory[:2] == best[:2] and memory.neighbour_exponent < 1 and is_as_good(memory, 1.0)
-        ),
-        key=lambda memory: memory.neighbour_exponent,
-    )
+    alike = [memory for memory in errors if memory[:2] == best[:2] and memory.neighbour_exponent < 1]
+    found = max((memory for memory in alike if is_as_good(memory, 1.0)), key=lambda each: each.neighbour_exponent)
     return found._replace(load_s=_LOAD_S if _has_load(ranked, found) else 0.0)
 
 
@@ -210,19 +204,18 @@ def _has_load(ranked: Ranked, memory: Memory) -> bool:
     # Of each condition on its own, so that its mean explains nothing.
     one = np.concatenate([np.eye(len(ranked.rows))[[c] * len(rows)] for c, rows in enumerate(ranked.rows)])
     every = np.concatenate(ranked.rows)
-    without, with_load = (
-        _squares_left(ranked.rank[every], np.concatenate([one * x[every, None] for x in given], axis=1))
-        for given in ([np.ones_like(trace), trace], [np.ones_like(trace), trace, load.at])
-    )
+    rank = ranked.rank[every]
+
+    def squares_left(*given: Float64[np.ndarray, " responses"]) -> float:
+        """By a linear regression."""
+        design = np.concatenate([one * x[every, None] for x in (np.ones_like(trace), *given)], axis=1)
+        return float(np.sum((rank - design @ np.linalg.lstsq(design, rank, rcond=None)[0]) ** 2))
+
+    without, with_load = squares_left(trace), squares_left(trace, load.at)
     more, left = len(ranked.rows), len(every) - 3 * len(ranked.rows)
     if left <= 0 or with_load <= 0:
         return False
     return bool(f.sf((without - with_load) / more / (with_load / left), more, left) < _UNLIKELY)
-
-
-def _squares_left(rank: Float64[np.ndarray, " rows"], design: Float64[np.ndarray, "rows numbers"]) -> float:
-    """What a linear regression leaves."""
-    return float(np.sum((rank - design @ np.linalg.lstsq(design, rank, rcond=None)[0]) ** 2))
 
 
 def _slopes(
@@ -261,12 +254,9 @@ def _slopes(
 def _errors(
     rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], neighbour_exponent: float
 ) -> Float64[np.ndarray, " rows"]:
-    """Squared differences between each response's rank and the mean of the nearest others', in a fixed order.
+    """Squared differences between each response's rank and the mean of the nearest n^neighbour_exponent others'.
 
-    Args:
-        rank: of all responses.
-        in_order: the responses to each condition in the order of their histories.
-        neighbour_exponent: of n, n^neighbour_exponent are nearest.
+    Responses to each condition are in the order of their histories.
     """
     errors = np.full(len(rank), np.nan)
     for rows in in_order:

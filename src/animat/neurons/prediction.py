@@ -126,9 +126,8 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
         of_condition = [_shares(x[:n], values_hz) for x, n in zip(table, counts, strict=True)]
     elif isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
         counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
-        cumulatives, edges_hz = np.asarray(simulator.cumulative), np.asarray(simulator.edges_hz)
-        if halves.readout is not None:
-            cumulatives, edges_hz = cumulatives[halves.readout], edges_hz[halves.readout]
+        own = ... if halves.readout is None else halves.readout
+        cumulatives, edges_hz = np.asarray(simulator.cumulative)[own], np.asarray(simulator.edges_hz)[own]
         of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
     else:
         raise TypeError(f"simulator: expected a histogram, an empirical or a memory one, got {type(simulator)}")

@@ -12,10 +12,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.history import AT_FIRST
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
 """Arrays of a simulator: JAX's, or numpy's while it is on its way to another process."""

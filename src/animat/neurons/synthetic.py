@@ -12,7 +12,6 @@ from animat.neurons.simulator import PERCENTILES, HistogramSimulator
 
 MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 """Mean responses to the five conditions, in the order of 5, 10, 20, 40 and 80 Hz."""
-
 LABELS = ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
 
 
@@ -55,14 +54,9 @@ def synthetic_simulator(
     cumulative = gammainc(shape, edges_hz * shape / means[:, None])
     cumulative[:, -1] = 1.0
 
-    def pooled_share_below(x_hz: float) -> float:
-        return float(np.mean(gammainc(shape, x_hz * shape / means)))
+    def pooled(x_hz: float, share: float) -> float:
+        return float(np.mean(gammainc(shape, x_hz * shape / means))) - share
 
     shares = np.clip(np.array(PERCENTILES) / 100, 1 / (n_responses + 1), n_responses / (n_responses + 1))
-    highest_hz = 100 * float(means.max())
-    percentiles_hz = [brentq(lambda x, share=share: pooled_share_below(x) - share, 0.0, highest_hz) for share in shares]
-    return HistogramSimulator(
-        jnp.asarray(cumulative, jnp.float32),
-        jnp.asarray(edges_hz, jnp.float32),
-        jnp.asarray(percentiles_hz, jnp.float32),
-    )
+    percentiles_hz = [brentq(pooled, 0.0, 100 * float(means.max()), (share,)) for share in shares]
+    return HistogramSimulator(*(jnp.asarray(each, jnp.float32) for each in (cumulative, edges_hz, percentiles_hz)))

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
@@ -21,6 +20,7 @@ from animat.responses.condition import Condition, other_stimulus
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
+from animat.tables import briefly
 
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",
@@ -168,25 +168,17 @@ def fit_timeline(
     )
     if kind == "memory" and first.is_blocked:
         findings += (_MEMORY_OF_BLOCKS,)
-    return SimulatorTimeline(
-        simulators=jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted),
-        start_min=start_min,
-        conditions=first.conditions,
-        window_ms=first.window_ms,
-        presentation=first.presentation,
-        fidelities=fidelities,
-        findings=findings,
-        fitted={
-            "kind": kind,
-            "bins": bins if kind == "histogram" else None,
-            "range_hz": range_hz if kind == "histogram" else None,
-            "by": first.by,
-            "burst_threshold": first.burst_threshold,
-            "burst_thresholds": [float(responses.threshold) for responses in ordered],
-        },
-        responses=tuple(ordered),
-        readouts=first.readouts,
-    )
+    how = {
+        "kind": kind,
+        "bins": bins if kind == "histogram" else None,
+        "range_hz": range_hz if kind == "histogram" else None,
+        "by": first.by,
+        "burst_threshold": first.burst_threshold,
+        "burst_thresholds": [float(responses.threshold) for responses in ordered],
+    }
+    simulators = jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted)
+    same = first.conditions, first.window_ms, first.presentation
+    return SimulatorTimeline(simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts)
 
 
 def _words(value: object) -> str:

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument
 from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
 from animat.neurons.kinds import Kind, fit_simulator
@@ -28,6 +27,7 @@ from animat.neurons.prediction import (
 from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import usual_kind
 from animat.responses.responses import Responses
+from animat.tables import briefly
 
 MARGINAL = "marginal"
 """The name of the baseline: all conditions' responses in one distribution."""
@@ -240,11 +240,10 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         UnusableData: as `halved` does.
         InvalidArgument: for a kind or a readout that there is not.
     """
-    n_readouts = responses.read_hz.shape[1] if responses.read_hz.ndim == 2 else None
-    if (readout is None) != (n_readouts is None) or (readout is not None and not 0 <= readout < (n_readouts or 0)):
-        raise InvalidArgument(f"readout: expected which of {n_readouts or 1} readouts, None of one, got {readout}")
-    rng = np.random.default_rng(seed)
-    halves = halved(responses, readout)
+    n = len(responses.readouts)
+    if (readout is None) != (n == 1) or not 0 <= (readout or 0) < n:
+        raise InvalidArgument(f"readout: expected which of {n} readouts, None of one, got {readout}")
+    rng, halves = np.random.default_rng(seed), halved(responses, readout)
     kinds: tuple[str, ...] = get_args(Kind)
     if kind is not None and kind not in kinds:
         raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -14,10 +14,33 @@ from animat.closed_loop.session import Session
 from animat.coding.mapping import N_PERCENTILES
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
-from animat.reality_gap.passes import Passes
 from animat.responses.extraction import SILENCE_S
 from animat.responses.responses import Presented, Responses
 from animat.robots.base import Robot
+
+
+class Passes(NamedTuple):
+    """Counts of each condition.
+
+    Attributes:
+        presented: how often, shape (..., conditions).
+        passed: how often the response was P50 or more, the same shape; of several readouts each on its own, shape
+            (..., conditions, readouts).
+    """
+
+    presented: Int64[np.ndarray, "*any conditions"]
+    passed: Int64[np.ndarray, "*any"]
+
+    @property
+    def share(self) -> Float64[np.ndarray, "*any"]:
+        """P(x >= P50) of each condition, in the shape of `passed`; NaN for one that was never presented."""
+        of_several = self.passed.ndim > self.presented.ndim
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.passed / (self.presented[..., None] if of_several else self.presented))
+
+    def summed(self, axis: int) -> Passes:
+        """Over policies or episodes."""
+        return Passes(self.presented.sum(axis=axis), self.passed.sum(axis=axis))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ from animat.evaluation.controls import turned_round
 from animat.evaluation.rollouts import Actor, Constant, Episodes, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.progress import Progress, Silent
+from animat.reality_gap.answered import Passes
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.passes import Passes
 from animat.robots.host import HostRobot
 from animat.wrappers import GoalSwitch, YokedDelivery
 

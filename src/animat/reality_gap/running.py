@@ -24,13 +24,19 @@ from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.rollouts import networks_of
-from animat.evaluation.transfer import no_memory, old_calibration, other_calibration, other_simulator
+from animat.evaluation.transfer import (
+    expect_conditions,
+    no_memory,
+    old_calibration,
+    other_calibration,
+    other_simulator,
+)
 from animat.evaluation.verdict import beside
 from animat.goals.tally import Outcome
 from animat.neurons.simulator import NeuronSimulator
@@ -44,8 +50,7 @@ from animat.reality_gap.row import Row, between
 from animat.reality_gap.table import RealityGap
 from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
-from animat.responses.condition import other_stimulus
-from animat.robots.capabilities import lacking
+from animat.robots.base import lacking
 from animat.robots.grid import grid_for, no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
@@ -313,20 +318,8 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
     Raises:
         Mismatch: if it is not.
     """
-    if first.mapping is None:
-        return
-    if first.conditions != calibration.conditions:
-        raise Mismatch(
-            f"conditions: expected {', '.join(c.label for c in first.conditions)}, which the policies pick from, got "
-            f"recordings with {', '.join(c.label for c in calibration.conditions)}"
-        )
-    if first.readouts != calibration.readouts:
-        raise Mismatch(
-            f"readouts: expected {', '.join(first.readouts.names)}, of the electrodes that the policies were trained "
-            f"on, got recordings read as {', '.join(calibration.readouts.names)}"
-        )
-    if others := other_stimulus(first.conditions, calibration.conditions):
-        raise Mismatch(f"conditions: {others} in the recordings: run on those that the policies were trained on")
+    if first.mapping is not None:
+        expect_conditions(first, calibration.conditions, calibration.readouts)
 
 
 def _rows(

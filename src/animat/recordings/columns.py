@@ -75,8 +75,10 @@ class PlainColumns:
             UnusableData: naming the column, what was expected and what came.
         """
         for name in ("spike_channel", "channel_label", "stimulus_pattern"):
-            column = getattr(self, name)
-            if column is not None and (width := _width(column)) > LONGEST_TEXT:
+            dtype = np.asarray(getattr(self, name)).dtype
+            # Characters that every row of a column of text has room for.
+            width = {"U": dtype.itemsize // 4, "S": dtype.itemsize}.get(dtype.kind, 0)
+            if width > LONGEST_TEXT:
                 raise UnusableData(f"{name}: expected names of at most {LONGEST_TEXT:,} characters, got {width:,}")
         noted = [*findings]
         spike_time_s, spikes_in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
@@ -108,16 +110,16 @@ class PlainColumns:
     def _channels(self, n_spikes: int, noted: list[Finding]) -> tuple[Channels, Int64[np.ndarray, " spikes"]]:
         """The channel table, and the row of each spike in it."""
         values = _column("spike_channel", self.spike_channel, n_spikes, "one channel a spike")
-        nameless = int(np.count_nonzero(values == "" if _is_text(values) else values != values))
-        if nameless:
+        if nameless := int(np.count_nonzero(values == "" if _is_text(values) else values != values)):
             raise UnusableData(f"spike_channel: expected a channel for each spike, got {nameless} without one")
         if not _is_text(values):
             values = _whole("spike_channel", values)
-        lengths = {
-            name: _length(name, column)
-            for name in ("channel_label", "channel_electrode", "channel_xy_um")
-            if (column := getattr(self, name)) is not None
-        }
+        lengths = {}
+        for name in ("channel_label", "channel_electrode", "channel_xy_um"):
+            if (column := getattr(self, name)) is not None:
+                if np.ndim(column) == 0:
+                    raise UnusableData(f"{name}: expected a value a channel, got a single one")
+                lengths[name] = len(column)
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
             message = (
@@ -257,23 +259,11 @@ def _looked_up(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
     return rows[which.reshape(-1)]
 
 
-def _length(name: str, column: Column) -> int:
-    if np.ndim(column) == 0:
-        raise UnusableData(f"{name}: expected a value a channel, got a single one")
-    return len(column)
-
-
 def _column(name: str, column: Column, n: int, expected: str = "one value a stimulus") -> Column:
     column = np.asarray(column)
     if column.shape != (n,):
         raise UnusableData(f"{name}: expected {expected}, shape ({n},), got {column.shape}")
     return column
-
-
-def _width(column: Column) -> int:
-    """Characters that every row of a column of text has room for; 0 for numbers."""
-    dtype = np.asarray(column).dtype
-    return {"U": dtype.itemsize // 4, "S": dtype.itemsize}.get(dtype.kind, 0)
 
 
 def _is_text(column: Column) -> bool:

@@ -58,10 +58,12 @@ class Origin:
 
     def __post_init__(self) -> None:
         # Here and not when the file is written: finding spikes takes minutes.
-        if self.age is not None and not all(DURATION.fullmatch(part) for part in _range(self.age)):
-            raise InvalidArgument(
-                f"age: expected an ISO 8601 duration such as P42D (days), P6W or P3M, got {self.age!r}"
-            )
+        if self.age is not None:
+            first, _, last = self.age.partition("/")
+            # The one duration of an age, or the two of a range, of which the last may be open.
+            if not all(map(DURATION.fullmatch, (first, last) if last else (first,))):
+                expected = "an ISO 8601 duration such as P42D (days), P6W or P3M"
+                raise InvalidArgument(f"age: expected {expected}, got {self.age!r}")
         if self.recorded_at is not None:
             try:
                 datetime.fromisoformat(self.recorded_at)
@@ -72,12 +74,6 @@ class Origin:
     def words(self) -> Mapping[str, str]:
         """What is given, as entries of `Recording.provenance`."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
-
-
-def _range(age: str) -> tuple[str, ...]:
-    """The one duration of an age, or the two of a range, of which the last may be open."""
-    first, slash, last = age.partition("/")
-    return (first, last) if slash and last else (first,)
 
 
 def convert_recording(

@@ -63,12 +63,8 @@ def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
     for finding in findings:
         if finding.severity != "note":
             warnings.setdefault(finding.name, []).append(finding)
-    for alike in warnings.values():
-        worst = max(alike, key=_gravity)
+    for name, alike in warnings.items():
+        # The number that is farthest from 0, or the nearest where few is bad.
+        sizes = [abs(finding.value or 0.0) for finding in alike]
+        worst = alike[sizes.index(min(sizes) if name in ("few-samples", "no-difference") else max(sizes))]
         yield worst.message + (f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else "")
-
-
-def _gravity(finding: Finding) -> float:
-    """What makes one of several findings of a name the worst: a number far from 0, or close to it where few is bad."""
-    value = abs(finding.value or 0.0)
-    return -value if finding.name in ("few-samples", "no-difference") else value

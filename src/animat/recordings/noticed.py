@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from animat.recordings.channel_quality import channel_findings
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -24,7 +23,7 @@ def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     Of a table of responses, which has no spikes to look at, the former and its frequencies (`other-frequencies`).
 
     Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
-    (`animat.recordings.channel_quality`), times that cannot be in seconds (`animat.recordings.time_quality`), more
+    (`channel_findings`), times that cannot be in seconds (`animat.recordings.time_quality`), more
     stimuli than spikes (`more-stimuli-than-spikes`), stimuli of one time (`simultaneous-stimuli`), stimuli without
     electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
     """
@@ -48,8 +47,7 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield from channel_findings(recording)
     yield from time_findings(recording)
     yield from _stimulus_rows(recording)
-    unknown = int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest))
-    if unknown:
+    if unknown := int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest)):
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
@@ -68,10 +66,47 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
         yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_A_SPIKE else "note", message, ratio)
     last = recording.stimuli.is_last_of_presentation
-    same = int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1]))
-    if same:
+    if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
         message = (
             f"{same:,} of {len(times_s):,} stimuli come at the very time of the one before, and the response is "
             "counted for each: where they are the electrodes of one stimulus, put these into one row"
         )
         yield Finding("simultaneous-stimuli", "refuse", message, float(same))
+
+
+MOSTLY_SILENT = 0.5
+FAST_HZ = 100.0
+"""On average over a recording: no few neurons near one electrode fire so fast for minutes."""
+HOLDS_MOST = 1 / 3
+SEVERAL = 8
+NAMED = 6
+
+
+def channel_findings(recording: Recording) -> Iterator[Finding]:
+    """Findings on silent channels (`silent-channels`) and noisy ones (`noisy-channels`).
+
+    A channel is silent without a spike. It is noisy if it fires at more than 100 Hz on average, or holds more than a
+    third of all spikes of eight or more channels.
+
+    Args:
+        recording: with at least one spike.
+    """
+    channels = recording.channels
+    n, n_spikes = len(channels), len(recording.spike_times_s)
+    count = np.bincount(recording.spike_channels, minlength=n)
+    if silent := int(np.count_nonzero(count == 0)):
+        mostly = silent > MOSTLY_SILENT * n
+        message = f"{silent:,} of {n:,} channels are silent; they count in rates per channel"
+        message += ": route electrodes where the culture fires" if mostly else ""
+        yield Finding("silent-channels", "warning" if mostly else "note", message, float(silent))
+    fast = count > FAST_HZ * recording.duration_s if recording.duration_s > 0 else np.zeros(n, dtype=bool)
+    most = (count > HOLDS_MOST * n_spikes) if n >= SEVERAL and n_spikes >= 10 * n else np.zeros(n, dtype=bool)
+    noisy = np.flatnonzero(fast | most)
+    if len(noisy):
+        share = float(count[noisy].sum() / n_spikes)
+        names = ", ".join(channels.label[noisy[:NAMED]]) + (", ..." if len(noisy) > NAMED else "")
+        message = (
+            f"{len(noisy):,} of {n:,} channels ({names}) fire as no neurons do and hold {100 * share:.0f} % of all "
+            "spikes: they carry noise; raise their threshold or leave them out of the routing"
+        )
+        yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

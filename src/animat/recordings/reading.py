@@ -31,11 +31,9 @@ S = TypeVar("S", Recording, Recording | ResponseTable)
 HDF5 = b"\x89HDF\r\n\x1a\n"
 ZIP = b"PK"
 NPY = b"\x93NUMPY"
+PICKLE = "a Python pickle, which is never read; save plain arrays with numpy.savez"
 OTHERS = {
-    **{
-        bytes([0x80, protocol]): "a Python pickle, which is never read; save plain arrays with numpy.savez"
-        for protocol in range(2, 6)
-    },
+    **{bytes([0x80, protocol]): PICKLE for protocol in range(2, 6)},
     b"\xff\xfe": "text in UTF-16; save it as CSV in UTF-8",
     b"\xfe\xff": "text in UTF-16; save it as CSV in UTF-8",
     b"MATLAB": "a MATLAB file; save its columns as CSV or NPZ",
@@ -217,14 +215,11 @@ def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
         InvalidFile: for a folder without recordings.
         InvalidArgument: if no path is given.
     """
-    files = [file for path in _listed(paths) for file in _files(path)]
+    given = [paths] if isinstance(paths, str | os.PathLike) else paths
+    files = [file for path in given for file in _files(Path(path))]
     if not files:
         raise InvalidArgument("paths: expected at least one file or folder of recordings, got none")
     return files
-
-
-def _listed(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
-    return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(path) for path in paths]
 
 
 def _files(path: Path) -> list[Path]:

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.stimulus import Stimuli
-from animat.tables import CENTURY_S, FASTEST_HZ, expect_rising_times, freeze
+from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,6 +15,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Channels
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
+from animat.tables import read_only
 
 Kind = Literal["count", "rate_hz"]
 
@@ -53,7 +54,7 @@ class ResponseTable:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
-        values: np.ndarray[Any, np.dtype[np.float64]] = np.array(self.values, dtype=np.float64)
+        values = read_only(self, "values", np.float64)
         shape = (len(self.stimuli), len(self.channels))
         if values.shape != shape:
             raise UnusableData(
@@ -76,8 +77,6 @@ class ResponseTable:
             raise UnusableData(
                 f"window: expected 0 <= start < end in ms, got {self.window_ms[0]:g}, {self.window_ms[1]:g}"
             )
-        values.setflags(write=False)
-        object.__setattr__(self, "values", values)
 
     @property
     def _words(self) -> str:

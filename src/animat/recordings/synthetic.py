@@ -83,13 +83,9 @@ class SyntheticCulture:
         _expect(self.seed >= 0, "seed", "0 or more", self.seed)
         _expect(len(self.frequencies_hz) >= 1, "frequencies_hz", "at least one", self.frequencies_hz)
         _expect(all(0 < f <= 100 for f in self.frequencies_hz), "frequencies_hz", "0 to 100 Hz", self.frequencies_hz)
-        _expect(
-            len(set(self.frequencies_hz)) == len(self.frequencies_hz),
-            "frequencies_hz",
-            "each once",
-            self.frequencies_hz,
-        )
-        _expect(len(self.means_hz) == len(self.frequencies_hz), "means_hz", "one a frequency", self.means_hz)
+        n = len(self.frequencies_hz)
+        _expect(len(set(self.frequencies_hz)) == n, "frequencies_hz", "each once", self.frequencies_hz)
+        _expect(len(self.means_hz) == n, "means_hz", "one a frequency", self.means_hz)
         _expect(all(0 <= m <= 150 for m in self.means_hz), "means_hz", "0 to 150 Hz a channel", self.means_hz)
         _expect(self.shape > 0, "shape", "more than 0", self.shape)
         _expect(1 <= self.patterns <= 10_000, "patterns", "1 to 10,000", self.patterns)
@@ -125,11 +121,7 @@ class SyntheticCulture:
             spike_channels=spike_channel[order],
             channels=channels,
             stimuli=Stimuli(
-                time_s=time_s,
-                frequency_hz=np.array(self.frequencies_hz, dtype=np.float64)[frequency],
-                pattern=pattern,
-                electrodes=patterns[pattern],
-                presentation=np.arange(len(time_s)),
+                time_s, np.array(self.frequencies_hz)[frequency], pattern, patterns[pattern], np.arange(len(time_s))
             ),
             sampling_rate_hz=SAMPLING_RATE_HZ,
             start_s=0.0,
@@ -267,9 +259,7 @@ def write_synthetic_series(
         file = Path(folder) / recording_name(start_min)
         if file.exists():
             there = read_recording(file)
-            told = dict(there.provenance)
-            if told.get("source") == FORMER_SOURCE:
-                told["source"] = SOURCE
+            told = {key: SOURCE if words == FORMER_SOURCE else words for key, words in there.provenance.items()}
             if told != culture.provenance or there.start_min != start_min:
                 raise Mismatch(
                     f"{file}: expected a recording of the same synthetic culture at {start_min:g} min, got another; "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float64
 
@@ -21,20 +23,17 @@ def draw_array(recording: Recording) -> Figure:
     channels, stimuli = recording.channels, recording.stimuli
     rate_hz = rates_of_sites(recording)
     known = np.isfinite(channels.x_um) & np.isfinite(channels.y_um)
-    figure = _figure_for(channels.x_um[known], channels.y_um[known])
+    # In the shape of what is drawn, with room for title, legend and colour bar.
+    places_um = channels.x_um[known], channels.y_um[known]
+    width_um, height_um = (max(float(np.ptp(along)), 1.0) if len(along) else 1.0 for along in places_um)
+    shape = float(np.clip(width_um / height_um, 0.4, 2.5))
+    across_in, down_in = (6.5, 6.5 / shape) if shape > 1.5 else (4.2 * shape, 4.2)
+    figure = new_figure(max(across_in + 1.8, 5.0), down_in + 1.4)
     axes = figure.subplots()
     # A few channels of a very high rate must not leave all others dark.
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
-    drawn = axes.scatter(
-        channels.x_um[known],
-        channels.y_um[known],
-        c=rate_hz[known],
-        vmin=0,
-        vmax=max(highest_hz, 1e-9),
-        cmap="cividis",
-        s=9,
-        linewidths=0,
-    )
+    of_rates: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
+    drawn = axes.scatter(*places_um, s=9, linewidths=0, **of_rates)
     bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
     bar.set_label("firing rate, stimulated time included (Hz)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
@@ -76,14 +75,6 @@ def draw_selection(selection: Selection) -> Figure:
     axes.set_xlim(-2 * array.pitch_um, (array.columns + 1) * array.pitch_um)
     _finish(axes, f"{array.name}: {selection.passed:,} of {selection.scanned:,} scanned electrodes passed")
     return figure
-
-
-def _figure_for(x_um: Float64[np.ndarray, " sites"], y_um: Float64[np.ndarray, " sites"]) -> Figure:
-    """A figure in the shape of what is drawn, with room for title, legend and colour bar."""
-    width_um, height_um = (max(float(np.ptp(along)), 1.0) if len(along) else 1.0 for along in (x_um, y_um))
-    shape = float(np.clip(width_um / height_um, 0.4, 2.5))
-    across_in, down_in = (6.5, 6.5 / shape) if shape > 1.5 else (4.2 * shape, 4.2)
-    return new_figure(max(across_in + 1.8, 5.0), down_in + 1.4)
 
 
 def _ring(axes: Axes, x_um: np.ndarray, y_um: np.ndarray, label: str) -> None:

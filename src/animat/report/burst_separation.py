@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 
-from animat.report.response_histograms import rate_edges
+from animat.report.response_histograms import even_edges, rate_edges
 from animat.report.style import BLACK, BLUE, BURST, NON_BURST, Axes, Figure, add_legend, new_figure, style_axes
 from animat.responses.responses import Responses
 
@@ -19,15 +19,15 @@ def draw_burst_separation(responses: Responses) -> Figure:
 
     Where no response is a burst, there is no threshold and no fourth panel.
     """
-    n_bursts = int(np.count_nonzero(responses.is_burst))
+    n_bursts, n_channels = int(np.count_nonzero(responses.is_burst)), responses.n_channels
     figure = new_figure(9.0, 6.8) if n_bursts else new_figure(12.0, 3.6)
     all_x, plain, ratios, *more = figure.subplots(2, 2).flat if n_bursts else figure.subplots(1, 3)
     all_x.hist(responses.rate_hz, bins=rate_edges(responses, responses.rate_hz, 40).tolist(), color=BLUE)
     style_axes(all_x, f"{len(responses):,} responses", _RATE, "responses (count)")
     _scatter(plain, responses, np.ones(len(responses), dtype=bool), BLUE, None)
     style_axes(plain, "response against active channels", _RATIO, _RATE)
-    # A bar for every possible ratio, k/N, up to 40 bars: bins that are no multiple of 1/N show a comb.
-    ratios.hist(responses.active_ratio, bins=_ratio_edges(responses).tolist(), color=BLUE)
+    # A bar for every possible ratio, k/N, up to 40 bars.
+    ratios.hist(responses.active_ratio, even_edges(responses.active_ratio, 1 / n_channels, 40).tolist(), color=BLUE)
     style_axes(ratios, f"separability {responses.separability:.2f}" if n_bursts else _NONE, _RATIO, "responses (count)")
     for labelled in more:
         _scatter(labelled, responses, ~responses.is_burst, NON_BURST, f"non-burst ({len(responses) - n_bursts:,})")
@@ -35,13 +35,8 @@ def draw_burst_separation(responses: Responses) -> Figure:
         style_axes(labelled, "bursts set apart", _RATIO, _RATE)
     for axes in (ratios, *more) if n_bursts else ():
         # Between the largest ratio that is no burst and the next possible one.
-        axes.axvline(
-            responses.threshold + 0.5 / responses.n_channels,
-            color=BLACK,
-            linestyle="--",
-            linewidth=1,
-            label=f"threshold {responses.threshold:.3f}",
-        )
+        label = f"threshold {responses.threshold:.3f}"
+        axes.axvline(responses.threshold + 0.5 / n_channels, color=BLACK, linestyle="--", linewidth=1, label=label)
         add_legend(axes, loc="best", markerscale=2)
         for handle in axes.get_legend().legend_handles:
             handle.set_alpha(1)
@@ -51,19 +46,5 @@ def draw_burst_separation(responses: Responses) -> Figure:
 def _scatter(
     axes: Axes, responses: Responses, which: Bool[np.ndarray, " responses"], colour: str, label: str | None
 ) -> None:
-    axes.scatter(
-        responses.active_ratio[which],
-        responses.rate_hz[which],
-        s=9,
-        alpha=0.6 if len(responses) > 300 else 0.9,
-        color=colour,
-        linewidths=0,
-        label=label,
-        rasterized=True,
-    )
-
-
-def _ratio_edges(responses: Responses) -> Float64[np.ndarray, " edges"]:
-    largest = round(responses.active_ratio.max() * responses.n_channels) if len(responses) else 1
-    step = max(1, -(-(largest + 1) // 40))
-    return (np.arange(0, largest + 1 + step, step) - 0.5) / responses.n_channels
+    x, y, alpha = responses.active_ratio[which], responses.rate_hz[which], 0.6 if len(responses) > 300 else 0.9
+    axes.scatter(x, y, s=9, alpha=alpha, color=colour, linewidths=0, label=label, rasterized=True)

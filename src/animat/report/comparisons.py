@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.html import cell
-from animat.report.minus import with_minus
+from animat.report.html import cell, with_minus
 from animat.report.style import (
     BLACK,
     BLUE,

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from animat.report.style import BLACK, BLUE, GREY, ORANGE, Axes, Figure, add_common_legend, new_figure, style_axes
 
 _APART = 0.11
@@ -64,14 +62,8 @@ def _points(axes: Axes, found: Mapping[str, Sequence[Estimate]], colour: str, no
             place = row + _APART * (i - (len(known) - 1) / 2)
             ends = [end for end in (each.low, each.high) if end is not None]
             axes.plot(ends, [place] * len(ends), color=colour, linewidth=1.2)
-            axes.plot(
-                [each.value if each.value is not None else np.nan],
-                [place],
-                ">" if each.is_least else "o",
-                color=colour,
-                markersize=4,
-                label="at least" if each.is_least else "a culture, 95 % interval",
-            )
+            marker, label = (">", "at least") if each.is_least else ("o", "a culture, 95 % interval")
+            axes.plot([each.value or 0.0], [place], marker, color=colour, markersize=4, label=label)
 
 
 def draw_whose_work(lost: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:

@@ -56,15 +56,8 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     upper, middle, lower = figure.subplots(3, 1, sharex=True, height_ratios=[1.3, 1.3, 0.7])
 
     for low, high, alpha in ((0, 4, 0.2), (1, 3, 0.35)):
-        upper.fill_between(
-            minutes,
-            percentiles[:, low],
-            percentiles[:, high],
-            color=GREY,
-            alpha=alpha,
-            linewidth=0,
-            label=f"P{PERCENTILES[low]} to P{PERCENTILES[high]}",
-        )
+        label = f"P{PERCENTILES[low]} to P{PERCENTILES[high]}"
+        upper.fill_between(minutes, *percentiles.T[[low, high]], color=GREY, alpha=alpha, linewidth=0, label=label)
     upper.plot(minutes, percentiles[:, 2], color=BLACK, marker="o", markersize=3, label="P50")
     upper.set_ylim(0, None)
     style_axes(upper, "percentiles of all non-burst responses", "", "response x (Hz per channel)")

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from animat.report.style import Figure, grid_of_panels, new_figure, style_axes
-from animat.robots.base import Robot
-from animat.robots.capabilities import capability
+from animat.robots.base import Robot, capability
 from animat.robots.drawing import draw_robot
 
 Path = Float[np.ndarray, "iterations+1 observations"]

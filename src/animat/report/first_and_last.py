@@ -33,25 +33,15 @@ def draw_first_and_last(series: Sequence[Responses]) -> Figure:
             colour = colours[i] if filled else GREY
             label = f"{responses.start_min:g} min"
             axes.stairs(share, edges_hz, fill=filled, color=colour, linewidth=None if filled else 1.6, label=label)
-            if math.isfinite(responses.median_rate_hz):
-                axes.axvline(
-                    responses.median_rate_hz,
-                    color=MEDIAN if filled else GREY,
-                    linewidth=1.3,
-                    linestyle="--",
-                    label=f"P50 at {responses.start_min:g} min: {responses.median_rate_hz:.1f} Hz" if i == 0 else None,
-                )
-        shares = [responses.shares_above_median()[i] for responses in (first, last)]
-        style_axes(
-            axes,
-            f"{condition.label}: P(x ≥ P50) {shares[0]:.2f} in the first, {shares[1]:.2f} in the last recording",
-            "",
-            "fraction",
-        )
+            if math.isfinite(median_hz := responses.median_rate_hz):
+                label, colour = f"P50 at {label}: {median_hz:.1f} Hz", MEDIAN if filled else GREY
+                axes.axvline(median_hz, color=colour, linewidth=1.3, linestyle="--", label=None if i else label)
+        before, after = (responses.shares_above_median()[i] for responses in (first, last))
+        title = f"{condition.label}: P(x ≥ P50) {before:.2f} in the first, {after:.2f} in the last recording"
+        style_axes(axes, title, "", "fraction")
         if i == 0:
             add_legend(axes, loc="upper right")
     left_out = len(first.conditions) - len(conditions)
-    figure.supxlabel(
-        "response x (Hz per channel)" + (f"; {left_out} more conditions are not drawn" if left_out else ""), fontsize=9
-    )
+    more = f"; {left_out} more conditions are not drawn" if left_out else ""
+    figure.supxlabel(f"response x (Hz per channel){more}", fontsize=9)
     return figure

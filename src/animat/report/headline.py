@@ -46,7 +46,11 @@ def draw_headline(rows: Sequence[ArmReturns], *, narrow: bool = False) -> Figure
     for axes, robot in zip(panels, robots, strict=True):
         own = [row for row in rows if row.robot == robot]
         style_axes(axes, robot, "mean return of an episode", "")
-        left, right = _ends(own)
+        every = [value for row in own for value in (row.mean, row.random, row.optimum, *row.policies)]
+        known = [value for value in every if value is not None]
+        # Every return, with some room for intervals on either side.
+        room = 0.08 * (max(known) - min(known)) or 1.0
+        left, right = min(known) - room, max(known) + room
         for place, row in enumerate(own):
             if row.random is not None:
                 axes.plot(row.random, place, "x", color=GREY, markersize=6, label="random actions")
@@ -68,10 +72,3 @@ def draw_headline(rows: Sequence[ArmReturns], *, narrow: bool = False) -> Figure
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=2 if narrow else 3 if len(robots) == 1 else 5)
     return figure
-
-
-def _ends(rows: Sequence[ArmReturns]) -> tuple[float, float]:
-    """Of an axis that holds every return, with some room for intervals on either side."""
-    every = [value for row in rows for value in (row.mean, row.random, row.optimum, *row.policies) if value is not None]
-    room = 0.08 * (max(every) - min(every)) or 1.0
-    return min(every) - room, max(every) + room

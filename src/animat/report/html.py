@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import os
+import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,11 +13,19 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from animat.errors import InvalidFile
-from animat.report.minus import MINUS, with_minus
 from animat.report.style import PNG_DPI
 from animat.writing import write_whole
 
 TEMPLATE = "report.html.j2"
+MINUS = "\u2212"
+
+# Not within a word, a range such as 2-10, an option or a file's name; the exponent's of 1.5e-05 is one.
+_HYPHEN = re.compile(r"(?:(?<![\w.\-/])-(?=\.?\d))|(?<=\de)-(?=\d)")
+
+
+def with_minus(text: str) -> str:
+    """A text with a minus sign before each negative number, in place of a hyphen."""
+    return _HYPHEN.sub(MINUS, text)
 
 
 @dataclass(frozen=True)
@@ -40,12 +49,12 @@ class Picture:
     @property
     def data(self) -> str:
         """The PNG as a data address."""
-        return _address(_bytes(self.file))
+        return _address(self.file)
 
     @property
     def narrow_data(self) -> str | None:
         """The PNG for a telephone as a data address, where there is one of its own."""
-        return None if self.narrow is None else _address(_bytes(self.narrow))
+        return None if self.narrow is None else _address(self.narrow)
 
     @property
     def width_px(self) -> int:
@@ -84,6 +93,11 @@ class Table:
 
 Columns: TypeAlias = list[tuple[str, "str | Callable[[Any], Any]"]]
 """Of a table of records: their names, and the field or a function of a record that gives the cell."""
+
+
+def columns_of(*fields: str) -> Columns:
+    """Columns that are called as their fields are, in words."""
+    return [(name.replace("_", " "), name) for name in fields]
 
 
 def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) -> Table:
@@ -140,8 +154,8 @@ def _bytes(file: Path) -> bytes:
         raise InvalidFile(f"{file}: expected a figure, got none: {error.strerror or error}") from error
 
 
-def _address(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def _address(file: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(_bytes(file)).decode()
 
 
 def cell(value: Any) -> str:

@@ -28,9 +28,14 @@ def inspection_text(inspection: Inspection) -> str:
     """Lines for a terminal: what the recording holds, its responses, the conditions, the findings, the verdict."""
     responses = inspection.responses
     start_ms, end_ms = responses.window_ms
+    # As far as it is known.
+    spikes = "rates" if inspection.n_spikes is None else f"{inspection.n_spikes:,} spikes"
+    of_s = inspection.duration_s
+    span = f" in {of_s:,.1f} s ({of_s / 60:.1f} min)" if math.isfinite(of_s) else ""
+    start = f"from {inspection.start_min:g} min on the culture's clock"
     lines = [
         f"{inspection.name}: {inspection.verdict}",
-        f"  {_held(inspection)}, from {inspection.start_min:g} min on the culture's clock",
+        f"  {spikes} on {inspection.n_channels:,} channels{span}, {start}",
         f"  {inspection.n_stimuli:,} stimuli"
         + (f" in {inspection.n_trials:,} trials" if inspection.n_trials != inspection.n_stimuli else "")
         + (f", {inspection.presentation}" if inspection.presentation else ""),
@@ -38,14 +43,10 @@ def inspection_text(inspection: Inspection) -> str:
     if inspection.network_bursts is not None:
         lines += _spontaneous(inspection, inspection.network_bursts)
     if math.isfinite(inspection.mean_spikes_per_stimulus):
-        lines.append(
-            f"  {inspection.mean_spikes_per_stimulus:.2f} spikes in {start_ms:g}-{end_ms:g} ms per stimulus"
-            + (
-                f"; {inspection.spontaneous_rate_hz:.3g} Hz per channel without stimuli"
-                if math.isfinite(inspection.spontaneous_rate_hz)
-                else ""
-            )
-        )
+        quiet_hz = inspection.spontaneous_rate_hz
+        quiet = f"; {quiet_hz:.3g} Hz per channel without stimuli" if math.isfinite(quiet_hz) else ""
+        per_stimulus = f"{inspection.mean_spikes_per_stimulus:.2f} spikes in {start_ms:g}-{end_ms:g} ms per stimulus"
+        lines.append(f"  {per_stimulus}{quiet}")
     if len(responses):
         lines.append(
             f"  bursts: {inspection.n_bursts:,} of {len(responses):,} responses, above {responses.threshold:.3f} of "
@@ -57,14 +58,6 @@ def inspection_text(inspection: Inspection) -> str:
     if inspection.findings:
         lines += ["", *(f"  {_MARK[finding.severity]} {finding.message}" for finding in inspection.findings)]
     return "\n".join(lines)
-
-
-def _held(inspection: Inspection) -> str:
-    """What was measured, as far as it is known."""
-    spikes = "rates" if inspection.n_spikes is None else f"{inspection.n_spikes:,} spikes"
-    of_s = inspection.duration_s
-    span = f" in {of_s:,.1f} s ({of_s / 60:.1f} min)" if math.isfinite(of_s) else ""
-    return f"{spikes} on {inspection.n_channels:,} channels{span}"
 
 
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:
@@ -99,15 +92,11 @@ def draw_inspection(
     stem = figure_stem(inspection.name)
     figures = {}
     if isinstance(recording, Recording):
-        figures["raster"] = (
-            draw_raster(recording, responses)
-            if inspection.network_bursts is None
-            else draw_spontaneous(recording, inspection.network_bursts)
-        )
-    if isinstance(recording, Recording) and inspection.n_trials:
-        figures["psth"] = draw_psth(
-            _histogram(recording, inspection), responses.window_ms, inspection.spontaneous_rate_hz
-        )
+        bursts = inspection.network_bursts
+        figures["raster"] = draw_raster(recording, responses) if bursts is None else draw_spontaneous(recording, bursts)
+        if inspection.n_trials:
+            histogram = _histogram(recording, inspection)
+            figures["psth"] = draw_psth(histogram, responses.window_ms, inspection.spontaneous_rate_hz)
     if len(responses):
         figures["burst-separation"] = draw_burst_separation(responses)
         figures["responses"] = draw_response_histograms(responses)

@@ -55,10 +55,8 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
         ):
             if levels is not None:
                 # A part goes up to its end, the first one from 0.
-                steps = np.append(levels[:1], levels)
-                axes.step(
-                    np.append(0.0, x), steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name
-                )
+                steps = np.append(0.0, x), np.append(levels[:1], levels)
+                axes.step(*steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name)
         style_axes(axes, curve.name, "iterations (thousands)", "return")
         axes.set_xlim(0, None)
     add_common_legend(figure, panels, columns=4 if columns == 3 else 2)

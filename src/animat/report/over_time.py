@@ -73,10 +73,8 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
             name = "optimal return, rough grid"
             axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=name)
         if of.fine_optimum:
-            name = "optimal return, fine grid"
-            axes.plot(
-                *zip(*of.fine_optimum, strict=True), color=OPTIMUM, linestyle="", marker="D", markersize=4, label=name
-            )
+            points = zip(*of.fine_optimum, strict=True)
+            axes.plot(*points, "D", color=OPTIMUM, markersize=4, label="optimal return, fine grid")
         if of.random is not None:
             axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
         if trained_until_min is not None:

@@ -21,9 +21,8 @@ def draw_psth(
     figure = new_figure(7.5, 3.8)
     axes = figure.subplots()
     rate_hz = np.nan_to_num(histogram.rate_hz)
-    axes.axvspan(
-        *window_ms, color=WINDOW, alpha=0.25, linewidth=0, label=f"window {window_ms[0]:g}-{window_ms[1]:g} ms"
-    )
+    label = f"window {window_ms[0]:g}-{window_ms[1]:g} ms"
+    axes.axvspan(*window_ms, color=WINDOW, alpha=0.25, linewidth=0, label=label)
     axes.stairs(rate_hz, histogram.edges_ms, fill=True, color=BLUE)
     axes.axvline(0, color=RED, linewidth=1, label="stimulus")
     if spontaneous_hz is not None and np.isfinite(spontaneous_hz):

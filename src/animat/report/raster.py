@@ -99,9 +99,8 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     axes.set_xlim(from_ms, to_ms)
     axes.set_ylim(-0.5, max(len(chosen), 1) - 0.5)
     thinned = "" if len(chosen) == len(times_s) else f"{len(chosen)} of "
-    style_axes(
-        axes, f"{thinned}{len(times_s):,} stimuli, a row each; {each}", "time from stimulus (ms)", "stimulus (row)"
-    )
+    title = f"{thinned}{len(times_s):,} stimuli, a row each; {each}"
+    style_axes(axes, title, "time from stimulus (ms)", "stimulus (row)")
 
 
 def _draw_rates(

@@ -60,7 +60,11 @@ def rate_edges(
     values and now one less, and show a comb that is not in the data.
     """
     start_ms, end_ms = responses.window_ms
-    step_hz = 1 / ((end_ms - start_ms) * 1e-3 * responses.n_channels)
-    most = round(float(rates_hz.max()) / step_hz) if len(rates_hz) else 1
-    spikes = max(1, math.ceil((most + 1) / n_bins))
-    return (np.arange(0, most + 1 + spikes, spikes) - 0.5) * step_hz
+    return even_edges(rates_hz, 1 / ((end_ms - start_ms) * 1e-3 * responses.n_channels), n_bins)
+
+
+def even_edges(values: Float64[np.ndarray, " some"], step: float, n_bins: int) -> Float64[np.ndarray, " edges"]:
+    """Edges of at most n_bins bins that each hold equally many of the multiples of a step, which all values are."""
+    most = round(float(values.max()) / step) if len(values) else 1
+    together = max(1, math.ceil((most + 1) / n_bins))
+    return (np.arange(0, most + 1 + together, together) - 0.5) * step

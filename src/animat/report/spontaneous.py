@@ -19,15 +19,8 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
     upper, lower = figure.subplots(2, 1, height_ratios=[2, 1], sharex=True)
     n = len(recording.spike_times_s)
     shown = evenly(n, _MOST_SPIKES)
-    size = 4.0 if n < 10_000 else 1.0
-    upper.scatter(
-        recording.spike_times_s[shown],
-        recording.spike_channels[shown],
-        s=size,
-        color=BLACK,
-        linewidths=0,
-        rasterized=True,
-    )
+    size, spikes = 4.0 if n < 10_000 else 1.0, (recording.spike_times_s[shown], recording.spike_channels[shown])
+    upper.scatter(*spikes, s=size, color=BLACK, linewidths=0, rasterized=True)
     upper.set_xlim(recording.start_s, max(recording.stop_s, recording.start_s + 1e-3))
     upper.set_ylim(-1, len(recording.channels))
     thinned = f"{len(shown):,} of " if len(shown) < n else ""

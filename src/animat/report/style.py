@@ -22,23 +22,12 @@ FORMATS = ("png", "svg", "pdf")
 PNG_DPI = 160
 
 # Okabe and Ito's palette, which people with any common colour blindness can tell apart.
-BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (
-    "#000000",
-    "#E69F00",
-    "#56B4E9",
-    "#009E73",
-    "#0072B2",
-    "#D55E00",
-    "#CC79A7",
-)
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, RED, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
 """In the order in which they are taken."""
-GREY = "#8C8C8C"
-WINDOW = ORANGE
-NON_BURST = BLUE
-BURST = RED
-MEDIAN = RED
-OPTIMUM = BLACK
+WINDOW, OPTIMUM = ORANGE, BLACK
+NON_BURST, BURST, MEDIAN = BLUE, RED, RED
 
 # Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}

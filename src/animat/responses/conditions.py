@@ -313,13 +313,9 @@ def _check_frequencies(name: str, values_hz: tuple[float, ...]) -> None:
         raise InvalidArgument(f"{name}: expected each frequency once, got {_listed(values_hz)[1:]}")
 
 
-def _number(value: float) -> str:
-    """The shortest text that reads back as the same number, without a needless .0."""
-    return repr(float(value)).removesuffix(".0")
-
-
 def _listed(values: tuple[float, ...]) -> str:
-    return ":" + ",".join(map(_number, values)) if values else ""
+    # The shortest text that reads back as the same number, without a needless .0.
+    return ":" + ",".join(repr(float(value)).removesuffix(".0") for value in values) if values else ""
 
 
 def _floats(text: str, listed: str) -> tuple[float, ...]:

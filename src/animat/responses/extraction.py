@@ -115,7 +115,14 @@ def responses_of_table(
         raise UnusableData("channels: expected at least one, got a table without any; x is a mean over channels")
     if isinstance(by, ByInterval) and not table.has_times:
         raise UnusableData("conditions: expected others than intervals, as the table has no times of stimuli")
-    assumed = () if table.window_ms is not None else (_assumed(window_ms),)
+    assumed = []
+    if table.window_ms is None:
+        message = (
+            f"the table does not say in which window its spikes were counted: {window_ms[0]:g} to {window_ms[1]:g} ms "
+            "after the stimulus are assumed, in which a closed loop would count them; say it with --window-ms, or in "
+            "the file"
+        )
+        assumed = [Finding("window-assumed", "warning", message)]
     window_ms = table.window_ms or window_ms
     scale = 1.0 if table.kind == "rate_hz" else 1 / ((window_ms[1] - window_ms[0]) * 1e-3)
     presented = np.flatnonzero(table.stimuli.is_last_of_presentation)
@@ -151,6 +158,7 @@ def _sorted(
     # other, and nothing is known of what was before the first.
     silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
     is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
+    time_s = stimuli.time_s[presented] if has_times else None
     responses = Responses(
         condition=condition[chosen],
         rate_hz=rate_hz[chosen],
@@ -163,25 +171,10 @@ def _sorted(
         separability=bursts.separability,
         presentation=source.presentation,
         start_min=source.start_min,
-        time_s=stimuli.time_s[presented[chosen]] if has_times else None,
-        presented=Presented(
-            condition,
-            rate_hz,
-            active_ratio > bursts.threshold,
-            is_rested,
-            stimuli.time_s[presented] if has_times else None,
-        ),
+        time_s=None if time_s is None else time_s[chosen],
+        presented=Presented(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
         place=np.flatnonzero(chosen),
         by=str(by),
         burst_threshold=burst_threshold,
     )
     return responses, assignment, bursts
-
-
-def _assumed(window_ms: tuple[float, float]) -> Finding:
-    message = (
-        f"the table does not say in which window its spikes were counted: {window_ms[0]:g} to {window_ms[1]:g} ms "
-        "after the stimulus are assumed, in which a closed loop would count them; say it with --window-ms, or in "
-        "the file"
-    )
-    return Finding("window-assumed", "warning", message)

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from animat.brief import briefly
 from animat.recordings.findings import Finding
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
@@ -20,6 +19,7 @@ from animat.responses.network_bursts import NetworkBursts, find_network_bursts
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS, count_spikes
+from animat.tables import briefly
 
 Verdict = Literal["usable", "usable with care", "not usable"]
 

@@ -86,10 +86,8 @@ def post_stimulus_histogram(
     # The small number keeps 70.000000001 bins from becoming 71.
     n_bins = max(1, math.ceil((to_ms - from_ms) / bin_ms - 1e-9))
     edges_ms = from_ms + bin_ms * np.arange(n_bins + 1)
-    spikes_before = [np.searchsorted(recording.spike_times_s, times_s + edge * 1e-3).sum() for edge in edges_ms]
-    return PostStimulusHistogram(
-        edges_ms, np.diff(np.array(spikes_before, dtype=np.int64)), len(times_s), len(recording.channels)
-    )
+    before = np.array([np.searchsorted(recording.spike_times_s, times_s + edge * 1e-3).sum() for edge in edges_ms])
+    return PostStimulusHistogram(edges_ms, np.diff(before.astype(np.int64)), len(times_s), len(recording.channels))
 
 
 def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float, float]:

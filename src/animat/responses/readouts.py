@@ -182,16 +182,16 @@ def _groups(written: str) -> Readouts:
     """Readouts from JSON."""
     try:
         data = json.loads(written, object_pairs_hook=_each_once)
-        if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
-            raise InvalidArgument(
-                f'readouts: expected electrodes by the names of groups, {{"left": [1, 2], "right": [3, 4]}}, got '
-                f"{shown(data)}"
-            )
-        return Readouts(tuple(data), tuple(map(tuple, data.values())))
     except InvalidArgument:
         raise
     except (ValueError, RecursionError) as error:
         raise InvalidArgument(f"readouts: expected JSON, got {error}") from error
+    if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
+        raise InvalidArgument(
+            f'readouts: expected electrodes by the names of groups, {{"left": [1, 2], "right": [3, 4]}}, got '
+            f"{shown(data)}"
+        )
+    return Readouts(tuple(data), tuple(map(tuple, data.values())))
 
 
 def _each_once(groups: list[tuple[str, object]]) -> dict[str, object]:

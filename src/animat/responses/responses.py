@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import Mismatch
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
 from animat.stimulation.protocol import Presentation
+from animat.tables import briefly, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +41,9 @@ class Presented:
     def __post_init__(self) -> None:
         known = () if self.time_s is None else ("time_s",)
         for name in ("condition", "rate_hz", "is_burst", "is_rested", *known):
-            array = np.array(getattr(self, name))
+            array = read_only(self, name)
             if array.shape != (len(self.condition),):
                 raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {array.shape}")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,29 +102,21 @@ class Responses:
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None
 
     def __post_init__(self) -> None:
-        columns: dict[str, Any] = {
-            "condition": np.int64,
-            "rate_hz": np.float64,
-            "active_ratio": np.float64,
-            "is_burst": np.bool_,
-        }
+        columns = {"condition": np.int64, "rate_hz": np.float64, "active_ratio": np.float64, "is_burst": np.bool_}
         optional = {"time_s": np.float64, "place": np.int64}
-        columns |= {name: dtype for name, dtype in optional.items() if getattr(self, name) is not None}
-        for name, dtype in columns.items():
-            array = np.array(getattr(self, name), dtype=dtype)
+        for name, dtype in (columns | optional).items():
+            if name in optional and getattr(self, name) is None:
+                continue
+            array = read_only(self, name, dtype)
             if array.shape != (len(self),):
                 raise Mismatch(f"responses.{name}: expected {len(self)} values, one a response, got {array.shape}")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
         self._check_places()
         if (self.readout_hz is None) != self.readouts.are_all:
             raise Mismatch("responses.readout_hz: expected some where readouts are groups of channels, and only there")
         if self.readout_hz is not None:
-            array = np.array(self.readout_hz, np.float64)
+            array = read_only(self, "readout_hz", np.float64)
             if array.shape != (shape := (len(self),) if len(self.readouts) == 1 else (len(self), len(self.readouts))):
                 raise Mismatch(f"responses.readout_hz: expected shape {shape}, got {array.shape}")
-            array.setflags(write=False)
-            object.__setattr__(self, "readout_hz", array)
         if len(self) and not (self.condition.min() >= 0 and self.condition.max() < len(self.conditions)):
             raise Mismatch(
                 f"responses.condition: expected indices of {len(self.conditions)} conditions, "

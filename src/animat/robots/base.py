@@ -5,11 +5,13 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Generic, TypeVar, final
 
 from jaxtyping import Bool, Float
 from pydantic import BeforeValidator, Field
 
+from animat.errors import InvalidArgument
 from animat.late import Array, jax
 from animat.records import Number, Whole
 
@@ -68,7 +70,7 @@ class Robot(abc.ABC, Generic[State]):
     `terminated` says that the task ended (fell, arrived). That an episode reached `episode_limit` is truncation;
     whoever runs the episode counts, and a robot never says so.
 
-    Methods that may be missing, and what needs them says so (`animat.robots.capabilities`):
+    Methods that may be missing, and what needs them says so (`lacking`):
 
         succeeded(state) -> Bool[Array, ""]                            of the last state of an episode, in JAX
         heuristic(observation) -> command                              a heuristic policy, in JAX, of one observation
@@ -144,3 +146,32 @@ class Robot(abc.ABC, Generic[State]):
     def departures(self) -> tuple[tuple[str, str], ...]:
         """Where it departs from a paper's print: each with a title, for the report of a study; mostly nothing."""
         return ()
+
+
+WITHOUT = {
+    "heuristic": "no heuristic policy among the controls",
+    "value_grid": "no optimal return",
+    "draw": "no pictures of the robot",
+    "draw_paths": "no figure of paths",
+}
+"""What is left out for a robot without a method of this name (see `animat.Robot`)."""
+
+
+def lacking(robot: Robot[Any]) -> dict[str, str]:
+    """What is left out for this robot: a sentence for each method that it has not, by the method's name."""
+    return {
+        name: f"{without}: {robot.name} has no method `{name}`"
+        for name, without in WITHOUT.items()
+        if not hasattr(robot, name)
+    }
+
+
+def capability(robot: Robot[Any], name: str) -> Callable[..., Any]:
+    """The method of this name.
+
+    Raises:
+        InvalidArgument: for a robot without it.
+    """
+    if not hasattr(robot, name):
+        raise InvalidArgument(f"robot: {robot.name} has no method `{name}`")
+    return getattr(robot, name)  # type: ignore[no-any-return]

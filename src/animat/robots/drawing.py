@@ -11,8 +11,7 @@ from PIL import Image, ImageDraw
 
 from animat.errors import InvalidArgument
 from animat.late import Axes
-from animat.robots.base import Robot
-from animat.robots.capabilities import capability
+from animat.robots.base import Robot, capability
 
 Colour = tuple[int, int, int]
 Point = tuple[float, float]

@@ -12,8 +12,7 @@ from jaxtyping import Int32
 
 from animat.errors import InvalidArgument, first_line, shown
 from animat.late import Array, jnp
-from animat.robots.base import Robot
-from animat.robots.capabilities import capability
+from animat.robots.base import Robot, capability
 
 _FINEST = 8192.0
 

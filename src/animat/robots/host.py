@@ -265,15 +265,11 @@ def tried(robot: HostRobot, what: str, call: Callable[..., Answer], *arguments: 
     try:
         with within(robot, what):
             return call(*arguments)
+    except AnimatError:
+        # What the house has said in one line stays as it is.
+        raise
     except (Exception, SystemExit) as error:
-        raise _failed(robot, what, error) from error
-
-
-def _failed(robot: HostRobot, what: str, error: Exception | SystemExit) -> Exception:
-    # What the house has said in one line stays as it is.
-    if isinstance(error, AnimatError):
-        return error
-    return BodyFailed(f"{robot.name}: expected {what} to succeed, got {first_line(error)}")
+        raise BodyFailed(f"{robot.name}: expected {what} to succeed, got {first_line(error)}") from error
 
 
 class _TooLongError(BaseException):

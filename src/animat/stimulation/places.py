@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, InvalidFile, shown
 from animat.plain_file import read_plain_text
+from animat.tables import evenly
 
 CUT = {"halves": (2, 1), "quadrants": (2, 2)}
 """Columns and rows that electrodes are cut into, as many electrodes in each as can be."""
@@ -65,11 +66,10 @@ def read_places(text: str | os.PathLike[str]) -> Places:
         if not places:
             raise InvalidArgument("places: expected groups of electrodes as [[1, 2], [3, 4]], got none")
         return places
+    except InvalidArgument as error:
+        raise InvalidFile(f"{text}: {error}") from error
     except (ValueError, RecursionError) as error:
-        said = (
-            error if isinstance(error, InvalidArgument) else f"places: expected JSON as [[1, 2], [3, 4]], got {error}"
-        )
-        raise InvalidFile(f"{text}: {said}") from error
+        raise InvalidFile(f"{text}: places: expected JSON as [[1, 2], [3, 4]], got {error}") from error
 
 
 def count_places(places: Places) -> int:
@@ -108,7 +108,10 @@ def electrodes_of(
         )
     if places == "corners":
         y_of_um = dict(zip(electrodes.tolist(), y_um.tolist(), strict=True))
-        left, right = (_spread(half, y_of_um) for half in electrodes_of("halves", electrodes, x_um, y_um))
+        halves = electrodes_of("halves", electrodes, x_um, y_um)
+        # Of each half some electrodes, evenly from its smallest to its largest y.
+        sorted_halves = (sorted(half, key=lambda electrode: (y_of_um[electrode], electrode)) for half in halves)
+        left, right = (tuple(sorted(half[rank] for rank in evenly(len(half), SITES))) for half in sorted_halves)
         return left, right, tuple(sorted(left + right)), left[:1]
     columns, rows = CUT[places]
     found = []
@@ -116,10 +119,3 @@ def electrodes_of(
         in_order = column[np.lexsort((electrodes[column], y_um[column]))]
         found += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
     return tuple(found)
-
-
-def _spread(half: tuple[int, ...], y_of_um: dict[int, float]) -> tuple[int, ...]:
-    """Some electrodes of a half, evenly from its smallest to its largest y."""
-    in_order = sorted(half, key=lambda electrode: (y_of_um[electrode], electrode))
-    ranks = np.unique(np.linspace(0, len(half) - 1, SITES).round().astype(int))
-    return tuple(sorted(in_order[rank] for rank in ranks))

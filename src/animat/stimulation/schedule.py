@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from animat.errors import InvalidArgument
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli, Stimulus
-from animat.tables import UNKNOWN
+from animat.tables import UNKNOWN, padded
 
 TICK_S = 50e-6
 """Stimuli start on a grid of 50 us, a sample at 20 kHz: what stimulation hardware can time exactly."""
@@ -83,19 +83,18 @@ class Schedule:
 
     def deliveries(self, block: Block) -> list[Stimulus]:
         """The stimuli of a block as they are delivered."""
-        return stimuli_of(block.stimuli, self.protocol)
+        table = block.stimuli
+        columns = table.time_s, table.electrodes, table.frequency_hz, table.pattern, table.presentation
+        return [
+            Stimulus(time_s, tuple(e for e in on if e != UNKNOWN), self.protocol.pulse, frequency_hz, pattern, number)
+            for time_s, on, frequency_hz, pattern, number in zip(*(each.tolist() for each in columns), strict=True)
+        ]
 
 
 def _between(stimuli: Stimuli, first: int, last: int, start_s: float) -> Stimuli:
     """Rows of a table, their times counted from a start."""
-    rows = slice(first, last)
-    return Stimuli(
-        time_s=on_ticks(stimuli.time_s[rows] - start_s),
-        frequency_hz=stimuli.frequency_hz[rows],
-        pattern=stimuli.pattern[rows],
-        electrodes=stimuli.electrodes[rows],
-        presentation=stimuli.presentation[rows],
-    )
+    columns = {each.name: getattr(stimuli, each.name)[first:last] for each in fields(Stimuli)}
+    return Stimuli(**columns | {"time_s": on_ticks(columns["time_s"] - start_s)})
 
 
 def make_schedule(
@@ -135,7 +134,9 @@ def make_schedule(
         orders = [rng.permutation(np.repeat(np.arange(n_conditions), each))]
     if places:
         return Schedule(protocol, seed, _at_places(protocol, orders, patterns, places))
-    read = [_balanced(rng, protocol.patterns, each) for _ in range(n_frequencies)]
+    # Each pattern as often as the others, one round after the other, each round in random order.
+    rounds = range(-(-each // protocol.patterns))
+    read = [np.concatenate([rng.permutation(protocol.patterns) for _ in rounds])[:each] for _ in range(n_frequencies)]
     taken = [0] * n_frequencies
     blocks, presentation = [], 0
     for order in orders:
@@ -159,9 +160,7 @@ def _at_places(
     """Blocks of which each presentation is all on one place; one that is a pattern of the culture has its number."""
     number_of = {frozenset(row) - {UNKNOWN}: number for number, row in enumerate(patterns.tolist())}
     pattern = np.array([number_of.get(frozenset(place), UNKNOWN) if place else NOTHING for place in places])
-    electrodes = np.full((len(places), max((1, *map(len, places)))), UNKNOWN)
-    for number, place in enumerate(places):
-        electrodes[number, : len(place)] = place
+    electrodes = padded(places)
     blocks, presentation = [], 0
     for order in orders:
         of = np.repeat(np.arange(presentation, presentation + len(order)), protocol.pulses)
@@ -170,22 +169,6 @@ def _at_places(
         blocks.append(_block(protocol, frequency_hz, electrodes[where], pattern[where], of))
         presentation += len(order)
     return tuple(blocks)
-
-
-def stimuli_of(stimuli: Stimuli, protocol: Protocol) -> list[Stimulus]:
-    """Rows of a stimulus table as they are delivered."""
-    rows = zip(
-        stimuli.time_s.tolist(),
-        stimuli.electrodes.tolist(),
-        stimuli.frequency_hz.tolist(),
-        stimuli.pattern.tolist(),
-        stimuli.presentation.tolist(),
-        strict=True,
-    )
-    return [
-        Stimulus(time_s, tuple(e for e in electrodes if e != UNKNOWN), protocol.pulse, frequency_hz, pattern, number)
-        for time_s, electrodes, frequency_hz, pattern, number in rows
-    ]
 
 
 def on_ticks(time_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
@@ -205,23 +188,8 @@ def _block(
     since_s[0] = protocol.pause_s
     time_s = on_ticks(np.cumsum(since_s))
     end_s = on_ticks(time_s[-1:] + protocol.tail_s)[0]
-    return Block(
-        setup_s=protocol.setup_s,
-        duration_s=float(end_s),
-        stimuli=Stimuli(
-            time_s=time_s,
-            frequency_hz=frequency_hz,
-            pattern=pattern,
-            electrodes=electrodes,
-            presentation=presentation,
-        ),
-    )
-
-
-def _balanced(rng: np.random.Generator, patterns: int, trials: int) -> Int64[np.ndarray, " trials"]:
-    """Each pattern as often as the others, one round after the other, each round in random order."""
-    rounds = -(-trials // patterns)
-    return np.concatenate([rng.permutation(patterns) for _ in range(rounds)])[:trials]
+    stimuli = Stimuli(time_s, frequency_hz, pattern, electrodes, presentation)
+    return Block(protocol.setup_s, float(end_s), stimuli)
 
 
 def _train(rng: np.random.Generator, protocol: Protocol, last: int) -> Int64[np.ndarray, " pulses"]:

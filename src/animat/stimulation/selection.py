@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
-from animat.writing import atomic_write
+from animat.tables import briefly, read_only
+from animat.writing import write_whole
 
 _MOST_BYTES = 2**24
 
@@ -90,11 +91,9 @@ class Selection:
 
     def __post_init__(self) -> None:
         for name, dimensions in (("recording", 1), ("stimulation", 1), ("patterns", 2)):
-            values = np.array(getattr(self, name), dtype=np.int64)
+            values = read_only(self, name, np.int64)
             if values.ndim != dimensions:
                 raise InvalidArgument(f"selection.{name}: expected {dimensions} dimensions, got {values.shape}")
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
             if values.size:
                 self.array.position_um(values.ravel())
         for name in ("recording", "stimulation"):
@@ -148,8 +147,7 @@ class Selection:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
-        with atomic_write(path) as beside:
-            beside.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
+        write_whole(Path(path), json.dumps(self.to_dict(), indent=1) + "\n")
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Selection:
@@ -214,22 +212,11 @@ def select_electrodes(
     worth = (scan.amplitude_uv * scan.excitatory_score)[recording]
     stimulation = recording[np.lexsort((scan.electrode[recording], -worth))][: rule.stimulation_sites]
     electrodes = np.sort(scan.electrode[stimulation])
+    patterns = draw_patterns(
+        array, electrodes, seed=seed, patterns=rule.patterns, size=rule.pattern_size, spacing_um=rule.pattern_spacing_um
+    )
     return Selection(
-        array=array,
-        recording=np.sort(scan.electrode[recording]),
-        stimulation=electrodes,
-        patterns=draw_patterns(
-            array,
-            electrodes,
-            seed=seed,
-            patterns=rule.patterns,
-            size=rule.pattern_size,
-            spacing_um=rule.pattern_spacing_um,
-        ),
-        rule=rule,
-        seed=seed,
-        scanned=len(scan),
-        passed=len(passed),
+        array, np.sort(scan.electrode[recording]), electrodes, patterns, rule, seed, len(scan), len(passed)
     )
 
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.brief import briefly
 from animat.errors import InvalidArgument, UnusableData
 from animat.stimulation.plain import number, seconds, whole_number
 from animat.stimulation.pulse import Pulse
-from animat.tables import FASTEST_HZ, UNKNOWN, expect_rising_times, freeze
+from animat.tables import FASTEST_HZ, UNKNOWN, briefly, expect_rising_times, freeze
 
+_ONLY_INT = frozenset({int})
 NOTHING = -2
 """Stands for the pattern of a stimulus without electrodes, of the place `animat.stimulation.places.NONE`."""
 
@@ -80,9 +80,6 @@ def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
     if not isinstance(stimuli, Iterable):
         raise InvalidArgument(f"stimuli: expected several Stimulus, got {type(stimuli).__name__}")
     return tuple([stimulus if type(stimulus) is Stimulus else _plain_stimulus(stimulus) for stimulus in stimuli])
-
-
-_ONLY_INT = frozenset({int})
 
 
 def _plain_electrodes(electrodes: Any) -> tuple[int, ...]:

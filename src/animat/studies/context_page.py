@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from animat.report.context import Estimate, draw_context, draw_whose_work
-from animat.report.html import Columns, Picture, Section, Table, cell, table_of, write_page
+from animat.report.html import Columns, Picture, Section, Table, cell, columns_of, table_of, write_page
 from animat.report.style import FORMATS, save_figure
 from animat.studies.context import ADMITTED, TABLE, WHOSE_WORK, ContextRow, LostRow, RanContext
 from animat.studies.context_tasks import ContextStudy
@@ -148,14 +148,11 @@ def _lost_table(lost: dict[str, dict[str, list[float]]]) -> Table:
 
 def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
     columns: Columns = [
-        ("robot", "robot"),
-        ("culture", "culture"),
-        ("random", "random"),
-        ("heuristic", "heuristic"),
+        *columns_of("robot", "culture", "random", "heuristic"),
         ("best coupling", "coupling"),
         ("policies", "policies"),
         ("optimum", lambda row: row.optimum if row.best_known is None else f"≥ {cell(row.best_known)}"),
-        ("gap", _gap),
+        ("gap", lambda row: None if row.gap is None else _least(row) + _hundredths(row.gap)),
         ("score, 95 %", _score),
         ("bits", "bits"),
     ]
@@ -169,8 +166,7 @@ def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
 
 def _on_the_culture(rows: Sequence[ContextRow]) -> Table:
     columns: Columns = [
-        ("robot", "robot"),
-        ("culture", "culture"),
+        *columns_of("robot", "culture"),
         ("random", "measured_random"),
         ("heuristic", "measured_heuristic"),
         ("best coupling", "measured_coupling"),
@@ -182,10 +178,6 @@ def _on_the_culture(rows: Sequence[ContextRow]) -> Table:
         "predicted for the same policies."
     )
     return table_of("On the culture, in closed loop", rows, columns, note=note, beside=TABLE)
-
-
-def _gap(row: ContextRow) -> str | None:
-    return None if row.gap is None else _least(row) + _hundredths(row.gap)
 
 
 def _score(row: ContextRow) -> str | None:

@@ -15,7 +15,7 @@ from animat.progress import InTurn, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.readouts import USUAL_READOUTS
 from animat.responses.responses import Responses
-from animat.studies.draws import draw_seed
+from animat.studies.task import draw_seed
 
 if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol

@@ -21,9 +21,16 @@ from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.progress import Progress, Silent
-from animat.studies.parquet import write_parquet
 from animat.studies.places import results_file
-from animat.studies.results import ComparedReturns, Results, Score, read_typed, write_named_records, write_records
+from animat.studies.results import (
+    ComparedReturns,
+    Results,
+    Score,
+    read_typed,
+    write_named_records,
+    write_parquet,
+    write_records,
+)
 from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from animat.report.html import Picture, Section, cell, table_of, write_page
+from animat.report.html import Picture, Section, cell, columns_of, table_of, write_page
 from animat.report.over_cultures import Compared, draw_over_cultures
 from animat.report.style import FORMATS, save_figure
 from animat.studies.arms import arms_shown, many_arms, what_parts
@@ -24,7 +24,9 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"over-cultures.{ending}")
         sections.append(_in_short(study, found))
-    sections.append(_each(found))
+    points = [(name, f"finished: {name}/{REPORT}") for name in found.ran]
+    points += [(name, f"failed: {why}") for name, why in found.failed.items()]
+    sections.append(Section("Each culture", points=tuple(points)))
     cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
     lead = f"{cultures}. {many_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
@@ -49,12 +51,8 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         "Over cultures",
         found.summary,
         [
-            ("comparison", "comparison"),
-            ("robot", "robot"),
-            ("mean first", "mean_first"),
-            ("mean second", "mean_second"),
-            ("difference", "difference"),
-            ("95 % interval", _interval),
+            *columns_of("comparison", "robot", "mean_first", "mean_second", "difference"),
+            ("95 % interval", lambda row: "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"),
             ("second mean larger in", lambda row: f"{row.larger_in} of {row.cultures}"),
             ("significantly better in", "found_better"),
         ],
@@ -74,10 +72,6 @@ def _in_short(study: Study, found: RanCultures) -> Section:
     return Section("Results in short", (), tuple(points), (arms_shown(study), table), (picture,))
 
 
-def _interval(row: OverCultures) -> str:
-    return "–" if row.low_95 is None else f"{cell(row.low_95)} to {cell(row.high_95)}"
-
-
 def _told(compared: Comparison, row: OverCultures) -> str:
     larger = (
         f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of {row.cultures} "
@@ -86,9 +80,3 @@ def _told(compared: Comparison, row: OverCultures) -> str:
     if not row.tested:
         return f"{larger}; with so few policies no test finds a difference in one culture."
     return f"{larger}; it is found to be better (p < {LEVEL:g}) in {row.found_better}."
-
-
-def _each(found: RanCultures) -> Section:
-    points = [(name, f"finished: {name}/{REPORT}") for name in found.ran]
-    points += [(name, f"failed: {why}") for name, why in found.failed.items()]
-    return Section("Each culture", points=tuple(points))

@@ -14,13 +14,12 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
-from animat.studies.draws import draw_seed
 from animat.studies.episodes import COUPLING, RANDOM, tabulated, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
-from animat.studies.task import StudyTask
+from animat.studies.task import StudyTask, draw_seed
 from animat.studies.training import training_of
 from animat.training.policy import Policy
 

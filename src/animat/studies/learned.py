@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from animat.report.html import Table, table_of, with_error
+from animat.report.html import Table, columns_of, table_of, with_error
 from animat.studies.results import Score
 from animat.studies.specification import RobotSpec, Study
 from animat.studies.tabulating import AIM
@@ -26,17 +26,19 @@ def learned_of(study: Study, scores: Sequence[Score]) -> list[Score]:
 def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
     """Scores beside `AIM`, with what is known of the difference."""
     bodies = {spec.name: spec for spec in study.robots}
+
+    def mean_with_error(row: Score) -> str:
+        spread = row.standard_deviation
+        return with_error(row.mean_return, None if spread is None else spread / math.sqrt(row.policies))
+
     return table_of(
         f"As good as the optimum: scores on the simulator trained on, beside {AIM:g}",
         rows,
         [
-            ("robot", "robot"),
-            ("arm", "arm"),
-            ("mapping", "mapping"),
+            *columns_of("robot", "arm", "mapping"),
             ("at (min)", "at_min"),
-            ("mean ± s.e.", _mean_with_error),
-            ("random", "random"),
-            ("optimum", "optimum"),
+            ("mean ± s.e.", mean_with_error),
+            *columns_of("random", "optimum"),
             ("run", "optimum_run"),
             ("without clock", "optimum_without_clock"),
             ("score", "normalised_score"),
@@ -49,11 +51,6 @@ def beside_the_optimum(study: Study, rows: Sequence[Score]) -> Table:
         beside="tables/scores.csv",
         marked=tuple(i for i, row in enumerate(rows) if (row.normalised_score or 0.0) < AIM),
     )
-
-
-def _mean_with_error(row: Score) -> str:
-    spread = row.standard_deviation
-    return with_error(row.mean_return, None if spread is None else spread / math.sqrt(row.policies))
 
 
 def known_of(row: Score, spec: RobotSpec) -> str:

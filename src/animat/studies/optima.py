@@ -10,7 +10,7 @@ from animat.environment import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
 from animat.progress import Part, Progress
-from animat.robots.capabilities import lacking
+from animat.robots.base import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, setting_of, span_min
 from animat.studies.places import optima_file

@@ -29,7 +29,7 @@ from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import FORMATS, Figure, save_figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
-from animat.robots.capabilities import lacking
+from animat.robots.base import lacking
 from animat.studies import figure_tables
 from animat.studies.episodes import POLICY, DataFrame, mean_returns
 from animat.studies.evaluating import as_recorded, span_min

@@ -304,18 +304,13 @@ def _controls(study: Study, results: Results) -> Section:
         ("coupling", "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and goal."),
     )
     beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
+    told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
     return Section(
         "Is it the culture?",
-        ("Each control takes something away.", *_sentences(results)),
+        ("Each control takes something away.", *(each[:1].upper() + each[1:] for each in told)),
         points,
         (*(table for table in beside if table.rows), controls_shown(study, results.controls)),
     )
-
-
-def _sentences(results: Results) -> list[str]:
-    """How policies stand beside the heuristic policy and the best reflex."""
-    told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
-    return [each[:1].upper() + each[1:] for each in told]
 
 
 def _done(study: Study, results: Results) -> Section:

@@ -33,8 +33,10 @@ class Record(StudyTask):
         return self.study.culture.kind == "files"
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        out = folder / RECORDINGS
-        _remove_changed(folder)
+        out, receipt = folder / RECORDINGS, Receipt.load(folder / RECEIPTS, JOB)
+        # Recordings that are no longer as they were left: nobody else can tell, as they may still be good ones.
+        for name in () if receipt is None else receipt.changed(folder):
+            (folder / name).unlink(missing_ok=True)
         kind = self.study.culture.kind
         make = {"virtual": _virtual, "synthetic": _synthetic, "files": self._copies}[kind]
         files = make(self.study, out, progress)
@@ -56,13 +58,6 @@ class Record(StudyTask):
             write_nwb(recording, copy)
             progress.update(i + 1, len(recordings))
         return copies
-
-
-def _remove_changed(folder: Path) -> None:
-    """Remove recordings that are no longer as they were left: nobody else can tell, as they may still be good ones."""
-    receipt = Receipt.load(folder / RECEIPTS, JOB)
-    for name in () if receipt is None else receipt.changed(folder):
-        (folder / name).unlink(missing_ok=True)
 
 
 def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
-from animat.report.html import Columns, Table, cell, table_of, with_error
+from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.optima import optima_of_all, rough_kinds
@@ -30,8 +30,7 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
     """Tests and outcomes, beside the paper's p where it printed one."""
     printed = any(row.paper_p is not None for row in rows)
     columns: Columns = [
-        ("comparison", "comparison"),
-        ("robot", "robot"),
+        *columns_of("comparison", "robot"),
         ("at (min)", "at_min"),
         ("n", "n"),
         ("U", "u"),
@@ -61,16 +60,11 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
         "The same comparisons as returns",
         rows,
         [
-            ("first", "first"),
-            ("second", "second"),
-            ("robot", "robot"),
-            ("mean first", "mean_first"),
-            ("mean second", "mean_second"),
+            *columns_of("first", "second", "robot", "mean_first", "mean_second"),
             ("random", "random_second"),
             ("optimum first", _pair("optimum_first", "optimum_error_first")),
             ("optimum second", _pair("optimum_second", "optimum_error_second")),
-            ("score first", "score_first"),
-            ("score second", "score_second"),
+            *columns_of("score_first", "score_second"),
         ],
         note=_SCORE_NOTE + " ±: how far it may lie from there, by the grid, or down to its controller's return.",
         beside="tables/comparisons.csv",
@@ -83,16 +77,13 @@ def scores_shown(rows: Sequence[Score]) -> Table:
         "Every arm",
         rows,
         [
-            ("robot", "robot"),
-            ("arm", "arm"),
+            *columns_of("robot", "arm"),
             ("at (min)", "at_min"),
-            ("policies", "policies"),
-            ("episodes", "episodes"),
+            *columns_of("policies", "episodes"),
             ("mean", "mean_return"),
             ("s.d.", "standard_deviation"),
             ("interquartile mean", _interval("interquartile_mean", "low_95", "high_95")),
-            ("random", "random"),
-            ("optimum", "optimum"),
+            *columns_of("random", "optimum"),
             ("score", "normalised_score"),
         ],
         note=_SCORE_NOTE,
@@ -196,11 +187,9 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
             ("robot", "robot"),
             ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
             ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
-            ("control", "control"),
-            ("actors", "actors"),
+            *columns_of("control", "actors"),
             ("mean return", _pair("mean_return", "standard_error")),
-            ("random", "random"),
-            ("optimum", "optimum"),
+            *columns_of("random", "optimum"),
             ("score", "normalised_score"),
         ],
         note="Trained policies stand beside their controls, as in the figures above. ±: standard error over actors, of "
@@ -222,12 +211,10 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
         "Policies beside the heuristic policy",
         rows,
         [
-            ("robot", "robot"),
-            ("arm", "arm"),
+            *columns_of("robot", "arm"),
             ("at (min)", "at_min"),
             ("policies", "mean_return"),
-            ("heuristic", "heuristic"),
-            ("p", "p"),
+            *columns_of("heuristic", "p"),
             ("pairs won", "wins"),
             ("the policies", "outcome"),
         ],
@@ -244,8 +231,7 @@ def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
         "Policies beside the best reflex",
         rows,
         [
-            ("robot", "robot"),
-            ("arm", "arm"),
+            *columns_of("robot", "arm"),
             ("at (min)", "at_min"),
             ("best coupling", _pair("coupling", "coupling_standard_error")),
             ("optimum", "optimum"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import hashlib
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -11,6 +12,11 @@ from typing import ClassVar
 from animat.execution.task import Task
 from animat.progress import Progress
 from animat.studies.specification import Study
+
+
+def draw_seed(*names: object) -> int:
+    """A seed from the names of what is drawn, so that no two arms share their luck."""
+    return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from animat.execution.task import UNFINISHED
 from animat.execution.trains import Trains, Work, train_alone
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
-from animat.studies.draws import draw_seed
 from animat.studies.places import TIMELINE, policies_folder
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Arm, RobotSpec, Study
-from animat.studies.task import StudyTask
+from animat.studies.task import StudyTask, draw_seed
 from animat.training.folder import describe, provenance_of
 from animat.training.group import Group, untrained_policies
 from animat.training.settings import SAC

@@ -7,17 +7,17 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Array, Bool, Float, Float64, Int64, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
-from animat.training.assessment import assess
 from animat.training.lessons import Lesson, stages_of
-from animat.training.networks import Network
+from animat.training.networks import Network, likeliest_action
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import MOST_POLICIES, SAC
 from animat.training.specification import CHUNKS, Training
@@ -26,6 +26,46 @@ from animat.wrappers import EpisodeLimit
 
 ASSESSED = ("iterations", "minute", "lesson", "success", "mean_return")
 """The columns of a policy's assessments: the minute is that of the simulators, lessons count from 1; NaN: not known."""
+
+
+def assess(
+    environment: Varied[Any], episodes: int, actor: Network, simulator: NeuronSimulator | None, key: PRNGKeyArray
+) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
+    """Run a policy's most probable actions on the configurations that `key` decides.
+
+    Args:
+        environment: what is varied, and between what.
+        episodes: how many (static).
+        actor: the policy's network.
+        simulator: the neurons; None without.
+        key: the same in each assessment of a training, so that policies and minutes compare.
+
+    Returns:
+        of each episode the return, and whether it succeeded.
+    """
+    limited = EpisodeLimit(environment)
+    of_starts, of_iterations = jax.random.split(key)
+    started = jax.vmap(limited.reset)(jax.random.split(of_starts, episodes)).carried
+    none = jnp.zeros(episodes)
+
+    def iteration(at: tuple[Any, ...]) -> tuple[Any, ...]:
+        index, state, going, returns, succeeded = at
+        uniforms = jax.random.uniform(jax.random.fold_in(of_iterations, index), (episodes, limited.noise_size))
+        action = likeliest_action(limited, actor, jax.vmap(limited.observe)(state) / limited.scales)
+        after = jax.vmap(limited.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
+        ends = going & jnp.logical_or(*after.ended)
+        succeeded |= ends & jax.vmap(environment.succeeded)(after)
+        return (
+            index + 1,
+            after.carried,
+            going & ~ends,
+            returns + jnp.where(going, after.reward, 0.0),
+            succeeded,
+        )
+
+    first = (jnp.int32(0), started, none == 0, none, none > 0)
+    *_, returns, succeeded = jax.lax.while_loop(lambda at: jnp.any(at[2]), iteration, first)
+    return returns, succeeded
 
 
 class Standing(NamedTuple):

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
-from animat.brief import briefly
 from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
@@ -32,6 +31,7 @@ from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
 from animat.robots.registry import REGISTRY as ROBOTS
 from animat.stimulation.protocol import Presentation
+from animat.tables import briefly
 from animat.training.provenance import expect_provenance
 from animat.training.settings import PulseCost
 from animat.writing import atomic_write

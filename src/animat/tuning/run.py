@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import shutil
@@ -11,20 +12,20 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+from animat.differences import with_fingerprint
 from animat.errors import InvalidFile, UnusableData
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
-from animat.studies.draws import draw_seed
-from animat.studies.folder import held, source_files, sums_of
+from animat.studies.folder import describe_study, held, source_files, sums_of
 from animat.studies.places import OWN_FOLDERS, RECEIPTS
 from animat.studies.plan import ITERATIONS_PER_S
 from animat.studies.recording import JOB, Record
 from animat.studies.run import check_own
+from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
-from animat.tuning.folder import MANIFEST, describe_tuning
 from animat.tuning.journal import Told, read_journal, write_journal
 from animat.tuning.results import Final, Tuned, write_results
 from animat.tuning.search import Search, expect_optuna, importance_of
@@ -32,7 +33,14 @@ from animat.tuning.space import first_settings, own_settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, returns_file, same_shapes, timeline_file
 
+MANIFEST = "tune.json"
 FINALS = "finals"
+
+
+def describe_tuning(tuning: Tuning, sources: dict[str, str]) -> dict[str, Any]:
+    """What decides how a tuning comes out, as of a study (`describe_study`), with a fingerprint over all of it."""
+    versions = {**describe_study(tuning.study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
+    return with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
 
 
 def tune(

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from animat.extras import expect_extra
-from animat.studies.draws import draw_seed
+from animat.studies.task import draw_seed
 from animat.training.settings import SAC
 from animat.tuning.journal import Told
 from animat.tuning.space import Range, Settings, Space, Value, first_settings

@@ -5,13 +5,15 @@ from __future__ import annotations
 import functools
 import importlib.resources
 import json
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from animat.errors import AnimatError, InvalidArgument, first_line
+from animat.closed_loop.gathering import LOG_FILE, RECORDING_FILE, STOP_FILE
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, first_line
 from animat.watch.cultures import CulturesView
 from animat.watch.found import Kind, find, place_within
 from animat.watch.guard import App, Guard
@@ -19,7 +21,6 @@ from animat.watch.picture import picture_of
 from animat.watch.plain import text
 from animat.watch.recording import RecordingView
 from animat.watch.session import SessionView
-from animat.watch.stopping import stop_session
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
@@ -183,3 +184,21 @@ def _number(asked: Any, name: str) -> float | None:
     if not abs(value) < 1e15:
         raise InvalidArgument(f"{name}: expected a number, got {text(given, 40)}")
     return value
+
+
+def stop_session(folder: Path) -> None:
+    """Ask a session to end. Nothing is waited for or read first: it may be urgent.
+
+    Raises:
+        InvalidArgument: where no session is, or one that has ended.
+        InvalidFile: if the file cannot be made.
+    """
+    if not (folder / LOG_FILE).is_file():
+        raise InvalidArgument(f"{folder.name}: expected a session to stop, got none")
+    if (folder / RECORDING_FILE).exists():
+        raise InvalidArgument(f"{folder.name}: the session has ended: there is nothing to stop")
+    try:
+        # Not through a link, which may lead anywhere.
+        os.close(os.open(folder / STOP_FILE, os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
+    except OSError as error:
+        raise InvalidFile(f"{folder / STOP_FILE}: cannot be made: {error.strerror or error}") from error

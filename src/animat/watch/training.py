@@ -17,8 +17,7 @@ from animat.watch.files import curve_of_policy, curves_of_checkpoint, json_of, n
 from animat.watch.held import state_of
 from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
-from animat.watch.speed import Speed
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.view import Speed, View, in_blocks, titled
 
 _UNFINISHED = ".unfinished"
 _MOST_POLICIES = 1000

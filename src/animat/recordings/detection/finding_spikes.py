@@ -13,8 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from animat.progress import Progress, Silent
 from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
-from animat.recordings.detection.negative_peaks import find_negative_peaks
-from animat.recordings.detection.noise import median_noise_uv
+from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding
@@ -184,11 +183,8 @@ def _detect(
             done += 1
             progress.update(done, n, f"{sum(map(len, samples)):,} spikes")
     empty = np.empty(0, np.int64)
-    return (
-        np.concatenate([empty, *samples]),
-        np.concatenate([empty, *channels]),
-        np.concatenate([np.zeros((0, 2)), *saturations]),
-    )
+    found = np.concatenate([empty, *samples]), np.concatenate([empty, *channels])
+    return *found, np.concatenate([np.zeros((0, 2)), *saturations])
 
 
 def _findings(
@@ -197,8 +193,7 @@ def _findings(
     n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
-    dead = int(np.count_nonzero(is_dead(noise_uv)))
-    if dead:
+    if dead := int(np.count_nonzero(is_dead(noise_uv))):
         message = (
             f"{dead:,} of {n:,} channels are dead (less than {DEAD:g} of the median noise): no spike can be found on "
             "them, and they count in rates per channel; leave them out of the routing next time"
@@ -224,10 +219,7 @@ def _findings(
         message = (
             f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
             f"{longest:.1f} ms; they are blanked until then"
-            + (
-                ": rates in an earlier window are too low, use one that begins later"
-                if share >= 0.05 and longest > 2
-                else ""
-            )
         )
-        yield Finding("saturated-channels", "note" if share < 0.05 or longest <= 2.0 else "warning", message, share)
+        is_much = share >= 0.05 and longest > 2
+        message += ": rates in an earlier window are too low, use one that begins later" if is_much else ""
+        yield Finding("saturated-channels", "warning" if is_much else "note", message, share)

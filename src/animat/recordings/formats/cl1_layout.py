@@ -1,7 +1,5 @@
 """The channels of a CL1, which its driver and its files share: 59 electrodes among 64 numbers."""
 
-from __future__ import annotations
-
 CHANNELS = 64
 NO_STIMULATION = {0: "ground", 4: "reference", 7: "ground", 56: "ground", 63: "ground"}
 """Channels that are no electrodes, neither to stimulate nor to record, and what they are. The SDK says nothing of a

@@ -59,12 +59,9 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
         UnusableData: if a column is not what it should be.
     """
     path = Path(path)
-    if stimuli_path is None:
-        if _stem(path).endswith("_stimuli"):
-            raise InvalidFile(f"{path}: expected a file of spikes, got the stimuli beside it; name the file of spikes")
-        stimuli = stimuli_beside(path)
-    else:
-        stimuli = Path(stimuli_path)
+    if stimuli_path is None and _stem(path).endswith("_stimuli"):
+        raise InvalidFile(f"{path}: expected a file of spikes, got the stimuli beside it; name the file of spikes")
+    stimuli = stimuli_beside(path) if stimuli_path is None else Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
     columns, findings = _columns(read_text_table(path), SPIKE_COLUMNS)
     if stimuli is None:
@@ -116,8 +113,10 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
         elif name in REQUIRED:
             # Of a table of responses by its other columns, one of these may be misspelt.
             others = ("channel", "count", "rate_hz") if name == "spike_time_s" else ()
+            found_names = ", ".join(repr(head)[1:-1][:40] for head in table.header[:12])
+            found_names += ", ..." if len(table.header) > 12 else ""
             raise InvalidFile(
-                f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {_listed(table)}"
+                f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {found_names}"
                 f"{_advice(table, name) or nearest(table, (*names, *others))}"
             )
     columns = {name: plain_column(table, i, name) for name, i in place.items()}
@@ -126,11 +125,6 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
         missing = [each for name, names in known.items() if name not in place for each in names]
         table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
     return columns, table.findings
-
-
-def _listed(table: TextTable) -> str:
-    header = table.header
-    return ", ".join(repr(name)[1:-1][:40] for name in header[:12]) + (", ..." if len(header) > 12 else "")
 
 
 def _advice(table: TextTable, missing: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -193,9 +193,8 @@ PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) 
 def unavailable_filters(dataset: h5py.Dataset) -> str:
     """The compression filters of a dataset that are not installed here, in words; empty where all are."""
     created = dataset.id.get_create_plist()
-    filters = [created.get_filter(i) for i in range(created.get_nfilters())]
     names = []
-    for code, _, _, name in filters:
+    for code, _, _, name in map(created.get_filter, range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(code):
             words = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
             words = words.partition("\0")[0].strip()
@@ -236,3 +235,32 @@ def _as_text(values: Column) -> Column:
         # numpy gives every text the room of the longest.
         flat = [text[:256] for text in flat]
     return np.array(flat, dtype=np.str_).reshape(values.shape)
+
+
+LISTED = 8
+
+
+def choose(
+    what: str, option: str, names: Iterable[str], asked: str | None, words: Callable[[str], str] = lambda name: name
+) -> str:
+    """The name asked for, or the only one.
+
+    Args:
+        what: what is chosen and where, such as `rig.h5: part`.
+        option: how the user names it, such as `--part`.
+        names: what there is, at least one.
+        asked: the name asked for, if one was.
+        words: what to list of each name.
+
+    Raises:
+        InvalidFile: naming what there is, if the name is not among them, or none is asked for and there are several.
+    """
+    there = list(names)
+    listed = ", ".join(words(name)[:80] for name in there[:LISTED]) + (", ..." if len(there) > LISTED else "")
+    if asked is not None:
+        if asked in there:
+            return asked
+        raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
+    if len(there) == 1:
+        return there[0]
+    raise InvalidFile(f"{what}: expected one, found {len(there)}: {listed}; choose with {option} NAME")

@@ -26,8 +26,7 @@ import numpy as np
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
-from animat.recordings.formats.choice import choose
-from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file, unavailable_filters
+from animat.recordings.formats.hdf5 import Hdf5File, choose, hdf5_file, unavailable_filters
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -149,8 +148,7 @@ class _Found:
             bits = file.read(self.events_at, "bits").astype(np.int64)
             rises = (bits != 0) & (bits != np.concatenate([[0], bits[:-1]]))
             chosen = frame[rises]
-            n_falls = int(np.count_nonzero(~rises))
-            if n_falls:
+            if n_falls := int(np.count_nonzero(~rises)):
                 message = f"{n_falls:,} of {len(bits):,} entries of /bits end a pulse and are no stimuli"
                 self._note("bits-not-rising", message, "note", float(n_falls))
             columns = {"stimulus_pattern": bits[rises]} if len(np.unique(bits[rises])) > 1 else {}
@@ -197,8 +195,7 @@ class _Found:
         if self.recorded_channels is not None:
             used &= np.isin(channel, self.recorded_channels)
         labels, first = np.unique(channel[used], return_index=True)
-        repeated = int(np.count_nonzero(used)) - len(labels)
-        if repeated:
+        if repeated := int(np.count_nonzero(used)) - len(labels):
             rows = np.unique(np.column_stack([channel[used], electrode[used]]), axis=0)
             twice = len(rows) - len(labels)
             message = f"the file's mapping names {repeated:,} channels again; each is one channel here" + (

@@ -30,7 +30,7 @@ from animat.recordings.formats.nwb_layout import (
     STIMULI_TABLE,
     UNITS_TABLE,
 )
-from animat.recordings.formats.nwb_of_others import read_other_nwb
+from animat.recordings.formats.nwb_of_others import ragged, read_other_nwb
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.told import from_words
@@ -141,8 +141,7 @@ def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Rec
     Raises:
         InvalidFile: if the file is missing, damaged, not NWB, or of another program and without spikes.
     """
-    path = Path(path)
-    with hdf5_file(path, WHAT) as file:
+    with hdf5_file(Path(path), WHAT) as file:
         return _read(file, stimuli)
 
 
@@ -164,8 +163,12 @@ def _read(file: Hdf5File, stimuli: str | None) -> Recording:
         raise InvalidFile(
             f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat to read it"
         )
+    words = dict[str, str]()
+    if file.has(PROVENANCE_TABLE):
+        keys, told = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
+        words = dict(zip(keys, told, strict=True))
     try:
-        words = from_words(_words(file))
+        told_fields = from_words(words)
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
     order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
@@ -180,7 +183,7 @@ def _read(file: Hdf5File, stimuli: str | None) -> Recording:
         duration_s=_cell(file, "duration_s", float),
         start_min=_cell(file, "start_min", float),
         presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
-        **words,
+        **told_fields,
     )
 
 
@@ -192,45 +195,24 @@ def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.nd
     if not file.has(UNITS_TABLE):
         return np.empty(0), np.empty(0, dtype=np.int64)
     times = file.read(f"{UNITS_TABLE}/spike_times")
-    counts = _counts(file, f"{UNITS_TABLE}/spike_times_index", len(times))
+    counts = ragged(file, f"{UNITS_TABLE}/spike_times", len(times))
     channels = np.repeat(np.arange(len(counts)), counts)
     # Channel after channel: a stable sort leaves simultaneous spikes in the order of their channels, as Recording does.
     order = np.argsort(times, kind="stable")
     return times[order], channels[order]
 
 
-def _counts(file: Hdf5File, index: str, values: int) -> Int64[np.ndarray, " rows"]:
-    """How many of a ragged column's values each row has."""
-    ends = file.read(index).astype(np.int64)
-    counts = np.diff(ends, prepend=0)
-    if np.any(counts < 0) or np.any(counts > values) or int(counts.sum()) != values:
-        raise UnusableData(f"{index} does not divide the {values:,} values beside it")
-    return np.asarray(counts)
-
-
 def _channels(file: Hdf5File) -> Channels:
     if not file.has(ELECTRODES_TABLE):
         return Channels(label=np.empty(0, np.str_), electrode=np.empty(0, np.int64), x_um=np.empty(0), y_um=np.empty(0))
-    return Channels(
-        label=file.read(f"{ELECTRODES_TABLE}/label"),
-        electrode=file.read(f"{ELECTRODES_TABLE}/electrode_id"),
-        x_um=file.read(f"{ELECTRODES_TABLE}/rel_x"),
-        y_um=file.read(f"{ELECTRODES_TABLE}/rel_y"),
-    )
-
-
-def _words(file: Hdf5File) -> dict[str, str]:
-    if not file.has(PROVENANCE_TABLE):
-        return {}
-    keys, words = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
-    return dict(zip(keys, words, strict=True))
+    return Channels(*(file.read(f"{ELECTRODES_TABLE}/{name}") for name in ("label", "electrode_id", "rel_x", "rel_y")))
 
 
 def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
     time_s = file.read(f"{STIMULI_TABLE}/start_time")
     if file.has(f"{STIMULI_TABLE}/electrode_ids"):
         flat = file.read(f"{STIMULI_TABLE}/electrode_ids")
-        lengths = _counts(file, f"{STIMULI_TABLE}/electrode_ids_index", len(flat))
+        lengths = ragged(file, f"{STIMULI_TABLE}/electrode_ids", len(flat))
     else:
         flat, lengths = np.empty(0, np.int64), np.zeros(len(time_s), np.int64)
     if not 0 <= columns <= LARGEST_VALUES // max(len(lengths), 1):

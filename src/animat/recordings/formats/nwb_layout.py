@@ -10,8 +10,6 @@
                                /animat_provenance: one row a key (absent where there is none)
 """
 
-from __future__ import annotations
-
 FORMAT_VERSION = 1
 """Of the tables above; written into every file, and a newer one is refused."""
 
@@ -21,11 +19,5 @@ UNITS_TABLE = "units"
 ELECTRODES_TABLE = "general/extracellular_ephys/electrodes"
 STIMULI_TABLE = "stimulus/presentation/stimuli"
 
-SUBJECT = {
-    "subject_id": "subject_id",
-    "species": "species",
-    "sex": "sex",
-    "age": "age",
-    "description": "subject_description",
-}
+SUBJECT = {name: name for name in ("subject_id", "species", "sex", "age")} | {"description": "subject_description"}
 """NWB's fields of a subject, and where a recording's provenance has them."""

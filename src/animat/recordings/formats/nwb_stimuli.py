@@ -23,8 +23,7 @@ import numpy as np
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding
-from animat.recordings.formats.choice import choose
-from animat.recordings.formats.hdf5 import Hdf5File
+from animat.recordings.formats.hdf5 import Hdf5File, choose
 from animat.tables import padded
 
 FIRST = "stimulus/presentation"

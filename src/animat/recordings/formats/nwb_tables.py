@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping
 from datetime import UTC, datetime
 
 import numpy as np
@@ -66,7 +65,17 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
     module = nwb.create_processing_module(name="ecephys", description="What the recording is, for the package animat.")
     module.add(_recording_table(recording))
     if words:
-        module.add(_provenance_table(words))
+        module.add(
+            DynamicTable(
+                name="animat_provenance",
+                description="Where the recording came from, and what was noticed when it was read.",
+                id=np.arange(len(words)),
+                columns=[
+                    VectorData(name="key", description="what the words are about", data=list(words)),
+                    VectorData(name="words", description="the words", data=list(words.values())),
+                ],
+            )
+        )
     return nwb
 
 
@@ -128,9 +137,7 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
 def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
     # A row keeps its electrodes up to the last known one, so that padding between known ones survives too.
     known, columns = stimuli.electrodes != UNKNOWN, stimuli.electrodes.shape[1]
-    lengths = np.zeros(len(stimuli), np.int64)
-    for column in range(columns):
-        lengths[known[:, column]] = column + 1
+    lengths = (known * np.arange(1, columns + 1)).max(axis=1, initial=0)
     kept = np.arange(columns)[None, :] < lengths[:, None]
     rests = f"; {NOTHING}: nothing was delivered" if np.any(stimuli.is_rest) else ""
     electrodes = VectorData(
@@ -175,18 +182,6 @@ def _recording_table(recording: Recording) -> DynamicTable:
         description="The scalars of the recording, one row.",
         id=np.arange(1),
         columns=[VectorData(name=n, description=words, data=[value]) for n, (value, words) in cells.items()],
-    )
-
-
-def _provenance_table(words: Mapping[str, str]) -> DynamicTable:
-    return DynamicTable(
-        name="animat_provenance",
-        description="Where the recording came from, and what was noticed when it was read.",
-        id=np.arange(len(words)),
-        columns=[
-            VectorData(name="key", description="what the words are about", data=list(words)),
-            VectorData(name="words", description="the words", data=list(words.values())),
-        ],
     )
 
 

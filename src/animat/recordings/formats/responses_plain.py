@@ -96,15 +96,9 @@ def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
         raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
     findings = [left_out_of("keys", left_out)] if left_out else []
     labels = arrays.pop("channel_label", np.arange(values.shape[1]))
-    return _table(
-        values,
-        NPZ_KEYS[given[0]],
-        labels,
-        arrays,
-        None if window is None else (float(window[0]), float(window[1])),
-        {"source": path.name, "format": "NPZ of responses"},
-        findings,
-    )
+    window_ms = None if window is None else (float(window[0]), float(window[1]))
+    provenance = {"source": path.name, "format": "NPZ of responses"}
+    return _table(values, NPZ_KEYS[given[0]], labels, arrays, window_ms, provenance, findings)
 
 
 def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:

@@ -23,17 +23,8 @@ from animat.tables import UNKNOWN, padded
 
 LONGEST = 4096
 """Characters of a line; what is longer says nothing that is understood here."""
-NAMES = {
-    "frequency_hz": "frequency_hz",
-    "frequency": "frequency_hz",
-    "freq": "frequency_hz",
-    "pattern": "pattern",
-    "presentation": "presentation",
-    "electrodes": "electrodes",
-    "electrode": "electrodes",
-    "order": "order",
-    "pulses": "pulses",
-}
+NAMES = {name: name for name in ("frequency_hz", "pattern", "presentation", "electrodes", "order", "pulses")}
+NAMES |= {"frequency": "frequency_hz", "freq": "frequency_hz", "electrode": "electrodes"}
 _MOST_ELECTRODES = 1024
 _PAIR = re.compile(r"([A-Za-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:[,+]\d+)*)")
 

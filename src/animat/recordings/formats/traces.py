@@ -12,9 +12,8 @@ import h5py
 import numpy as np
 
 from animat.errors import InvalidFile
-from animat.recordings.formats.choice import choose
 from animat.recordings.formats.cl1 import read_cl1
-from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, hdf5_file, unavailable_filters
+from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, unavailable_filters
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
 from animat.recordings.formats.nwb_of_others import read_other_nwb
@@ -54,20 +53,13 @@ def open_traces(
         if found == "MaxWell":
             traces = _maxwell(file, part, base)
         elif found == "CL1":
-            scale = file.attribute("/", "uV_per_sample_unit")
-            traces = _traces(file, "samples", base, _number(scale, 0.195))
+            traces = _traces(file, "samples", base, _number(file.attribute("/", "uV_per_sample_unit"), 0.195))
         else:
             traces = _nwb(file, part, base)
     stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
-    start_s = min(base.start_s, traces.start_s)
-    base = replace(
-        base,
-        channels=traces.channels,
-        sampling_rate_hz=traces.sampling_rate_hz,
-        start_s=start_s,
-        duration_s=stop_s - start_s,
-    )
-    return traces, base
+    start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
+    base = replace(base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s)
+    return traces, replace(base, duration_s=stop_s - start_s)
 
 
 def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
@@ -146,13 +138,8 @@ def _traces(
         rows = [row_of.get(str(name), UNKNOWN) for name in names]
     used = np.array([column for column, row in enumerate(rows) if row != UNKNOWN], dtype=np.int64)
     if not len(used):
-        channels = Channels(
-            label=np.arange(columns).astype(np.str_),
-            electrode=np.full(columns, UNKNOWN),
-            x_um=np.full(columns, np.nan),
-            y_um=np.full(columns, np.nan),
-        )
-        used = np.arange(columns)
+        used, nowhere = np.arange(columns), np.full(columns, np.nan)
+        channels = Channels(used.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
     else:
         # A channel twice in the traces is one channel: its first column.
         _, first = np.unique(np.array(rows)[used], return_index=True)

@@ -45,15 +45,11 @@ def findings_on(
         inside: whether a pulse's window ends within the recording, shape (stimuli,).
     """
     if not len(recording.stimuli):
-        return (
-            Finding(
-                "no-stimuli",
-                "refuse",
-                "the recording holds no stimuli, so there is no response to learn from: "
-                "give the stimuli's times with the spikes",
-                0.0,
-            ),
+        message = (
+            "the recording holds no stimuli, so there is no response to learn from: give the stimuli's times with the "
+            "spikes"
         )
+        return (Finding("no-stimuli", "refuse", message, 0.0),)
     return (
         *_left_out(recording, assignment, inside),
         *_timing(responses, recording, assignment),
@@ -66,16 +62,12 @@ def findings_without_times(
     responses: Responses, stimuli: Stimuli, assignment: Assignment, bursts: BurstSeparation
 ) -> tuple[Finding, ...]:
     """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told."""
-    return (
-        *_without_condition(stimuli, assignment),
-        Finding(
-            "spike-times-unknown",
-            "warning",
-            "the table has no times of spikes, so it is not known whether its window holds the response, an artefact "
-            "or a blank, nor how the culture fires without stimuli",
-        ),
-        *_without_times(responses, bursts),
+    message = (
+        "the table has no times of spikes, so it is not known whether its window holds the response, an artefact or a "
+        "blank, nor how the culture fires without stimuli"
     )
+    unknown = Finding("spike-times-unknown", "warning", message)
+    return (*_without_condition(stimuli, assignment), unknown, *_without_times(responses, bursts))
 
 
 def _without_times(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
@@ -91,8 +83,7 @@ def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndar
     yield from _without_condition(recording.stimuli, assignment)
     read = recording.stimuli.is_last_of_presentation
     n_read = int(np.count_nonzero(read))
-    late = int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside))
-    if late:
+    if late := int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside)):
         message = f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out"
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
@@ -125,8 +116,7 @@ def _timing(responses: Responses, recording: Recording, assignment: Assignment) 
     read = stimuli.is_last_of_presentation
     gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
     # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
-    overlapping = int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6)))
-    if overlapping:
+    if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
         message = (
             f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
             f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window"
@@ -212,9 +202,8 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
         n_all = int(np.count_nonzero(responses.condition == i))
         n = len(responses.rates_of(i))
         if not n:
-            what = (
-                "no stimulus" if not n_all else f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
-            )
+            all_bursts = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
+            what = all_bursts if n_all else "no stimulus"
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:

@@ -104,12 +104,12 @@ def _artefact(
     return None
 
 
-def _run(flags: Bool[np.ndarray, " bins"], start: int) -> tuple[int, int]:
-    """First and last of the flags that are set around one, over gaps of one."""
+def _run(flags: Bool[np.ndarray, " bins"], start: int, gap: int = 1) -> tuple[int, int]:
+    """First and last of the flags that are set around one, over gaps of so many."""
     first = last = start
-    while first > 0 and flags[max(first - 2, 0) : first].any():
+    while first > 0 and flags[max(first - 1 - gap, 0) : first].any():
         first -= 1
-    while last + 1 < len(flags) and flags[last + 1 : last + 3].any():
+    while last + 1 < len(flags) and flags[last + 1 : last + 2 + gap].any():
         last += 1
     return first, last
 
@@ -152,11 +152,7 @@ def _blank(
     zero = int(np.searchsorted(centre_ms, 0.0))
     if not is_blank[zero]:
         return
-    first = last = zero
-    while first > 0 and is_blank[first - 1]:
-        first -= 1
-    while last + 1 < len(is_blank) and is_blank[last + 1]:
-        last += 1
+    first, last = _run(is_blank, zero, gap=0)
     silent = last - first + 1 - (0 if artefact is None else artefact[1] - artefact[0] + 1)
     from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
     if silent * spontaneous < ENOUGH or last == len(is_blank) - 1:
