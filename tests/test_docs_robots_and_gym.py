@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.neurons.synthetic import synthetic_simulator
 from animat.recordings.synthetic import write_synthetic_series
 from animat.robots.registry import REGISTRY
@@ -20,13 +21,15 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 @pytest.fixture(autouse=True)
 def as_in_a_new_process() -> Iterator[None]:
-    """Other tests of this process have robots of the pages' names too."""
-    known = dict(REGISTRY._registered)
-    for name in [name for name, kind in known.items() if not kind.__module__.startswith("animat.")]:
-        del REGISTRY._registered[name]
+    """Other tests of this process have robots and mappings of the pages' names, and expect none of the pages' own."""
+    known = [(registry, dict(registry._registered)) for registry in (REGISTRY, MAPPINGS)]
+    for registry, kinds in known:
+        for name in [name for name, kind in kinds.items() if not kind.__module__.startswith("animat.")]:
+            del registry._registered[name]
     yield
-    REGISTRY._registered.clear()
-    REGISTRY._registered.update(known)
+    for registry, kinds in known:
+        registry._registered.clear()
+        registry._registered.update(kinds)
 
 
 @pytest.mark.parametrize("page", ["robots.md", "gymnasium.md"])
