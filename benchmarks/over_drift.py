@@ -1,10 +1,10 @@
-"""Policies trained on one recording, by shadowing, and on recordings that are drawn, over two hours of closed loop.
+"""Policies trained on one recording, by shadowing, and on recordings that are drawn, over 90 minutes of closed loop.
 
     python benchmarks/over_drift.py [--seeds 1 2 3 4 5] [--robot cartpole] [--episodes 12] [--pause-s 30] [--out drift/]
 
 Each virtual culture is recorded every ten minutes up to 60 min, as `animat record` does. The same policies are trained
-three ways on that. Then all of them run in one session, in turn, with pauses that make it two hours long: once with
-adaptive thresholds, and once with fixed ones on the culture in the same state. Everything is kept under `--out`.
+three ways on that. Then all of them run in one session, in turn, with pauses that make it an hour and a half long: once
+with adaptive thresholds, and once with fixed ones on the culture in the same state. Everything is kept under `--out`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
             episodes = episodes_of(options.out / f"culture{seed}" / thresholds)
             parts.append(episodes.assign(culture=seed, thresholds=thresholds))
             print(f"\nculture {seed}, {thresholds} thresholds\n{table(parts[-1])}", flush=True)
-    print(f"\nmean over {len(options.seeds)} cultures\n{table(pd.concat(parts))}")
+    print(f"\nmean over {len(options.seeds)} cultures\n{table(pd.concat(parts, ignore_index=True))}")
 
 
 def lived_through(seed: int, options: argparse.Namespace) -> None:
