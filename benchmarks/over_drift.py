@@ -34,7 +34,7 @@ def main() -> None:
     options = parser.parse_args()
     parts = []
     for seed in options.seeds:
-        lived_through(seed, options)
+        run_through(seed, options)
         for thresholds in THRESHOLDS:
             episodes = episodes_of(options.out / f"culture{seed}" / thresholds)
             parts.append(episodes.assign(culture=seed, thresholds=thresholds))
@@ -42,8 +42,8 @@ def main() -> None:
     print(f"\nmean over {len(options.seeds)} cultures\n{table(pd.concat(parts, ignore_index=True))}")
 
 
-def lived_through(seed: int, options: argparse.Namespace) -> None:
-    """A culture's recordings, policies and two sessions; what is there already is not done again."""
+def run_through(seed: int, options: argparse.Namespace) -> None:
+    """A culture's recordings, policies and two sessions; a session that is there already is not run again."""
     culture = options.out / f"culture{seed}"
     recordings, together = culture / "recordings", culture / "policies"
     expect(["record", "--seed", str(seed), "--sessions", "7", "--interval-min", "10", "--out", str(recordings)])
@@ -84,13 +84,14 @@ def episodes_of(session: Path) -> pd.DataFrame:
 def table(episodes: pd.DataFrame) -> str:
     """Mean return, its standard error and the number of episodes, by way, thresholds and time."""
     periods = (episodes["minute"] // PERIOD_MIN * PERIOD_MIN).astype(int)
+    starts = sorted(periods.unique())
     lines = []
     for (way, thresholds), rows in episodes.groupby(["way", "thresholds"]):
-        cells = [f"{part.mean():.1f} ({part.sem():.1f}, {len(part)})" for _, part in rows.groupby(periods)["return"]]
+        parts = [rows["return"][periods == start] for start in starts]
+        cells = [f"{part.mean():.1f} ({part.sem():.1f}, {len(part)})" if len(part) else "-" for part in parts]
         lines.append(f"| {way} | {thresholds} | {' | '.join(cells)} | {rows['return'].mean():.1f} |")
-    starts = [f"{start} to {start + PERIOD_MIN} min" for start in sorted(periods.unique())]
-    head = f"| trained | thresholds | {' | '.join(starts)} | all |"
-    return "\n".join([head, "|---" * (len(starts) + 3) + "|", *lines])
+    heads = " | ".join(f"{start} to {start + PERIOD_MIN} min" for start in starts)
+    return "\n".join([f"| trained | thresholds | {heads} | all |", "|---" * (len(starts) + 3) + "|", *lines])
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     assert "without shadowing: on the simulator of the first recording" in told["without shadowing"]
     assert told["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
     (fixed,) = arms_shown(Study(arms=(Arm("fixed", percentiles="first"),))).rows
-    assert fixed[1].endswith("Thresholds are fixed, by the first recording.")
+    assert fixed[1].endswith("Percentiles are those of the first recording throughout.")
     parts = {each.name: list(what_parts(each, study.arm("1 threshold"))) for each in study.arms}
     assert parts["1 threshold"] == parts["before training"] == []
     assert parts["without shadowing"] == [

@@ -139,7 +139,7 @@ def test_a_protocol_of_rests_alone_is_recorded_with_a_warning(
     for option, name in (("--protocol", "none.json"), ("--places", "places.json")):
         assert main([*given, option, str(tmp_path / name), "--out", str(tmp_path / f"of {name}")]) == 0
         said = capsys.readouterr().err.splitlines()
-        assert [line for line in said if line.startswith('warning: places: the only one is "none", so nothing is ever')]
+        assert [line for line in said if line.startswith('warning: the only place is "none", so nothing is ever')]
     # What is made of it says so, and is refused.
     assert main(["inspect", str(tmp_path / "of none.json")]) == 1
     assert "!! nothing was delivered: all 12 stimuli are rests" in capsys.readouterr().out

@@ -149,7 +149,7 @@ _BUDGET = {"budget.pulses": "budget_pulses", "budget.pulses_per_electrode": "bud
 
 
 def _by_option(command: Command, message: str) -> str:
-    """A message that begins with the name of an argument, beginning with that of the option it was given by."""
+    """A message that begins with the name of an argument, beginning with that of the option it is given by."""
     argument, _, rest = message.partition(": ")
     name = _BUDGET.get(argument, argument)
     options = {field.name for field in dataclasses.fields(command) if "Positional" not in str(field.type)}

@@ -83,7 +83,7 @@ class Record:
             _say_too_fast(protocol)
         if protocol is not None and protocol.is_rest:
             print(
-                'warning: places: the only one is "none", so nothing is ever delivered, and no robot can be driven by '
+                'warning: the only place is "none", so nothing is ever delivered, and no robot can be driven by '
                 "such recordings; to stimulate, add groups of electrodes",
                 file=sys.stderr,
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.reading import read_response
 from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
 from animat.closed_loop.standing import Standing
-from animat.closed_loop.stopping import Stop, ending_of
+from animat.closed_loop.stopping import Stop, ending_of, is_there
 from animat.closed_loop.stretch import Asked, Stretch, seen_in
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
@@ -102,8 +101,8 @@ class Driver:
 
     def stopped_by_file(self) -> Ending | None:
         """The ending that a person asks for by a file, if they do."""
-        is_there = os.access(self._stop_file, os.F_OK)
-        return Ending("person", f"stopped by a person (the file {self._stop_file.name})") if is_there else None
+        words = f"stopped by a person (the file {self._stop_file.name})"
+        return Ending("person", words) if is_there(self._stop_file) else None
 
     def run(self) -> Ending:
         """Run all episodes; whatever goes wrong is an ending, never an exception."""

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from animat.closed_loop.tick import Ending
 from animat.cultures.base import Culture
 from animat.cultures.failing import in_words
 from animat.errors import UnsafeStimulus
+
+
+def is_there(file: Path) -> bool:
+    """Whether a file is there, asked before every trial.
+
+    Raises:
+        OSError: where that cannot be told, as in a folder that cannot be looked into.
+    """
+    try:
+        file.stat()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 class Stop(Exception):

@@ -316,7 +316,7 @@ def refuse_overrides(cls: type, base: type, *, leaving: Collection[str]) -> None
 
 
 class ComputedCulture(Culture):
-    """A culture that a program computes: a delivery comes to its end within its call, and nothing is to be let go of.
+    """A culture that a program computes: a delivery ends within its call, and there is nothing to release.
 
     Closed and opened again it is where it was. Arguments as of `Culture`.
     """
@@ -332,4 +332,4 @@ class ComputedCulture(Culture):
         """Do nothing: the guard refuses the next delivery."""
 
     def _close(self) -> None:
-        """Do nothing."""
+        """Do nothing: it lives on in memory, and is where it was when it is opened again."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,13 @@ _LAST = threading.local()
 """The bodies of a thread's last wave: to make new ones takes longer than many an episode."""
 
 
+class Acting(Protocol):
+    """Whoever picks actions (`animat.evaluation.rollouts.Actor`)."""
+
+    def act(self, environment: Environment[Any], observation: Array, uniforms: Array) -> Array:
+        """An action for each scaled observation."""
+
+
 class Counts(NamedTuple):
     """What came of the episodes; shapes and meanings as in `animat.evaluation.rollouts.Episodes`."""
 
@@ -39,7 +46,7 @@ def roll_out_on_host(
     environment: Environment[Any],
     episodes: int,
     simulator: NeuronSimulator | None,
-    actors: Any,
+    actors: Acting,
     keys: Key[Array, " actors"],
     seed: int,
 ) -> Counts:
@@ -76,7 +83,7 @@ def roll_out_on_host(
 def paths_on_host(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
-    actors: Any,
+    actors: Acting,
     keys: Key[Array, " actors"],
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,7 +193,7 @@ def _iteration(
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array, Array]:
     """Commands, the state that the neurons leave, what was delivered, and whether the answer was P50 or more."""
 
-    def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array, Array]:
+    def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn
         uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales

@@ -104,7 +104,8 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, error:
     """A warning where a value parts from its controller's return by more than 3 standard errors and the grid's error.
 
     Args:
-        value, grid_error, monte_carlo, error: as in `Optimum`.
+        value, grid_error, monte_carlo: as in `Optimum`.
+        error: its `standard_error`.
     """
     apart = value - monte_carlo
     if not abs(apart) > max(_ALIKE, 3 * error + grid_error):

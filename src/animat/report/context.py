@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -63,7 +64,8 @@ def _points(axes: Axes, found: Mapping[str, Sequence[Estimate]], colour: str, no
             ends = [end for end in (each.low, each.high) if end is not None]
             axes.plot(ends, [place] * len(ends), color=colour, linewidth=1.2)
             marker, label = (">", "at least") if each.is_least else ("o", "a culture, 95 % interval")
-            axes.plot([each.value or 0.0], [place], marker, color=colour, markersize=4, label=label)
+            value = math.nan if each.value is None else each.value
+            axes.plot([value], [place], marker, color=colour, markersize=4, label=label)
 
 
 def draw_whose_work(lost: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:

@@ -21,6 +21,7 @@ _SHADOWED: dict[bool | str, str] = {
     False: "Trained without shadowing: on the simulator of the first recording throughout.",
     "drawn": "In training, each episode draws one of the recordings, whose simulator is used.",
 }
+FIXED = "percentiles are those of the first recording throughout."
 SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy chooses."
 
 
@@ -39,8 +40,12 @@ def mapped(arm: Arm) -> str:
 def what_parts(first: Arm, second: Arm) -> Iterator[str]:
     """What two arms differ in, where a name does not say it: a sentence each."""
     for arm, other in ((first, second), (second, first)):
-        if arm.shadowing is True and other.shadowing is False:
+        if arm.shadowing is True is not other.shadowing:
             yield f"“{arm.name}” is trained {REFRESHED}"
+        if arm.shadowing == "drawn" != other.shadowing:
+            yield f"In “{arm.name}” each episode of training draws one of the recordings, whose simulator is used."
+        if arm.percentiles == "first" != other.percentiles:
+            yield f"In “{arm.name}” {FIXED}"
         if arm.delivery == "shuffled" != other.delivery:
             yield f"In “{arm.name}” {SHUFFLED}"
         if arm.mapping != other.mapping:
@@ -68,4 +73,4 @@ def _in_words(arm: Arm) -> Iterator[str]:
     if arm.delivery == "shuffled":
         yield f"{SHUFFLED[:1].upper()}{SHUFFLED[1:-1]}, in training and in evaluation."
     if arm.percentiles == "first":
-        yield "Thresholds are fixed, by the first recording."
+        yield f"{FIXED[:1].upper()}{FIXED[1:]}"

@@ -84,12 +84,16 @@ class Publish(StudyTask):
 
 
 def _lead(study: Study) -> str:
-    robots = " and ".join(spec.name for spec in study.robots)
+    robots = _and([spec.name for spec in study.robots])
     neurons = {"virtual": "a virtual culture", "synthetic": "synthetic responses", "files": "recordings"}[
         study.culture.kind
     ]
-    trained = " and ".join(f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots)
+    trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
     return f"{robots.capitalize()}, driven through {neurons}. {many_arms(study)}, trained for {trained}."
+
+
+def _and(parts: Sequence[str]) -> str:
+    return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), *parts[-1:]])
 
 
 def _headline(study: Study, results: Results, table: DataFrame) -> list[ArmReturns]:

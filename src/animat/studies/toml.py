@@ -1,4 +1,4 @@
-"""A study as a TOML file: read strictly, every mistake in one line; and written, so that it can be changed and run."""
+"""A study as a TOML file: read strictly, every mistake in one line; lists in it multiplied out; and written again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it; what is left out has its
     default; a key that is not known is refused. Lists in robots, arms and comparisons stand for their products
-    (`animat.studies.toml`).
+    (`without_lists`).
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.

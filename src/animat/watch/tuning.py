@@ -43,14 +43,15 @@ class TuningView(View):
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
         states = [trial["state"] for trial in trials]
-        best = max((t for t in trials if t["last"] is not None), key=lambda t: (t["rungs"], t["last"]), default=None)
+        complete = (t for t in trials if t["state"] == "complete" and t["last"] is not None)
+        best = max(complete, key=lambda t: t["last"], default=None)
         rows: list[tuple[str, Any]] = [
             ("trials done", f"{len(trials):,} of {planned:,}"),
             ("complete", states.count("complete")),
             ("stopped early", states.count("stopped")),
             ("diverged", states.count("diverged")),
             ("under way", _under_way(told, tune, len(trials), planned) if is_running else "nothing"),
-            ("time left", self._left(planned - len(trials)) if is_running else time_left(None, state)),
+            ("time left", self._left(planned - len(trials)) if is_running and planned else time_left(None, state)),
             _won(results)
             or ("best so far", "none yet" if best is None else f"trial {best['trial']}, {short(best['last'])}"),
         ]

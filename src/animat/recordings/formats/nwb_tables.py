@@ -137,7 +137,9 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
 def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
     # A row keeps its electrodes up to the last known one, so that padding between known ones survives too.
     known, columns = stimuli.electrodes != UNKNOWN, stimuli.electrodes.shape[1]
-    lengths = (known * np.arange(1, columns + 1)).max(axis=1, initial=0)
+    lengths = np.zeros(len(stimuli), np.int64)
+    for column in range(columns):
+        lengths[known[:, column]] = column + 1
     kept = np.arange(columns)[None, :] < lengths[:, None]
     rests = f"; {NOTHING}: nothing was delivered" if np.any(stimuli.is_rest) else ""
     electrodes = VectorData(

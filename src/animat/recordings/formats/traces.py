@@ -58,8 +58,11 @@ def open_traces(
             traces = _nwb(file, part, base)
     stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
     start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
-    base = replace(base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s)
-    return traces, replace(base, duration_s=stop_s - start_s)
+    # At once: stimuli lie within both together, and perhaps not within the new start and the old length.
+    base = replace(
+        base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s, duration_s=stop_s - start_s
+    )
+    return traces, base
 
 
 def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
