@@ -19,11 +19,15 @@ def drawn_networks(
     """Actor, critics, log alpha and target critics with weights of ordinary size everywhere, biases included."""
     continuous = (n + 1 + n_commands, 1, 2 * n_commands)
     inputs, values, outputs = continuous if n_actions is None else (n + 1, n_actions, n_actions)
-    actor, critics, targets = initial_networks(
+    # For their shapes alone.
+    actor, critics, targets = jax.eval_shape(
+        lambda key: initial_networks(
+            key,
+            ((n, hidden, hidden, outputs), ()),
+            ((inputs, hidden, hidden, values), (2,)),
+            ((inputs, hidden, hidden, values), (2,)),
+        ),
         jax.random.key(seed),
-        ((n, hidden, hidden, outputs), ()),
-        ((inputs, hidden, hidden, values), (2,)),
-        ((inputs, hidden, hidden, values), (2,)),
     )
     rng = np.random.default_rng(seed)
 

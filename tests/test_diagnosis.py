@@ -29,6 +29,8 @@ from test_sac_learning import SMALL as TINY
 from test_sac_learning import explored, start, trained_for
 from test_training import SHORT, timeline_of, trained, weights_after
 
+compiled_diagnose = jax.jit(diagnose, static_argnums=(0, 1))
+
 
 def through(network: Network, inputs: np.ndarray, critic: int | None = None) -> np.ndarray:
     """A network's outputs in float64; of critics, which are stacked, one's."""
@@ -55,7 +57,7 @@ def test_it_is_what_the_equations_say_of_discrete_actions(paid: bool) -> None:
     settings = replace(TINY, replay=200)
     learner, _ = trained_for(environment, settings, 80)
     learner = explored(learner) if paid else learner._replace(exploration=start(environment, settings).exploration)
-    found = diagnose(environment, settings, learner, jnp.int32(160))
+    found = compiled_diagnose(environment, settings, learner, jnp.int32(160))
     rows, n = rows_of(learner, 160, drawn(environment)[0]), 5
     state, after, action, (reward, ended) = rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n].astype(int), rows[:, -2:].T
     log_pi = log_softmax(through(learner.trained.actor, state[:, :-1]), axis=1)
@@ -75,7 +77,7 @@ def test_it_is_what_the_equations_say_of_continuous_actions() -> None:
     environment = WithoutNeurons(Navigation(), None)
     settings = replace(TINY, replay=200)
     learner = explored(trained_for(environment, settings, 80)[0])
-    found = diagnose(environment, settings, learner, jnp.int32(160))
+    found = compiled_diagnose(environment, settings, learner, jnp.int32(160))
     numbers, n = drawn(environment).astype(np.float64), len(environment.observation_spec) + 1
     rows = rows_of(learner, 160, drawn(environment)[0])
     state, after, action, (reward, ended) = rows[:, :n], rows[:, n : 2 * n], rows[:, [2 * n]], rows[:, -2:].T
@@ -99,7 +101,7 @@ def test_it_is_what_the_equations_say_of_continuous_actions() -> None:
 
 def test_of_no_transitions_nothing_is_known() -> None:
     environment = WithoutNeurons(Cartpole(), (-1.0, 1.0))
-    found = diagnose(environment, TINY, start(environment, TINY), jnp.int32(0))
+    found = compiled_diagnose(environment, TINY, start(environment, TINY), jnp.int32(0))
     assert np.isnan(found).all()
 
 
@@ -152,6 +154,6 @@ def test_a_training_of_before_goes_on(tmp_path: Path) -> None:
 
 def test_before_training_actions_are_all_but_random_and_alpha_is_the_initial_one() -> None:
     environment = WithoutNeurons(Cartpole(), (-1.0, 1.0))
-    first = diagnose(environment, TINY, start(environment, TINY), jnp.int32(1))
+    first = compiled_diagnose(environment, TINY, start(environment, TINY), jnp.int32(1))
     assert first.entropy == pytest.approx(np.log(2), abs=0.01)
     assert first.alpha == pytest.approx(TINY.initial_alpha)

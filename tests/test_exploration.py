@@ -25,6 +25,9 @@ from animat.training.specification import Training
 ENVIRONMENT = Animat(SwingUp(), mapping_named("9-thresholds"), 5)
 NOT_ENDED = jnp.zeros(64, bool)
 
+compiled_explore = jax.jit(explore, static_argnums=0)
+compiled_ended_episodes = jax.jit(ended_episodes)
+
 
 def history(
     n: int, iterations: int, environment: Animat | WithoutNeurons = ENVIRONMENT
@@ -56,7 +59,7 @@ def test_lengths_of_every_order_are_equally_likely() -> None:
     """Of 64 environments one action each: held for k iterations or more with a chance of 1 - ln k / ln 50."""
     n, longest = 20_000, 50
     uniforms = jax.random.uniform(jax.random.key(2), (n, 3)).at[:, 0].set(0.0)
-    _, exploration = explore(ENVIRONMENT, nothing_held(n, 1), jnp.full(n, 7), uniforms)
+    _, exploration = compiled_explore(ENVIRONMENT, nothing_held(n, 1), jnp.full(n, 7), uniforms)
     lengths = np.asarray(exploration.left)[n // 2 :] + 1
     assert lengths.min() == 1
     assert lengths.max() == longest - 1
@@ -71,20 +74,20 @@ def test_a_held_action_stays_the_same_for_its_length_and_ends_with_its_episode()
     never = jnp.tile(jnp.array([1.0, 0.0, 0.0]), (n, 1))
     policy = jnp.full(n, 7)
     length = math.floor(50**0.9)
-    taken, exploration = explore(ENVIRONMENT, nothing_held(n, 1), policy, begin)
+    taken, exploration = compiled_explore(ENVIRONMENT, nothing_held(n, 1), policy, begin)
     for _ in range(length - 1):
         assert np.asarray(taken)[n // 2 :].tolist() == (n // 2) * [2]
-        exploration = ended_episodes(exploration, NOT_ENDED, jnp.zeros(n))
+        exploration = compiled_ended_episodes(exploration, NOT_ENDED, jnp.zeros(n))
         # What would begin another one changes nothing while one is held.
-        taken, exploration = explore(ENVIRONMENT, exploration, policy, never)
+        taken, exploration = compiled_explore(ENVIRONMENT, exploration, policy, never)
     assert np.asarray(taken)[n // 2 :].tolist() == (n // 2) * [2]
-    taken, exploration = explore(ENVIRONMENT, exploration, policy, never)
+    taken, exploration = compiled_explore(ENVIRONMENT, exploration, policy, never)
     assert (np.asarray(taken) == 7).all()
 
-    _, exploration = explore(ENVIRONMENT, nothing_held(n, 1), policy, begin)
-    exploration = ended_episodes(exploration, ~NOT_ENDED, jnp.zeros(n))
+    _, exploration = compiled_explore(ENVIRONMENT, nothing_held(n, 1), policy, begin)
+    exploration = compiled_ended_episodes(exploration, ~NOT_ENDED, jnp.zeros(n))
     assert not np.asarray(exploration.was_held).any()
-    taken, _ = explore(ENVIRONMENT, exploration, policy, never)
+    taken, _ = compiled_explore(ENVIRONMENT, exploration, policy, never)
     assert (np.asarray(taken) == 7).all()
 
 
@@ -108,11 +111,10 @@ def test_what_is_known_of_late_episodes_is_their_weighted_mean() -> None:
     rng = np.random.default_rng(3)
     exploration = nothing_held(4, 1)._replace(was_held=jnp.array([False, False, True, True]))
     weights: list[list[float]] = [[0.0, 0.0], [0.0, 0.0]]
-    tally = jax.jit(ended_episodes)
     for _ in range(200):
         which, value = int(rng.integers(4)), float(rng.normal())
         returns = jnp.full(4, 1e6).at[which].set(value)
-        after = tally(exploration, jnp.arange(4) == which, returns)
+        after = compiled_ended_episodes(exploration, jnp.arange(4) == which, returns)
         exploration = after._replace(was_held=exploration.was_held)
         kind = weights[which // 2]
         kind[0], kind[1] = 0.98 * kind[0] + 1.0, 0.98 * kind[1] + value

@@ -459,11 +459,12 @@ def test_a_simulator_with_a_memory_of_before_is_read(tmp_path: Path) -> None:
     path.write_bytes(save({**arrays, "reach": arrays.pop("neighbour_exponent")}, metadata=metadata))
     read = load_timeline(path).simulators
     history = after(jnp.linspace(0, 1, 50))
+    both = [
+        jax.jit(jax.vmap(each.at(0.0).answer, (None, None, 0)))
+        for each in (timeline, replace(timeline, simulators=read))
+    ]
     for c in (0, 1):
-        ours, theirs = (
-            jax.vmap(each.at(0.0).answer, (None, None, 0))(jnp.int32(c), jnp.float32(0.3), history)
-            for each in (timeline, replace(timeline, simulators=read))
-        )
+        ours, theirs = (answer(jnp.int32(c), jnp.float32(0.3), history) for answer in both)
         np.testing.assert_array_equal(ours.rate_hz, theirs.rate_hz)
         np.testing.assert_array_equal(ours.history, theirs.history)
 

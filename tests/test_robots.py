@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -44,22 +45,27 @@ def commands_of(robot: Robot, u):
 
 def play(robot: Robot, policy: str, episodes: int, iterations: int, seed: int = 0):
     """Observations, rewards and endings of many episodes, (iterations, episodes, ...), going on after an ending."""
-    key_reset, key_u, key_steps = jax.random.split(jax.random.key(seed), 3)
+    rng = np.random.default_rng(seed)
     shape = (iterations, episodes) if robot.n_commands == 1 else (iterations, episodes, robot.n_commands)
     u = {
-        "random": jax.random.uniform(key_u, shape, minval=-1.0, maxval=1.0),
-        "thrown": jnp.where(jax.random.uniform(key_u, shape) < 0.5, -1.0, 1.0),
-        "right": jnp.ones(shape),
-        "left": -jnp.ones(shape),
+        "random": rng.uniform(-1.0, 1.0, shape),
+        "thrown": rng.choice((-1.0, 1.0), shape),
+        "right": np.ones(shape),
+        "left": -np.ones(shape),
     }[policy]
-    uniforms = jax.random.uniform(key_steps, (iterations, episodes, robot.noise_size))
+    uniforms = rng.random((iterations, episodes, robot.noise_size), np.float32)
+    return jax.tree.map(np.asarray, _play(robot, jax.random.key(seed), uniforms, u.astype(np.float32)))
 
+
+# One program for all policies of a robot.
+@partial(jax.jit, static_argnums=0)
+def _play(robot: Robot, key, uniforms, u):
     def iterate(state, inputs):
         state, reward, terminated = jax.vmap(robot.advance)(inputs[0], state, inputs[1])
         return state, (jax.vmap(robot.observe)(state), reward, terminated)
 
-    start = jax.vmap(robot.reset)(jax.random.split(key_reset, episodes))
-    return jax.tree.map(np.asarray, jax.lax.scan(iterate, start, (uniforms, u))[1])
+    start = jax.vmap(robot.reset)(jax.random.split(key, u.shape[1]))
+    return jax.lax.scan(iterate, start, (uniforms, u))[1]
 
 
 def test_a_state_keeps_its_form_so_that_it_can_be_scanned(robot: Robot) -> None:
@@ -100,10 +106,11 @@ def test_a_jitted_step_draws_no_random_numbers_in_advance(robot: Robot) -> None:
 def test_a_batch_steps_as_each_alone(robot: Robot) -> None:
     u = commands_of(robot, jnp.linspace(-1, 1, 7))
     keys = jax.random.split(jax.random.key(3), 7)
-    states = jax.vmap(robot.reset)(keys)
-    together = jax.vmap(robot.step)(keys, states, u)
+    states = jax.jit(jax.vmap(robot.reset))(keys)
+    together = jax.jit(jax.vmap(robot.step))(keys, states, u)
+    step = jax.jit(robot.step)
     for i in range(7):
-        alone = robot.step(keys[i], jax.tree.map(lambda leaf, i=i: leaf[i], states), u[i])
+        alone = step(keys[i], jax.tree.map(lambda leaf, i=i: leaf[i], states), u[i])
         np.testing.assert_allclose(
             [leaf[i] for leaf in jax.tree.leaves(together)], jax.tree.leaves(alone), rtol=1e-6, atol=1e-7
         )

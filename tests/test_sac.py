@@ -36,6 +36,8 @@ def all_losses(trained: Trained, targets: Network, batch: Batch, uniforms: jax.A
 
 compiled_losses = jax.jit(all_losses)
 compiled_gradients = jax.jit(jax.jacrev(all_losses))
+compiled_squashed_normal = jax.jit(squashed_normal)
+compiled_draw_action = jax.jit(draw_action, static_argnums=0)
 
 
 def reference_losses(trained: Trained, targets: Network, batch: Batch, uniforms: jax.Array | None) -> np.ndarray:
@@ -148,7 +150,8 @@ def test_continuous_losses_stay_finite_at_the_ends(outputs: tuple[float, float])
 @pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (0.7, -1.5), (-1.2, -0.3), (0.3, -3.0)])
 def test_the_squashed_normals_density_integrates_to_one(mean: float, log_std: float) -> None:
     uniforms = jnp.linspace(1e-5, 1 - 1e-5, 200_001)
-    action, log_p = squashed_normal(jnp.tile(jnp.array([[mean, log_std]]), (len(uniforms), 1)), uniforms[:, None])
+    outputs = jnp.tile(jnp.array([[mean, log_std]]), (len(uniforms), 1))
+    action, log_p = compiled_squashed_normal(outputs, uniforms[:, None])
     area = integrate.trapezoid(np.exp(np.asarray(log_p, np.float64)), np.asarray(action[:, 0], np.float64))
     assert area == pytest.approx(1.0, abs=2e-3)
 
@@ -160,7 +163,7 @@ def test_the_squashed_normals_density_integrates_to_one(mean: float, log_std: fl
 )
 @settings(max_examples=100, deadline=None)
 def test_the_squashed_normal_is_scipys_change_of_variables(mean: float, log_std: float, uniform: float) -> None:
-    action, log_p = jax.jit(squashed_normal)(jnp.array([[mean, log_std]]), jnp.array([[uniform]]))
+    action, log_p = compiled_squashed_normal(jnp.array([[mean, log_std]]), jnp.array([[uniform]]))
     kept = min(max(log_std, -5.0), 2.0)
     z = stats.norm.ppf(uniform, mean, math.exp(kept))
     assert float(action[0, 0]) == pytest.approx(math.tanh(z), abs=2e-4)
@@ -177,7 +180,7 @@ def test_actions_are_drawn_as_often_as_softmax_says() -> None:
     environment = WithoutNeurons(Cartpole(), (-1.0, -0.5, 0.0, 0.5, 1.0))
     n = 200_000
     uniforms = jax.random.uniform(jax.random.key(11), (n, 1))
-    drawn = np.asarray(draw_action(environment, constant_actor(logits), jnp.zeros((n, 4)), uniforms))
+    drawn = np.asarray(compiled_draw_action(environment, constant_actor(logits), jnp.zeros((n, 4)), uniforms))
     expected = n * np.exp(logits) / np.exp(logits).sum()
     assert stats.chisquare(np.bincount(drawn, minlength=5), expected).pvalue > 1e-3
 
@@ -186,7 +189,7 @@ def test_actions_are_drawn_as_often_as_softmax_says() -> None:
 def test_actions_are_valid_and_possible_at_both_ends_of_the_uniforms(logits: list[float]) -> None:
     environment = WithoutNeurons(Cartpole(), (-1.0, 0.0, 1.0))
     uniforms = jnp.array([[0.0], [2.0**-24], [0.5], [1.0 - 2.0**-24]])
-    drawn = np.asarray(draw_action(environment, constant_actor(logits), jnp.zeros((4, 4)), uniforms))
+    drawn = np.asarray(compiled_draw_action(environment, constant_actor(logits), jnp.zeros((4, 4)), uniforms))
     possible = np.flatnonzero(np.array(logits) >= max(logits) - 100)
     assert set(drawn) <= set(possible)
 
@@ -196,7 +199,7 @@ def test_continuous_actions_follow_the_squashed_normal() -> None:
     n = len(environment.observation_spec)
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 2)), jnp.array([[0.4, -0.7]])))
     uniforms = jax.random.uniform(jax.random.key(12), (20_000, 1))
-    drawn = np.asarray(draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
+    drawn = np.asarray(compiled_draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
     assert np.all(np.abs(drawn) <= 1)
     assert stats.kstest(np.arctanh(drawn), "norm", (0.4, math.exp(-0.7))).pvalue > 1e-3
 
@@ -207,7 +210,7 @@ def test_each_of_several_commands_follows_its_own_squashed_normal() -> None:
     outputs = jnp.array([[0.4, -1.0, -0.7, 0.2]])  # two means, then two log deviations
     actor = (Layer(jnp.zeros((n, 2)), jnp.zeros((1, 2))), Layer(jnp.zeros((2, 4)), outputs))
     uniforms = jax.random.uniform(jax.random.key(13), (20_000, 2))
-    drawn = np.asarray(draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
+    drawn = np.asarray(compiled_draw_action(environment, actor, jnp.zeros((20_000, n)), uniforms), np.float64)
     assert drawn.shape == (20_000, 2)
     z = np.arctanh(drawn)
     assert stats.kstest(z[:, 0], "norm", (0.4, math.exp(-0.7))).pvalue > 1e-3

@@ -68,10 +68,11 @@ class Kept:
 def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_stays_open(tmp_path: Path) -> None:
     six = replace(SHORT, policies=6, iterations=2_000)
     progress = Kept()
-    train(six, timeline_of(), tmp_path / "two", workers=2, progress=progress)
+    # First here, where the program is compiled that each worker then finds.
     with ThreadPoolExecutor(2) as executor:
         lent = train(six, timeline_of(), tmp_path / "lent", executor=executor)
         assert executor.submit(len, lent).result() == 6
+    train(six, timeline_of(), tmp_path / "two", workers=2, progress=progress)
     assert list(bits(tmp_path / "two")) == [f"p{i}.safetensors" for i in range(6)]
     assert bits(tmp_path / "two") == bits(tmp_path / "lent")
     assert progress.told[-1] == (6 * CHUNKS, 6 * CHUNKS)

@@ -101,7 +101,7 @@ def test_random_spikes_have_the_rates_of_the_culture_and_do_not_listen() -> None
     uniforms = (jnp.arange(4096) + 0.5) / 4096
     conditions = jnp.arange(SIMULATOR.n_conditions)
     own, of_all = (
-        np.asarray(jax.vmap(jax.vmap(each.quantile, (None, 0)), (0, None))(conditions, uniforms))
+        np.asarray(jax.jit(jax.vmap(jax.vmap(each.quantile, (None, 0)), (0, None)))(conditions, uniforms))
         for each in (SIMULATOR, spikes)
     )
     np.testing.assert_array_equal(of_all, of_all[:1].repeat(len(of_all), axis=0))
