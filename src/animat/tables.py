@@ -1,4 +1,4 @@
-"""Tables of what was measured: columns as read-only arrays of one length, and times that can be times."""
+"""Tables of what was measured: read-only columns of one length, times that can be times, and objects told in short."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a study comes to, as typed records: read by the tasks that show it, and exported as CSV, a file a table."""
+"""What a study comes to, as typed records: read by the tasks that show it, and exported as CSV and Parquet tables."""
 
 from __future__ import annotations
 

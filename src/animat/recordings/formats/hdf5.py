@@ -2,7 +2,8 @@
 
 A file is data, never instructions: links to other files are not followed (external links, external storage, virtual
 datasets), pickles are bytes that nobody opens, and what claims to be larger than the file can hold is refused before
-memory is asked for. Links inside a file are followed, as MaxWell's files need them.
+memory is asked for. Links inside a file are followed, as MaxWell's files need them. Where
+several things in a file could be meant, one is chosen by its name (`choose`).
 """
 
 from __future__ import annotations
