@@ -379,3 +379,22 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
         del file["acquisition/traces/data"]
     with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
         read_traces(tmp_path / "a.nwb", Detection())
+
+
+def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) -> None:
+    voltage, _ = noisy(2, 6.0, step_uv=1.0)
+    with h5py.File(tmp_path / "a.nwb", "w") as file:
+        file.attrs["nwb_version"] = "2.7.0"
+        series = file.create_group("acquisition/traces")
+        series.attrs["neurodata_type"] = "ElectricalSeries"
+        series["data"] = voltage
+        series["data"].attrs["conversion"] = 1e-6
+        series["starting_time"] = -1.0
+        series["starting_time"].attrs["rate"] = RATE_HZ
+        table = file.create_group("intervals/stimuli")
+        table.attrs["neurodata_type"] = "TimeIntervals"
+        table.attrs["colnames"] = ["start_time", "stop_time"]
+        table["start_time"] = table["stop_time"] = np.array([1.0, 4.9])
+    recording = read_traces(tmp_path / "a.nwb", Detection())
+    assert (recording.start_s, recording.duration_s) == (-1.0, 6.0)
+    assert recording.stimuli.time_s.tolist() == [1.0, 4.9]
