@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from animat.cli import main as animat
 from animat.ctrl_c import heard_everywhere
 
 pytestmark = pytest.mark.usefixtures("in_the_foreground")
@@ -61,3 +62,15 @@ def test_where_it_is_ignored_it_stays_so() -> None:
     with heard_everywhere():
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, capsys) -> None:
+    def killed(*_: Any, **__: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(5.0)
+
+    monkeypatch.setattr("animat.cultures.series.record_virtual_series", killed)
+    before = signal.getsignal(signal.SIGTERM)
+    assert animat(["record", "--out", str(tmp_path / "recordings")]) == 130
+    assert capsys.readouterr().err.endswith("animat: interrupted; what was finished is kept; start again to go on\n")
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -26,7 +26,7 @@ from animat.execution.task import Task, carry_out, carry_out_alone, reported
 from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.synthetic import synthetic_recording
-from worker_tasks import Die, Fail, Join, Starve, Stumble
+from worker_tasks import Die, Fail, Join, Killed, Starve, Stumble
 
 CORE = min(os.sched_getaffinity(0))
 
@@ -151,6 +151,11 @@ def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
             Die(),
             AnimatError,
             r"job: its process ended with status 7 \(is there memory enough\? .*\); start again to go on",
+        ),
+        (
+            Killed(),
+            AnimatError,
+            r"job: its process ended with status -15 \(another program ended it\); start again to go on",
         ),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,6 +82,15 @@ class Die(Sized):
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         os._exit(7)
+
+
+class Killed(Sized):
+    """Is ended as `kill` ends it."""
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(60.0)
+        return []
 
 
 class Fail(Sized):

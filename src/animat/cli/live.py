@@ -70,7 +70,6 @@ class Live(Stimulating):
 
     def run(self) -> dict[str, Any]:
         """Live."""
-        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
@@ -116,7 +115,6 @@ class Live(Stimulating):
         with (
             ExitStack() as told,
             exclusive_lock(self.out),
-            polite_kill_as_ctrl_c(),
             Bar("culture") as progress,
             culture_of(
                 self.culture, seed=seed, recordings=recordings, selection=self.selection, progress=progress

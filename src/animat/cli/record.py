@@ -126,7 +126,6 @@ class Record:
         )
 
     def _living(self, progress: Progress) -> list[Path]:
-        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.cultures.kinds import culture_of
         from animat.cultures.living_series import record_in_held_folder
         from animat.cultures.series import check_interval
@@ -139,7 +138,6 @@ class Record:
         with (
             # Held before a device is opened, which stops whatever another run has it do.
             exclusive_lock(self.out),
-            polite_kill_as_ctrl_c(),
             culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
         ):
             protocol = self._protocol(len(culture.patterns))

@@ -86,7 +86,6 @@ class Run(Stimulating):
         """Run."""
         import numpy as np
 
-        from animat.closed_loop.interrupts import polite_kill_as_ctrl_c
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.running import check_episodes
         from animat.coding.decoder import percentiles_shape
@@ -126,7 +125,6 @@ class Run(Stimulating):
             ExitStack() as told,
             # Last, as it makes the folder.
             _held_for_session(self.out, is_recording=not recordings),
-            polite_kill_as_ctrl_c(),
             Bar("culture") as progress,
             self._culture(recordings, progress) as culture,
         ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
@@ -231,6 +232,7 @@ def _done(future: Future[Done], job: Job) -> Done:
     except Exception as error:
         # The executor's: of a process that ended, or a machine that is lost.
         words = " ".join(str(error).split()) or type(error).__name__
-        raise AnimatError(
-            f"{job.name}: {words} (is there memory enough? {memory_of(job.task)}); start again to go on"
-        ) from error
+        # That is what a person or a program asks for; a system that is out of memory does not ask.
+        is_asked = words.endswith(f"status {-signal.SIGTERM}")
+        why = "another program ended it" if is_asked else f"is there memory enough? {memory_of(job.task)}"
+        raise AnimatError(f"{job.name}: {words} ({why}); start again to go on") from error
