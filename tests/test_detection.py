@@ -362,16 +362,20 @@ def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
     assert recording.stimuli.electrodes.tolist() == [[9]]
 
 
-def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
-    voltage, truth = noisy(2, 1.0, step_uv=1.0)
-    with h5py.File(tmp_path / "a.nwb", "w") as file:
+def write_nwb_traces(path: Path, voltage: np.ndarray, start_s: float) -> None:
+    with h5py.File(path, "w") as file:
         file.attrs["nwb_version"] = "2.7.0"
         series = file.create_group("acquisition/traces")
         series.attrs["neurodata_type"] = "ElectricalSeries"
         series["data"] = voltage
         series["data"].attrs["conversion"] = 1e-6
-        series["starting_time"] = 0.0
+        series["starting_time"] = start_s
         series["starting_time"].attrs["rate"] = RATE_HZ
+
+
+def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
+    voltage, truth = noisy(2, 1.0, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
     recording = read_traces(tmp_path / "a.nwb", Detection())
     found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     assert agreement(found, truth)[1] == 0
@@ -383,14 +387,8 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
 
 def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) -> None:
     voltage, _ = noisy(2, 6.0, step_uv=1.0)
-    with h5py.File(tmp_path / "a.nwb", "w") as file:
-        file.attrs["nwb_version"] = "2.7.0"
-        series = file.create_group("acquisition/traces")
-        series.attrs["neurodata_type"] = "ElectricalSeries"
-        series["data"] = voltage
-        series["data"].attrs["conversion"] = 1e-6
-        series["starting_time"] = -1.0
-        series["starting_time"].attrs["rate"] = RATE_HZ
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=-1.0)
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
         table = file.create_group("intervals/stimuli")
         table.attrs["neurodata_type"] = "TimeIntervals"
         table.attrs["colnames"] = ["start_time", "stop_time"]

@@ -178,7 +178,7 @@ def test_a_policy_carries_its_readouts_through_its_file(
     with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of two-wheels, got 1"):
         replace(policies["p0"], readouts=ALL)
     other = replace(timeline, readouts=replace(timeline.readouts, names=("a", "b")))
-    with pytest.raises(Mismatch, match=r"readouts: expected left, right, .*, got recordings read as a, b"):
+    with pytest.raises(Mismatch, match=r"readouts: expected left, right, .*, got a, b"):
         evaluate(policies, other, episodes=5)
 
 

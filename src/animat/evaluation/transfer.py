@@ -131,7 +131,7 @@ def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts:
     if policy.readouts != readouts:
         raise Mismatch(
             f"readouts: expected {', '.join(policy.readouts.names)}, of the electrodes that the policies were trained "
-            f"on, got recordings read as {', '.join(readouts.names)}"
+            f"on, got {', '.join(readouts.names)} in the recordings"
         )
 
 
