@@ -123,7 +123,11 @@ def _run(given: list[str]) -> int:
             else "; what was finished is kept"
         )
         again = (
-            "; start again to go on" if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile) else ""
+            "; start again to go on"
+            if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile)
+            else "; a session is not gone on with: start another in a folder of its own"
+            if isinstance(command, Run)
+            else ""
         )
         print(f"animat: interrupted{kept}{again}", file=sys.stderr)
         _say_notes(error)

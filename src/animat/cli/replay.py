@@ -9,7 +9,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, InvalidFile
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,8 @@ class Replay(Fitting):
             )
         if self.robot is not None:
             REGISTRY.name_of(self.robot)
+        if not self.source.exists():
+            raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
             if self.recordings:
                 raise InvalidArgument("--recordings: expected none with a session, which is shown as it was")

@@ -250,7 +250,7 @@ def _control(timeline: SimulatorTimeline) -> str:
         told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
     said = next((f.message for f in timeline.findings if f.name == "difference"), None)
     first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
-    return "\n".join([first, *([said] if said else []), *_memories(timeline)])
+    return "\n".join([first, *([f"in the recording {said}"] if said else []), *_memories(timeline)])
 
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:

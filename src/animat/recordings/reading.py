@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -224,6 +225,9 @@ def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
 
 def _files(path: Path) -> list[Path]:
     if not is_folder(path):
+        with suppress(OSError, ValueError):
+            if not path.exists():
+                raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
         return [expect_plain_file(path)]
     try:
         # A folder that cannot be read looks empty to glob.

@@ -338,7 +338,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
             arrays = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError, ValueError) as error:
         raise InvalidFile(
-            f"{path}: expected a policy (safetensors), got a file that cannot be read: {error}"
+            f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one: {error}"
         ) from error
     try:
         described = json.loads(metadata["animat"])
