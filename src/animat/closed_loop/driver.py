@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.adaptive import AdaptiveThresholds
+from animat.closed_loop.adaptive import Trial, thresholds_of
 from animat.closed_loop.agents import Agent, Controller, InTurn
 from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.log import Record
@@ -76,14 +76,15 @@ class Driver:
             # Compiled now, as its step is.
             self._runner.switch_goal(0)
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
-        self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
+        seeing = any(agent.sees_neurons(n) for agent in agents for n in range(len(turns)))
+        self._remembering = loop.remembering if seeing else None
+        self._adaptive = thresholds_of(loop.adaptive_from, loop.remembering)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
         self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
         self._begun: Counter[str] = Counter()
         self._presented = self._stretches = 0
-        self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
-        self._data_at_s = self._wall_zero_s = 0.0
+        self._zero_s = self._seen_until_s = self._last_pulse_s = self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
         self._remembered = Remembered()
         self._given: dict[str, list[int]] = {}
@@ -135,7 +136,7 @@ class Driver:
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         self.standing.begin(agent.name)
-        given, remembering = list[int](), loop.remembering if agent.sees_neurons(turn) else None
+        given, remembering = list[int](), self._remembering if agent.sees_neurons(turn) else None
         source = self._source_of(agent)
         for iteration in range(loop.robot.episode_limit):
             seen = observation if remembering is None else remembering.beside(observation, self._remembered)
@@ -251,15 +252,15 @@ class Driver:
             **read.told,
         }
         self._presented += 1
-        if loop.remembering is not None:
+        first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
+        if self._adaptive is not None and stimuli:
+            counts = (agent.calibrates or is_warm_up) and not read.is_burst
+            self._adaptive.see(Trial(delivered, read.x_hz, x, first_s, at_s, read.is_burst, counts))
+        if (remembering := self._remembering) is not None:
+            before = self._remembered
             if stimuli:
-                first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
-                self._remembered = loop.remembering.after(
-                    self._remembered, delivered, x, first_s, at_s, is_burst=read.is_burst
-                )
-            tick["neurons"] = loop.remembering.observed(self._remembered)
-        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
-            self._adaptive.add(delivered, read.x_hz)
+                self._remembered = remembering.after(before, delivered, x, first_s, at_s, is_burst=read.is_burst)
+            tick["neurons"] = remembering.observed(self._remembered)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:
