@@ -211,7 +211,7 @@ def is_shuffled(environment: Environment[Any]) -> bool:
 def _recorded(simulator: MemorySimulator) -> Float[np.ndarray, "responses 2"]:
     """The histories of all recorded responses, by rising trace."""
     histories = np.asarray(simulator.histories)[np.isfinite(np.asarray(simulator.before))]
-    return histories[np.argsort(histories[:, 0], kind="stable")]
+    return np.asarray(histories[np.argsort(histories[:, 0], kind="stable")])
 
 
 def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histories 2"]:
