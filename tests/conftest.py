@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import itertools
 import os
 import signal
+import sys
+import threading
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -39,21 +43,62 @@ settings.load_profile("the same")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile soon, in this process and all that it starts; long oracles train for minutes, compiled as users are."""
+    """Compile soon, in this process and all that it starts; long oracles train for minutes, compiled as users are.
+
+    Bytecode is kept as in any usual shell, also where the environment says otherwise: each of the processes that tests
+    start would compile animat anew, and each worker rewrite all assertions.
+    """
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     asked = config.getoption("markexpr")
     if asked and "long" not in asked.replace("not long", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SOON_COMPILED}"
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
     """Collect without looking for garbage: hardly anything is, and looking took a third of the time."""
     gc.disable()
     try:
+        import_from_the_last_to_the_first(session.config)
         return (yield)
     finally:
         gc.freeze()
         gc.enable()
+
+
+def import_from_the_last_to_the_first(config: pytest.Config) -> None:
+    """In every other worker, where all tests are run: of two, each rewrites the assertions of half of the files.
+
+    What one has rewritten, the other finds on disk; in the same order both would rewrite all of them.
+    """
+    worker = getattr(config, "workerinput", {"workerid": "gw0"})["workerid"]
+    if int(worker[2:]) % 2 == 0 or [Path(each).resolve() for each in config.args] != [Path(__file__).parent]:
+        return
+    for file in sorted(Path(__file__).parent.glob("test_*.py"), reverse=True):
+        # What is wrong is told where it is collected.
+        with suppress(Exception, pytest.skip.Exception):
+            importlib.import_module(file.stem)
+
+
+def keep_contexts() -> None:
+    """Let each thread put all its programs together in one context: JAX sets up another for each, a third of the time.
+
+    It has no option for that. Where its insides have other names, it does as usual, and the tests take longer.
+    """
+    try:
+        from jax._src.interpreters import mlir
+
+        make, kept = mlir.make_ir_context, threading.local()
+    except (ImportError, AttributeError):
+        return
+
+    def context_of_this_thread() -> object:
+        if not hasattr(kept, "context"):
+            kept.context = make()
+        return kept.context
+
+    mlir.make_ir_context = context_of_this_thread
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -63,6 +108,7 @@ def caches() -> Iterator[None]:
     from animat.compilation import keep_compilations, pynwb_importable
 
     keep_compilations()
+    keep_contexts()
     with pynwb_importable():
         yield
 

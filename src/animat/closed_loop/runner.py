@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -9,6 +11,7 @@ from jaxtyping import Float64, UInt8
 from numpy.typing import ArrayLike
 
 from animat.errors import InvalidArgument
+from animat.late import jax
 from animat.robots.base import Robot, capability
 from animat.robots.host import Bodies, HostRobot
 from animat.wrappers import other_goal
@@ -43,6 +46,26 @@ class Runner(Protocol):
         """Give the robot another goal, the same number the same one; returns what is observed."""
 
 
+@lru_cache(maxsize=8)
+def _compiled(robot: Robot[Any]) -> tuple[Callable[..., Any], ...]:
+    """A step, a start, and another goal: one program for every runner of this robot."""
+
+    def stepped(uniforms: Any, state: Any, u: Any) -> tuple[Any, Any, Any, Any]:
+        after, reward, terminated = robot.advance(uniforms, state, u)
+        return after, reward, terminated, robot.observe(after)
+
+    def started(key: Any, number: int) -> tuple[Any, Any]:
+        state = robot.reset(jax.random.fold_in(key, number))
+        return state, robot.observe(state)
+
+    def switched(key: Any, number: int, state: Any) -> tuple[Any, Any]:
+        other = other_goal(robot, state, jax.random.fold_in(key, number))
+        after = capability(robot, "with_goal_of")(state, other)
+        return after, robot.observe(after)
+
+    return jax.jit(stepped), jax.jit(started), jax.jit(switched)
+
+
 class RobotRunner:
     """A robot with its state; its step is compiled once, before the first one, and takes some 30 us.
 
@@ -52,23 +75,8 @@ class RobotRunner:
     """
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
-        import jax
-
-        def stepped(uniforms: Any, state: Any, u: Any) -> tuple[Any, Any, Any, Any]:
-            after, reward, terminated = robot.advance(uniforms, state, u)
-            return after, reward, terminated, robot.observe(after)
-
-        def started(key: Any, number: int) -> tuple[Any, Any]:
-            state = robot.reset(jax.random.fold_in(key, number))
-            return state, robot.observe(state)
-
-        def switched(key: Any, number: int, state: Any) -> tuple[Any, Any]:
-            other = other_goal(robot, state, jax.random.fold_in(key, number))
-            after = capability(robot, "with_goal_of")(state, other)
-            return after, robot.observe(after)
-
         self.robot, self._rng = robot, rng
-        self._step, self._start, self._switch = jax.jit(stepped), jax.jit(started), jax.jit(switched)
+        self._step, self._start, self._switch = _compiled(robot)
         self._key = jax.random.key(int(rng.integers(2**31)))
         # Goals are those of starts that no episode has.
         self._goals = jax.random.split(self._key)[1]

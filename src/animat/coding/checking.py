@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from animat.coding.mapping import N_PERCENTILES, Mapping
 from animat.errors import InvalidArgument, first_line, shown
+from animat.late import jax
 
 _RESPONSES_HZ = np.linspace(0.0, 12.0, 25, dtype=np.float32)
 _PERCENTILES_HZ = {
@@ -36,6 +39,13 @@ def check_mapping(mapping: Mapping) -> None:
         raise InvalidArgument(
             f"{kind}: expected a frozen dataclass of plain parameters ({first_line(error)})"
         ) from error
+    _check_commands(mapping)
+
+
+@lru_cache(maxsize=64)
+def _check_commands(mapping: Mapping) -> None:
+    """Once for each mapping: it is compiled."""
+    kind, compiled = type(mapping).__name__, jax.jit(mapping.command)
     for where, percentiles in _PERCENTILES_HZ.items():
         u = _commands(mapping, _RESPONSES_HZ, percentiles)
         _expect_commands(kind, u, where)
@@ -46,7 +56,7 @@ def check_mapping(mapping: Mapping) -> None:
                     f"{kind}.command: expected the same for one response as among several, {u[i]:g}, got "
                     f"{shown(one.tolist())}"
                 )
-        _expect_same(mapping, u, percentiles)
+        _expect_same(kind, compiled, u, percentiles)
 
 
 def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
@@ -74,17 +84,14 @@ def _expect_commands(kind: str, u: Any, where: str) -> None:
         )
 
 
-def _expect_same(mapping: Mapping, u: Any, percentiles: Any) -> None:
+def _expect_same(kind: str, compiled: Callable[..., Any], u: Any, percentiles: Any) -> None:
     """Training asks for commands under `jax.jit`, and a closed loop in numpy."""
-    import jax
-
-    kind = type(mapping).__name__
     try:
-        compiled = np.asarray(jax.jit(mapping.command)(_RESPONSES_HZ, percentiles))
+        same = np.asarray(compiled(_RESPONSES_HZ, percentiles))
     except Exception as error:
         raise InvalidArgument(f"{kind}.command: expected it to run under jax.jit, got {first_line(error)}") from error
-    if compiled.shape != u.shape or not np.allclose(compiled, u, atol=1e-4):
+    if same.shape != u.shape or not np.allclose(same, u, atol=1e-4):
         raise InvalidArgument(
             f"{kind}.command: expected the same under jax.jit as in numpy, {shown(u.tolist())}, got "
-            f"{shown(compiled.tolist())}"
+            f"{shown(same.tolist())}"
         )

@@ -17,7 +17,7 @@ from animat.coding.mapping import Thresholds
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import NeuronSimulator, Stored
+from animat.neurons.simulator import NeuronSimulator, Stored, placed
 from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
 
 CONTINUOUS_ACTIONS = 21
@@ -162,14 +162,13 @@ def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) 
     return CLASSES
 
 
-def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"]) -> Int[Array, "*histories"]:
+def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"]) -> Int[np.ndarray, "*histories"]:
     """Which class of histories each is remembered in, by its trace: of the recording's own, equally many are in each.
 
     The load is not told apart: in each class there are the loads that were recorded with such traces.
     """
-    ends = np.arange(1, CLASSES) / CLASSES
-    traces = _recorded(simulator)[:, 0]
-    return jnp.sum(jnp.asarray(history)[..., :1] >= jnp.quantile(traces, ends), axis=-1)
+    ends, traces = placed(np.arange(1, CLASSES) / CLASSES), placed(_recorded(simulator)[:, 0])
+    return np.asarray(np.sum(np.asarray(history)[..., :1] >= np.asarray(jnp.quantile(traces, ends)), axis=-1))
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
@@ -190,7 +189,7 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
     if is_one or not (isinstance(animat, Animat) and isinstance(simulator, MemorySimulator)):
         return [[commands_of(environment, simulator)]]
     levels, histories = _answers(animat, simulator, _histories(simulator))
-    levels, classes = np.asarray(levels), np.asarray(class_of(simulator, histories))
+    levels, classes = np.asarray(levels), class_of(simulator, histories)
     if is_shuffled(environment):
         # Whatever is chosen, any condition is delivered: one action stands for all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
@@ -209,16 +208,16 @@ def is_shuffled(environment: Environment[Any]) -> bool:
     return isinstance(environment, Wrapper) and is_shuffled(environment.inside)
 
 
-def _recorded(simulator: MemorySimulator) -> Float[Array, "responses 2"]:
+def _recorded(simulator: MemorySimulator) -> Float[np.ndarray, "responses 2"]:
     """The histories of all recorded responses, by rising trace."""
-    histories = jnp.asarray(simulator.histories)[jnp.isfinite(jnp.asarray(simulator.before))]
-    return histories[jnp.argsort(histories[:, 0])]
+    histories = np.asarray(simulator.histories)[np.isfinite(np.asarray(simulator.before))]
+    return np.asarray(histories[np.argsort(histories[:, 0], kind="stable")])
 
 
-def _histories(simulator: MemorySimulator) -> Float[Array, "classes histories 2"]:
+def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histories 2"]:
     """A few histories of each class, evenly spaced in rank among those that were recorded."""
     recorded = _recorded(simulator)
-    ends = np.searchsorted(np.asarray(class_of(simulator, recorded)), np.arange(CLASSES + 1))
+    ends = np.searchsorted(class_of(simulator, recorded), np.arange(CLASSES + 1))
     within = (np.arange(_PASTS) + 0.5) / _PASTS
     # In a class that none is in, only an episode's start can be: those next to it stand for it.
     rows = (ends[:-1, None] + within * np.diff(ends)[:, None]).astype(np.int64)

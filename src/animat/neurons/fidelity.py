@@ -89,7 +89,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
-    in_simulator = np.asarray(jnp.mean(x >= median_hz, axis=1), np.float64)
+    in_simulator = np.asarray(np.mean(np.asarray(x) >= median_hz, axis=1, dtype=np.float32), np.float64)
     return Fidelity(labels, in_data, in_simulator, above, responses.readouts.names)
 
 

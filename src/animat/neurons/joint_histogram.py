@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, quantile_of
+from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, placed, quantile_of, side_by_side
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -88,9 +88,9 @@ def fit_joint_histogram(
             order = np.lexsort((rng.random(len(rows)), responses.read_hz[rows, d]))
             ranks[condition, order, d] = np.arange(len(rows))
     return JointHistogramSimulator(
-        jnp.stack([each.cumulative for each in alone]),
-        jnp.stack([each.edges_hz for each in alone]),
-        jnp.asarray(ranks, jnp.float32),
-        jnp.asarray(counts, jnp.int32),
-        jnp.stack([each.percentiles for each in alone]),
+        side_by_side([each.cumulative for each in alone]),
+        side_by_side([each.edges_hz for each in alone]),
+        placed(ranks),
+        placed(counts, np.int32),
+        side_by_side([each.percentiles for each in alone]),
     )

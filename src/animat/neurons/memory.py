@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
 from animat.neurons.history import NO_MEMORY, Memory, Ranked, left_by
-from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical
+from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, placed
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -156,16 +156,16 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         values.values_hz,
         values.counts,
         values.percentiles,
-        jnp.asarray(before, jnp.float32),
-        jnp.asarray(histories, jnp.float32),
-        jnp.asarray(after, jnp.float32),
-        jnp.asarray(left, jnp.float32),
-        jnp.asarray(followers, jnp.int32),
-        jnp.asarray(np.rint(followers**memory.neighbour_exponent), jnp.int32),
-        jnp.asarray(toward, jnp.float32),
-        jnp.asarray(load.kept, jnp.float32),
-        jnp.float32(load.added),
-        *(jnp.float32(each) for each in memory),
+        placed(before),
+        placed(histories),
+        placed(after),
+        placed(left),
+        placed(followers, np.int32),
+        placed(np.rint(followers**memory.neighbour_exponent), np.int32),
+        placed(toward),
+        placed(load.kept),
+        placed(load.added),
+        *(placed(each) for each in memory),
     )
 
 

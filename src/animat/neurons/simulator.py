@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeAlias, final
 
@@ -202,7 +203,7 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
     # Whole counts are added up before dividing, so that the last share is exactly 1 and no empty bin is ever drawn.
     below = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
     cumulative = below / below[:, -1:]
-    return HistogramSimulator(jnp.asarray(cumulative, jnp.float32), jnp.asarray(edges), pooled_percentiles(responses))
+    return HistogramSimulator(placed(cumulative), placed(edges), pooled_percentiles(responses))
 
 
 def fit_empirical(responses: Responses, *, room: int | None = None) -> EmpiricalSimulator:
@@ -224,17 +225,14 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
         raise InvalidArgument(f"room: expected at least {counts.max()}, the largest condition's responses, got {room}")
     # Padded with the last one over and over.
     table = np.stack([np.concatenate([x, np.repeat(x[-1:], room - len(x), axis=0)]) for x in values])
-    return EmpiricalSimulator(
-        jnp.asarray(table, jnp.float32), jnp.asarray(counts, jnp.int32), pooled_percentiles(responses)
-    )
+    return EmpiricalSimulator(placed(table), placed(counts, np.int32), pooled_percentiles(responses))
 
 
 def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
     """A culture that always answers 0, beside the percentiles of the one that did not: the silent control."""
     conditions, readouts = simulator.n_conditions, simulator.percentiles.shape[:-1]
-    return EmpiricalSimulator(
-        jnp.zeros((conditions, 1, *readouts), jnp.float32), jnp.ones(conditions, jnp.int32), simulator.percentiles
-    )
+    zeros, counts = np.zeros((conditions, 1, *readouts)), np.ones(conditions)
+    return EmpiricalSimulator(placed(zeros), placed(counts, np.int32), simulator.percentiles)
 
 
 def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
@@ -246,12 +244,27 @@ def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
     pooled = each.reshape(-1, *each.shape[2:])
     pooled = pooled[jnp.argsort(pooled if pooled.ndim == 1 else pooled.mean(axis=1))]
     values = jnp.broadcast_to(pooled, (n, *pooled.shape))
-    return EmpiricalSimulator(values, jnp.full(n, len(pooled), jnp.int32), simulator.percentiles)
+    return EmpiricalSimulator(values, placed(np.full(n, len(pooled)), np.int32), simulator.percentiles)
 
 
 def pooled_percentiles(responses: Responses) -> Float[Array, "*readouts percentiles"]:
     """P0, P10, ..., P100 of the non-burst responses of all conditions together, interpolated linearly, in Hz."""
-    return jnp.asarray(np.percentile(_non_burst(responses), PERCENTILES, axis=0).T, jnp.float32)
+    return placed(np.percentile(_non_burst(responses), PERCENTILES, axis=0).T)
+
+
+def placed(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
+    """Numbers of the host as JAX has them, made of this kind (None: as they are) before they get there.
+
+    JAX would compile a program for each shape, also where it is not told the kind and nothing changes.
+    """
+    with np.errstate(over="ignore"):
+        array = np.asarray(values, kind)
+    return jnp.asarray(array, array.dtype)
+
+
+def side_by_side(leaves: Sequence[Any]) -> Array:
+    """`jnp.stack` of arrays that are ready, which are put together on the host: nothing is compiled."""
+    return placed(np.stack([np.asarray(leaf) for leaf in leaves]), None)
 
 
 def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts"]:

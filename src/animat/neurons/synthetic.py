@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from animat.errors import InvalidArgument
-from animat.neurons.simulator import PERCENTILES, HistogramSimulator
+from animat.neurons.simulator import PERCENTILES, HistogramSimulator, placed
 
 MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 """Mean responses to the five conditions, in the order of 5, 10, 20, 40 and 80 Hz."""
@@ -59,4 +58,4 @@ def synthetic_simulator(
 
     shares = np.clip(np.array(PERCENTILES) / 100, 1 / (n_responses + 1), n_responses / (n_responses + 1))
     percentiles_hz = [brentq(pooled, 0.0, 100 * float(means.max()), (share,)) for share in shares]
-    return HistogramSimulator(*(jnp.asarray(each, jnp.float32) for each in (cumulative, edges_hz, percentiles_hz)))
+    return HistogramSimulator(*(placed(each) for each in (cumulative, edges_hz, percentiles_hz)))

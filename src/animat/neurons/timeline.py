@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.simulator import NeuronSimulator, placed, side_by_side
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, other_stimulus
 from animat.responses.readouts import ALL, Readouts
@@ -98,12 +97,13 @@ class SimulatorTimeline:
     def at(self, minute: float) -> NeuronSimulator:
         """The simulator in use at a minute of the culture's clock."""
         row = self.row_at(minute)
-        return jax.tree.map(lambda stacked: stacked[row], self.simulators)  # type: ignore[no-any-return]
+        # Taken out on the host: JAX would compile programs for each shape.
+        return jax.tree.map(lambda stacked: placed(np.asarray(stacked)[row], None), self.simulators)  # type: ignore[no-any-return]
 
     def with_first_percentiles(self) -> SimulatorTimeline:
         """The same simulators with the first recording's percentiles fixed, for mappings that do not move along."""
-        percentiles = self.simulators.percentiles
-        held = jnp.broadcast_to(percentiles[:1], percentiles.shape)
+        percentiles = np.asarray(self.simulators.percentiles)
+        held = placed(np.broadcast_to(percentiles[:1], percentiles.shape), None)
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
 
 
@@ -176,7 +176,7 @@ def fit_timeline(
         "burst_threshold": first.burst_threshold,
         "burst_thresholds": [float(responses.threshold) for responses in ordered],
     }
-    simulators = jax.tree.map(lambda *leaves: jnp.stack(leaves), *fitted)
+    simulators = jax.tree.map(lambda *leaves: side_by_side(leaves), *fitted)
     same = first.conditions, first.window_ms, first.presentation
     return SimulatorTimeline(simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts)
 

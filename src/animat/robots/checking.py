@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,13 @@ def check_robot(robot: Robot[Any]) -> None:
     name = _named(robot)
     if isinstance(robot, HostRobot):
         _check_on_host(robot)
-        return
+    else:
+        _check_compiled(robot, name)
+
+
+@lru_cache(maxsize=64)
+def _check_compiled(robot: Robot[Any], name: str) -> None:
+    """Once for each robot: compiling its episode takes some tenths of a second."""
     observations, noise = len(robot.observation_spec), robot.noise_size
     one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)

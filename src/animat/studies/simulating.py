@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, final
 
-import jax.numpy as jnp
 import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, UnusableData
@@ -15,7 +14,7 @@ from animat.neurons.fidelity import Fidelity
 from animat.neurons.history import AT_FIRST
 from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, placed
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
@@ -189,4 +188,4 @@ def _simulators(kind: str, arrays: dict[str, np.ndarray]) -> NeuronSimulator:
         arrays["toward"] = np.tile(np.array([1.0, 0.0], np.float32), (*before.shape[:2], 1))
         arrays["kept"] = np.ones(before.shape[:2], np.float32)
         arrays["added"] = arrays["load_s"] = np.zeros_like(decay)
-    return _KINDS[kind](**{name: jnp.asarray(array) for name, array in arrays.items()})
+    return _KINDS[kind](**{name: placed(array, None) for name, array in arrays.items()})
