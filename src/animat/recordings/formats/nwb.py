@@ -98,7 +98,7 @@ def write_nwb(
 
 @lru_cache(maxsize=1)
 def _types() -> Any:
-    """What pynwb knows of NWB's types, with what it finds out as it writes: the next file takes a fifth less time."""
+    """What pynwb knows of NWB's types, with what it finds out as it writes, which the next file need not."""
     import pynwb
 
     return pynwb.get_type_map()
