@@ -39,7 +39,27 @@ class Trial(NamedTuple):
     counts: bool
 
 
-class LevelThresholds:
+class FixedThresholds:
+    """Whatever is answered, they stay as they are; what adapts builds on that.
+
+    Attributes:
+        seen: how many trials they have adapted to, or will have when they are asked for.
+    """
+
+    seen = 0
+
+    def see(self, trial: Trial) -> None:
+        """The next trial of a session."""
+
+    def adapt(self) -> None:
+        """Adapt to what was seen: when there is time for it, and not while a trial is answered."""
+
+    def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
+        """P0, P10, ..., P100 as they are now, in Hz, shape (11,), or (readouts, 11), once any trial was seen."""
+        raise NotImplementedError
+
+
+class LevelThresholds(FixedThresholds):
     """The percentiles of a recording, times how large responses are now beside what its simulator expects.
 
         level = m / e;    m' = m + (x - m) / 200;    e' = e + (E - e) / 200
@@ -58,16 +78,14 @@ class LevelThresholds:
         self._remembering, self._remembered = remembering, Remembered()
         self._mean_hz = self._expected_hz = np.concatenate(responses_hz).mean(axis=0)
         self._trials: list[Trial] = []
-        self.seen = 0
 
     def see(self, trial: Trial) -> None:
         """The next trial, also one that does not count: it is part of the next one's history."""
         self._trials.append(trial)
         self.seen += trial.counts
 
-    def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
-        """P0, P10, ..., P100 as they are now, in Hz, shape (11,), or (readouts, 11)."""
-        # Only now: while a trial is answered there is no time for it.
+    def adapt(self) -> None:
+        """Adapt to what was seen: some 40 us a trial."""
         for condition, x_hz, rate_hz, first_s, at_s, is_burst, counts in self._trials:
             before = self._remembered
             if counts:
@@ -76,11 +94,15 @@ class LevelThresholds:
                 self._expected_hz = self._expected_hz + (expected_hz - self._expected_hz) / LEVEL_TRIALS
             self._remembered = self._remembering.after(before, condition, rate_hz, first_s, at_s, is_burst=is_burst)
         self._trials.clear()
+
+    def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
+        """Those of the recording, times the level."""
+        self.adapt()
         level = self._mean_hz / np.maximum(self._expected_hz, 1e-9)
         return np.asarray(np.expand_dims(level, -1) * self._recorded_hz, np.float32)
 
 
-class AdaptiveThresholds:
+class AdaptiveThresholds(FixedThresholds):
     """The newest responses of each condition, and the percentiles of all of them together: without memory.
 
     A culture drifts and tires: minutes after a recording its responses to all conditions are smaller, and more of them
@@ -97,7 +119,6 @@ class AdaptiveThresholds:
     def __init__(self, responses_hz: Sequence[Float64[np.ndarray, "responses *readouts"]]) -> None:
         part = min(1.0, MOST_COUNTED / max(len(each) for each in responses_hz))
         self._newest = [deque(each, maxlen=max(1, round(part * len(each)))) for each in responses_hz]
-        self.seen = 0
 
     def see(self, trial: Trial) -> None:
         """The next trial of a session."""
@@ -110,7 +131,7 @@ class AdaptiveThresholds:
         self.seen += 1
 
     def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
-        """P0, P10, ..., P100 of all together, in Hz, shape (11,), or (readouts, 11)."""
+        """Of all together."""
         return _percentiles(self._newest)
 
 
@@ -121,10 +142,10 @@ def _percentiles(responses_hz: Sequence[Sequence[Any]]) -> Float32[np.ndarray, "
 
 def thresholds_of(
     responses_hz: Sequence[Float64[np.ndarray, "responses *readouts"]] | None, remembering: Remembering | None
-) -> LevelThresholds | AdaptiveThresholds | None:
-    """What thresholds adapt by; None: they are fixed, as no responses are given to start from."""
+) -> FixedThresholds:
+    """Thresholds that adapt to a recording's responses to start from, and fixed ones where none are given."""
     if responses_hz is None:
-        return None
+        return FixedThresholds()
     if remembering is None or remembering.expected is None:
         return AdaptiveThresholds(responses_hz)
     return LevelThresholds(responses_hz, remembering)

@@ -73,12 +73,11 @@ class Driver:
         runs = HostRunner if isinstance(loop.robot, HostRobot) else RobotRunner
         self._runner: Runner = runs(loop.robot, np.random.default_rng([seed, 22]))
         if any(agent.switch_at is not None for agent in agents):
-            # Compiled now, as its step is.
-            self._runner.switch_goal(0)
+            self._runner.switch_goal(0)  # Compiled now, as its step is.
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         seeing = any(agent.sees_neurons(n) for agent in agents for n in range(len(turns)))
         self._remembering = loop.remembering if seeing else None
-        self._adaptive = thresholds_of(loop.adaptive_from, loop.remembering)
+        self._thresholds = thresholds_of(loop.adaptive_from, loop.remembering)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
         self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
@@ -126,13 +125,14 @@ class Driver:
         controller = agent.acting(turn)
         observation = self._start(episode, turn)
         self._last_command = self._at_rest
+        self._thresholds.adapt()
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
         self._warm_up(agent, episode)
-        if self._adaptive is not None and self._adaptive.seen:
+        if self._thresholds.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
-            self._percentiles = self._adaptive.percentiles()
+            self._percentiles = self._thresholds.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         self.standing.begin(agent.name)
@@ -253,9 +253,9 @@ class Driver:
         }
         self._presented += 1
         first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
-        if self._adaptive is not None and stimuli:
+        if stimuli:
             counts = (agent.calibrates or is_warm_up) and not read.is_burst
-            self._adaptive.see(Trial(delivered, read.x_hz, x, first_s, at_s, read.is_burst, counts))
+            self._thresholds.see(Trial(delivered, read.x_hz, x, first_s, at_s, read.is_burst, counts))
         if (remembering := self._remembering) is not None:
             before = self._remembered
             if stimuli:
