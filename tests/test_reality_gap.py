@@ -18,7 +18,7 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from animat.cli import main
-from animat.closed_loop.adaptive import Trial, thresholds_of
+from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import CouplingController, HeuristicController
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
@@ -270,17 +270,16 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
 def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_it(without_controls: Ran) -> None:
     gap, policies, told = without_controls
     assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
-    thresholds = thresholds_of(gap.loop.adaptive_from, gap.loop.remembering)
-    p50_hz, passed = gap.loop.percentiles[5], list[bool]()
+    assert gap.loop.adaptive_from is not None
+    thresholds, p50_hz, passed = AdaptiveThresholds(gap.loop.adaptive_from), gap.loop.percentiles[5], []
     ticks, episode = [tick for tick in gap.session.ticks if tick.agent in policies], -1
     for tick in gap.session.ticks:
         if tick.episode != episode:
             episode, p50_hz = tick.episode, thresholds.percentiles()[5] if thresholds.seen else p50_hz
         if tick.agent in policies:
             passed.append(tick.rate_hz >= p50_hz)
-        x_hz, first_s, at_s = np.asarray(tick.rate_hz), tick.pulse_time_s[0], tick.read_after_s
-        told_of = tick.delivered, x_hz, tick.rate_hz, first_s, at_s, tick.is_burst
-        thresholds.see(Trial(*told_of, counts=not tick.is_burst))
+        if not tick.is_burst:
+            thresholds.add(tick.delivered, tick.rate_hz)
     found = answered(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.passed, passed)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])

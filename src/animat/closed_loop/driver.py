@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.adaptive import Trial, thresholds_of
+from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import Agent, Controller, InTurn
 from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.log import Record
@@ -73,17 +73,17 @@ class Driver:
         runs = HostRunner if isinstance(loop.robot, HostRobot) else RobotRunner
         self._runner: Runner = runs(loop.robot, np.random.default_rng([seed, 22]))
         if any(agent.switch_at is not None for agent in agents):
-            self._runner.switch_goal(0)  # Compiled now, as its step is.
+            # Compiled now, as its step is.
+            self._runner.switch_goal(0)
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
-        seeing = any(agent.sees_neurons(n) for agent in agents for n in range(len(turns)))
-        self._remembering = loop.remembering if seeing else None
-        self._thresholds = thresholds_of(loop.adaptive_from, loop.remembering)
+        self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
         self._dealer = Dealer(loop.encoder, culture.patterns[: loop.patterns], self._rng)
         self._begun: Counter[str] = Counter()
         self._presented = self._stretches = 0
-        self._zero_s = self._seen_until_s = self._last_pulse_s = self._data_at_s = self._wall_zero_s = 0.0
+        self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
+        self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
         self._remembered = Remembered()
         self._given: dict[str, list[int]] = {}
@@ -125,18 +125,17 @@ class Driver:
         controller = agent.acting(turn)
         observation = self._start(episode, turn)
         self._last_command = self._at_rest
-        self._thresholds.adapt()
         self._see((), loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
         self._warm_up(agent, episode)
-        if self._thresholds.seen:
+        if self._adaptive is not None and self._adaptive.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
-            self._percentiles = self._thresholds.percentiles()
+            self._percentiles = self._adaptive.percentiles()
             told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
             self.records.append(Record(told))
         self.standing.begin(agent.name)
-        given, remembering = list[int](), self._remembering if agent.sees_neurons(turn) else None
+        given, remembering = list[int](), loop.remembering if agent.sees_neurons(turn) else None
         source = self._source_of(agent)
         for iteration in range(loop.robot.episode_limit):
             seen = observation if remembering is None else remembering.beside(observation, self._remembered)
@@ -252,15 +251,15 @@ class Driver:
             **read.told,
         }
         self._presented += 1
-        first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
-        if stimuli:
-            counts = (agent.calibrates or is_warm_up) and not read.is_burst
-            self._thresholds.see(Trial(delivered, read.x_hz, x, first_s, at_s, read.is_burst, counts))
-        if (remembering := self._remembering) is not None:
-            before = self._remembered
+        if loop.remembering is not None:
             if stimuli:
-                self._remembered = remembering.after(before, delivered, x, first_s, at_s, is_burst=read.is_burst)
-            tick["neurons"] = remembering.observed(self._remembered)
+                first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
+                self._remembered = loop.remembering.after(
+                    self._remembered, delivered, x, first_s, at_s, is_burst=read.is_burst
+                )
+            tick["neurons"] = loop.remembering.observed(self._remembered)
+        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
+            self._adaptive.add(delivered, read.x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:

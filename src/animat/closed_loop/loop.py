@@ -93,8 +93,7 @@ class Loop:
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
         readouts: groups of channels that are read, by their electrodes: one for each command of the robot.
-        remembering: how responses become the history state, for agents that see it and for adaptive thresholds, which
-            take a response beside what was to be expected after its history; None: for neither.
+        remembering: how responses become the history state, for agents that see it; None: nobody does.
 
     Raises:
         InvalidArgument: for a setting that cannot be.

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.expected import Expected
 from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by, ranks_among
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
@@ -34,23 +32,21 @@ class Remembering:
         added: what a trial adds to the load.
         sorted_hz: non-burst responses of that recording, all channels as one, rising, shape (responses,).
         mean_ranks: of each condition's, shape (conditions,).
-        expected: what that simulator answers on average; None for one without memory.
     """
 
     memory: Memory
     added: float
     sorted_hz: Float64[np.ndarray, " responses"]
     mean_ranks: Float64[np.ndarray, " conditions"]
-    expected: Expected | None = None
 
     @classmethod
     def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
         """As a simulator of these responses remembers."""
         ranked = Ranked(responses)
-        memory, added, expected = NO_MEMORY, 0.0, None
+        memory, added = NO_MEMORY, 0.0
         if isinstance(simulator, MemorySimulator):
-            memory, added, expected = simulator.memory, float(simulator.added), Expected.of(simulator)
-        return cls(memory, added, ranked.sorted_hz, ranked.means, expected)
+            memory, added = simulator.memory, float(simulator.added)
+        return cls(memory, added, ranked.sorted_hz, ranked.means)
 
     def after(
         self, before: Remembered, condition: int, rate_hz: float, first_s: float, at_s: float, *, is_burst: bool
@@ -63,27 +59,13 @@ class Remembering:
             first_s, at_s: its first and its last pulse, s.
             is_burst: whether the response was a burst, after which nothing is known of the trace.
         """
-        trace, load = self._when_it_comes(before, first_s, at_s)
+        trace = 0.0 if first_s - before.at_s > SILENCE_S else before.trace
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         (more,) = left_by(rank, float(self.mean_ranks[condition]), self.memory).tolist()
         trace = 0.5 if is_burst else self.memory.decay * trace + more
-        return Remembered(float(trace), load + self.added, at_s)
-
-    def expected_hz(
-        self, before: Remembered, condition: int, first_s: float, at_s: float
-    ) -> Float64[np.ndarray, " readouts"]:
-        """What the recording's simulator, which has memory, answers to a trial on average, Hz a channel.
-
-        Args:
-            before, condition, first_s, at_s: as of `after`.
-        """
-        assert self.expected is not None
-        return self.expected.mean_hz(condition, *self._when_it_comes(before, first_s, at_s))
-
-    def _when_it_comes(self, before: Remembered, first_s: float, at_s: float) -> tuple[float, float]:
-        """Trace and load as a trial finds them."""
-        trace, load_s = 0.0 if first_s - before.at_s > SILENCE_S else before.trace, self.memory.load_s
-        return trace, before.load * math.exp((before.at_s - at_s) / load_s) if load_s else before.load
+        load_s = self.memory.load_s
+        load = before.load * np.exp((before.at_s - at_s) / load_s) + self.added if load_s else before.load
+        return Remembered(float(trace), float(load), at_s)
 
     def observed(self, state: Remembered) -> tuple[float, float]:
         """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""

@@ -120,7 +120,7 @@ def run_policies(
         settings["adaptive_from"] = calibration.responses_hz
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
-    if first.neural_observation or (adaptive and calibration.simulator.has_memory):
+    if first.neural_observation:
         settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
