@@ -93,7 +93,9 @@ def keep_contexts() -> None:
     except (ImportError, AttributeError):
         return
 
-    def context_of_this_thread() -> object:
+    def context_of_this_thread(*given: object, **named: object) -> object:
+        if given or named:
+            return make(*given, **named)
         if not hasattr(kept, "context"):
             kept.context = make()
         return kept.context

@@ -43,6 +43,14 @@ def is_folder(path: Path) -> bool:
         return False
 
 
+def is_nothing(path: Path) -> bool:
+    """Whether no file or folder has this name; it is no error where the system cannot have such a name."""
+    try:
+        return not path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
     """The text of a file, in UTF-8; raises InvalidFile for what is no file of text, or a larger one."""
     path = expect_plain_file(path, most_bytes)

@@ -125,8 +125,8 @@ def _run(given: list[str]) -> int:
         again = (
             "; start again to go on"
             if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile)
-            else "; a session is not gone on with: start another in a folder of its own"
-            if isinstance(command, Run)
+            else "; a session cannot be resumed: start a new one in another folder"
+            if isinstance(command, Run) and (command.out / "session.log").exists()
             else ""
         )
         print(f"animat: interrupted{kept}{again}", file=sys.stderr)

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for
 from animat.errors import InvalidArgument, InvalidFile
+from animat.plain_file import is_nothing
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Replay(Fitting):
             )
         if self.robot is not None:
             REGISTRY.name_of(self.robot)
-        if not self.source.exists():
+        if is_nothing(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
             if self.recordings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
@@ -76,7 +76,9 @@ class RobotRunner:
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
         self.robot, self._rng = robot, rng
-        self._step, self._start, self._switch = _compiled(robot)
+        # A robot that cannot be hashed has programs of its own.
+        compiled = _compiled if isinstance(robot, Hashable) else _compiled.__wrapped__
+        self._step, self._start, self._switch = compiled(robot)
         self._key = jax.random.key(int(rng.integers(2**31)))
         # Goals are those of starts that no episode has.
         self._goals = jax.random.split(self._key)[1]

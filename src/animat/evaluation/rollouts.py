@@ -20,7 +20,7 @@ from animat.errors import InvalidArgument, shown
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
-from animat.neurons.simulator import NeuronSimulator, side_by_side
+from animat.neurons.simulator import NeuronSimulator, stacked
 from animat.robots.base import MOST_AT_ONCE
 from animat.robots.host import HostRobot
 from animat.tables import briefly
@@ -153,10 +153,10 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
         if [w.shape for w in policy.weights] != [w.shape for w in first.weights]:
             raise InvalidArgument("policies: expected networks of one shape, got several; evaluate them one by one")
     layers = (
-        Layer(side_by_side([p.weights[i] for p in policies]), side_by_side([p.biases[i][None] for p in policies]))
+        Layer(stacked([p.weights[i] for p in policies]), stacked([p.biases[i][None] for p in policies]))
         for i in range(len(first.weights))
     )
-    return Networks(tuple(layers), side_by_side([np.asarray(p.scales, np.float32) for p in policies]), greedy)
+    return Networks(tuple(layers), stacked([np.asarray(p.scales, np.float32) for p in policies]), greedy)
 
 
 def roll_out(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, placed, quantile_of, side_by_side
+from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, placed, quantile_of, stacked
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -88,9 +88,9 @@ def fit_joint_histogram(
             order = np.lexsort((rng.random(len(rows)), responses.read_hz[rows, d]))
             ranks[condition, order, d] = np.arange(len(rows))
     return JointHistogramSimulator(
-        side_by_side([each.cumulative for each in alone]),
-        side_by_side([each.edges_hz for each in alone]),
+        stacked([each.cumulative for each in alone]),
+        stacked([each.edges_hz for each in alone]),
         placed(ranks),
         placed(counts, np.int32),
-        side_by_side([each.percentiles for each in alone]),
+        stacked([each.percentiles for each in alone]),
     )

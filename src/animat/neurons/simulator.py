@@ -259,10 +259,10 @@ def placed(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
     """
     with np.errstate(over="ignore"):
         array = np.asarray(values, kind)
-    return jnp.asarray(array, array.dtype)
+    return jnp.asarray(array, jax.dtypes.canonicalize_dtype(array.dtype))
 
 
-def side_by_side(leaves: Sequence[Any]) -> Array:
+def stacked(leaves: Sequence[Any]) -> Array:
     """`jnp.stack` of arrays that are ready, which are put together on the host: nothing is compiled."""
     return placed(np.stack([np.asarray(leaf) for leaf in leaves]), None)
 

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.simulator import NeuronSimulator, placed, side_by_side
+from animat.neurons.simulator import NeuronSimulator, placed, stacked
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, other_stimulus
 from animat.responses.readouts import ALL, Readouts
@@ -98,7 +98,7 @@ class SimulatorTimeline:
         """The simulator in use at a minute of the culture's clock."""
         row = self.row_at(minute)
         # Taken out on the host: JAX would compile programs for each shape.
-        return jax.tree.map(lambda stacked: placed(np.asarray(stacked)[row], None), self.simulators)  # type: ignore[no-any-return]
+        return jax.tree.map(lambda each: placed(np.asarray(each)[row], None), self.simulators)  # type: ignore[no-any-return]
 
     def with_first_percentiles(self) -> SimulatorTimeline:
         """The same simulators with the first recording's percentiles fixed, for mappings that do not move along."""
@@ -176,7 +176,7 @@ def fit_timeline(
         "burst_threshold": first.burst_threshold,
         "burst_thresholds": [float(responses.threshold) for responses in ordered],
     }
-    simulators = jax.tree.map(lambda *leaves: side_by_side(leaves), *fitted)
+    simulators = jax.tree.map(lambda *leaves: stacked(leaves), *fitted)
     same = first.conditions, first.window_ms, first.presentation
     return SimulatorTimeline(simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts)
 

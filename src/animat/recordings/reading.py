@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.plain_file import expect_plain_file, is_folder
+from animat.plain_file import expect_plain_file, is_folder, is_nothing
 from animat.recordings.apart import read_hdf5_apart
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
@@ -225,9 +224,8 @@ def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
 
 def _files(path: Path) -> list[Path]:
     if not is_folder(path):
-        with suppress(OSError, ValueError):
-            if not path.exists():
-                raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
+        if is_nothing(path):
+            raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
         return [expect_plain_file(path)]
     try:
         # A folder that cannot be read looks empty to glob.

@@ -8,7 +8,6 @@ import math
 import os
 from collections.abc import Mapping as Dict
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +22,7 @@ from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import AT_FIRST
-from animat.plain_file import expect_plain_file, is_folder
+from animat.plain_file import expect_plain_file, is_folder, is_nothing
 from animat.records import Number, read_record
 from animat.responses.condition import Condition, abbreviated
 from animat.responses.readouts import ALL, Readouts
@@ -379,11 +378,8 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     """
     path = Path(path)
     if not is_folder(path):
-        with suppress(OSError, ValueError):
-            if not path.exists():
-                raise InvalidFile(
-                    f"{path}: expected a policy file or a folder of them, got no such file; train them first"
-                )
+        if is_nothing(path):
+            raise InvalidFile(f"{path}: expected a policy file or a folder of them, got no such file; train them first")
         return {path.stem: Policy.load(path)}
     # Hidden files are unfinished ones: a process was killed while it wrote them.
     whole = [file for file in path.glob("*.safetensors") if not file.name.startswith(".")]
