@@ -450,6 +450,14 @@ BAD = {
     "a pipe": (pipe, ["inspect", "{folder}/pipe"], ["pipe: expected a file, got a device or a pipe"]),
     "a protocol that is a pipe": (pipe, ["record", "--protocol", "{folder}/pipe"], ["expected a file"]),
     "a name that is too long": (nothing, ["inspect", "a" * 5000], ["File name too long"]),
+    **{
+        f"a name that is too long for {command}": (nothing, [command, *arguments, "a" * 300], ["File name too long"])
+        for command, arguments in (
+            ("replay", []),
+            ("record", ["--culture", "synthetic", "--out"]),
+            ("train", ["cartpole", "--recordings", "{recordings}", "--out"]),
+        )
+    },
     "an empty text for a folder": (
         nothing,
         ["record", "--culture", "synthetic", "--out", ""],

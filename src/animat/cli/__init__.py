@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import importlib.metadata
 import io
 import itertools
@@ -135,6 +136,9 @@ def _run(given: list[str]) -> int:
     except BrokenPipeError:
         raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+            print(f"animat: {str(error.filename)[:60]}...: {error.strerror}; choose a shorter name", file=sys.stderr)
+            return 1
         words = out_of_memory(error)
         if words is None:
             raise
