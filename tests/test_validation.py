@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -407,10 +408,14 @@ def neighbours(responses: Responses, first: list[int], read_hz: np.ndarray) -> C
     a, b = np.asarray(simulator.toward, np.float64).T
     expected = [[a[c] * traces[p] + b[c] * scale * loads[p] for p in range(len(ranks))] for c in range(len(means))]
 
-    def drawn(i: int, c: int) -> list[float]:
+    @cache
+    def ordered(c: int) -> tuple[list[int], np.ndarray, np.ndarray]:
         rows = [k for k in first if responses.condition[k] == c and not np.isnan(responses.last_hz[k])]
         at = np.array([np.float32(expected[c][place[k]]) for k in rows])
-        order = np.argsort(at, kind="stable")
+        return rows, at, np.argsort(at, kind="stable")
+
+    def drawn(i: int, c: int) -> list[float]:
+        rows, at, order = ordered(c)
         here = np.float32(expected[c][place[i]])
         k = int(np.rint(len(rows) ** exponent))
         smaller, no_larger = int(np.sum(at < here)), int(np.sum(at <= here))
