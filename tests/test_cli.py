@@ -399,6 +399,21 @@ BAD = {
         ["{folder}/policies", "another"],
     ),
     "a word for a number": (nothing, ["run", "--at-min", "x"], ["animat: --at-min: expected a number, got 'x'; see"]),
+    "recordings that are not there": (
+        nothing,
+        ["evaluate", "{policies}", "--recordings", "{folder}/nowhere"],
+        ["{folder}/nowhere: no such file or folder of recordings; animat record makes them"],
+    ),
+    "a table in place of a policy": (
+        lambda folder, *_: (folder / "p0.csv").write_text("time_s,rate_hz\n0.1,20\n"),
+        ["evaluate", "{folder}/p0.csv", "--recordings", "{recordings}"],
+        ["p0.csv: expected a policy, as animat train writes it"],
+    ),
+    "nothing to replay": (
+        nothing,
+        ["replay", "{folder}/nowhere"],
+        ["{folder}/nowhere: expected a session, a policy or a folder of policies, got no such file"],
+    ),
     "a part of a pulse": (
         nothing,
         ["run", "--budget-pulses", "1.5"],

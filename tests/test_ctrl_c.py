@@ -74,3 +74,16 @@ def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, cap
     assert animat(["record", "--out", str(tmp_path / "recordings")]) == 130
     assert capsys.readouterr().err.endswith("animat: interrupted; what was finished is kept; start again to go on\n")
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_interrupted_session_is_told_to_be_no_start_for_another(tmp_path, monkeypatch, capsys) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("animat.cli.run.Run.run", interrupted)
+    command = ["run", "policies", "--out", str(tmp_path)]
+    assert animat(command) == 130
+    assert capsys.readouterr().err == "animat: interrupted; what was finished is kept\n"
+    (tmp_path / "session.log").touch()
+    assert animat(command) == 130
+    assert capsys.readouterr().err.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
