@@ -178,7 +178,10 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
     record = ["record", "--culture", "synthetic", "--sessions", "2", "--out", str(series)]
     assert main([*record, "--json"]) == 0
-    assert len(last_json(capsys.readouterr().out)["recordings"]) == 2  # type: ignore[arg-type]
+    printed = capsys.readouterr().out
+    assert len(last_json(printed)["recordings"]) == 2 and "there already" not in printed  # type: ignore[arg-type]
+    assert main(record) == 0
+    assert f"2 recordings in {series}, which were there already" in capsys.readouterr().out
 
     assert main(["inspect", str(series), "--out", str(figures), "--json"]) == 0
     told = last_json(capsys.readouterr().out)["recordings"]
@@ -390,7 +393,7 @@ BAD = {
     "a policy for another robot": (
         nothing,
         ["evaluate", "{policies}", "--recordings", "{recordings}", "--robot", "navigation"],
-        ["navigation", "cartpole"],
+        ["{policies}, p0: expected a policy for navigation, got one for cartpole; give others, or no --robot"],
     ),
     "no policies": (nothing, ["evaluate", "{folder}", "--recordings", "{recordings}"], ["{folder}", "policies"]),
     "another training's folder": (

@@ -88,12 +88,14 @@ class Record:
                 file=sys.stderr,
             )
         _expect_no_others(self.out)
+        there = set(self.out.glob("*"))
         with Bar("recording") as progress:
             if self.culture == "synthetic":
                 files = self._synthetic(progress)
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
-        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}")
+        were_there = ", which were there already" if files and there.issuperset(files) else ""
+        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{were_there}")
         if protocol is not None and protocol.places:
             print("each place is a condition; --conditions frequency mixes the places")
         return {"recordings": [str(file) for file in files]}

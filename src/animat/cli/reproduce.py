@@ -17,7 +17,7 @@ class Ours:
 
     study: Literal["paper", "context"] = "paper"
     """paper: the paper's comparisons; context: which tasks need more than a reflex, what the policies do beyond one,
-    and whose work it is"""
+    and whose work it is; for a study of your own: animat study FILE"""
     quick: bool = False
     """Every step with fewer policies, iterations and recordings: a first look, no results"""
     culture_seed: str = "1"

@@ -124,10 +124,16 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
     policies = load_policies(path)
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
-            raise Mismatch(f"{name}: expected a policy for {expected}, got one for {policy.robot.name}")
+            raise Mismatch(
+                f"{path}, {name}: expected a policy for {expected}, got one for {policy.robot.name}; give others, "
+                "or no --robot"
+            )
         got = "none" if policy.mapping is None else policy.mapping.name
         if asked not in (None, got):
-            raise Mismatch(f"{name}: expected a policy with the mapping {asked}, got one with {got}")
+            raise Mismatch(
+                f"{path}, {name}: expected a policy with the mapping {asked}, got one with {got}; give others, or "
+                "no --mapping"
+            )
         if not is_ours(without_goal(policy.robot)):
             check_robot(policy.robot)
         if policy.mapping is not None and not is_ours(policy.mapping):

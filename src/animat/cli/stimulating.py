@@ -36,6 +36,9 @@ class Stimulating:
     """Without stimulation before each episode"""
     warm_up: int | None = None
     """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
+    settling: int | None = None
+    """How often a pause, and each condition six times, come before the first episode, for thresholds to adapt;
+    default: 10 with one pulse and adaptive thresholds, else 0"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""
 
@@ -46,7 +49,7 @@ class Stimulating:
 
     def _of_the_loop(self) -> dict[str, Any]:
         """Settings of the closed loop."""
-        names = ("on_burst", "on_late", "pause_s", "warm_up", "patience_s")
+        names = ("on_burst", "on_late", "pause_s", "warm_up", "settling", "patience_s")
         return {name: getattr(self, name) for name in names}
 
 

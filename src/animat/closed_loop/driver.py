@@ -125,10 +125,8 @@ class Driver:
         controller = agent.acting(turn)
         observation = self._start(episode, turn)
         self._last_command = self._at_rest
-        self._see((), loop.pause_s, self._now_s(), pause=True)
-        # The first pulse comes as if one had been given at the end of the pause.
-        self._last_pulse_s = self._now_s()
-        self._warm_up(agent, episode)
+        for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
+            self._warm_up(agent, episode, rounds)
         if self._adaptive is not None and self._adaptive.seen:
             # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
             self._percentiles = self._adaptive.percentiles()
@@ -182,9 +180,12 @@ class Driver:
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
         return observation
 
-    def _warm_up(self, agent: Agent, episode: int) -> None:
-        """Bring the culture to where its recordings were made: after a rest it answers otherwise than in them."""
-        for _ in range(0 if agent.delivery == "silent" else self._loop.warm_up or 0):
+    def _warm_up(self, agent: Agent, episode: int, rounds: int) -> None:
+        """A pause, then what brings the culture to where it was recorded: rested it answers otherwise."""
+        self._see((), self._loop.pause_s, self._now_s(), pause=True)
+        # The first pulse comes as if one had been given at the end of the pause.
+        self._last_pulse_s = self._now_s()
+        for _ in range(rounds):
             for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
                 self._present(agent, episode, -1, condition, condition, 0)
 
@@ -211,7 +212,7 @@ class Driver:
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
         stimuli: list[Stimulus] = []
-        if agent.delivery != "silent":
+        if agent.delivery != "silent" or is_warm_up:
             stimuli = [
                 Stimulus(float(t), on.electrodes, loop.pulse, frequency_hz, on.pattern, self._presented)
                 for t, on in zip(times_s, self._dealer.targets(delivered), strict=True)

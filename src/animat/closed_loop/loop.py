@@ -30,6 +30,8 @@ OnLate = Literal["continue", "stop"]
 
 MOST_WARM_UP = 100
 """Presentations of each condition in a warm-up: as many as a recording holds; more wears a culture out for nothing."""
+SETTLING_ROUNDS = 6
+"""Presentations of each condition after each pause of the settling: with five of them 2.3 s, next to a pause of 2 s."""
 
 
 class Trained(Protocol):
@@ -89,6 +91,9 @@ class Loop:
         warm_up: how often each condition is presented after that, in random order, before the robot moves: a culture
             that has rested answers otherwise than in a recording. The responses count for adaptive thresholds. None:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
+        settling: how often a pause comes before the first episode, each with a warm-up of `SETTLING_ROUNDS`: a
+            recording tires a culture more than a loop, which recovers in the first minute, and its thresholds lag
+            behind. None: 10 where thresholds adapt and an action is one pulse, else 0.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
@@ -115,6 +120,7 @@ class Loop:
     on_late: OnLate = "continue"
     pause_s: float = 2.0
     warm_up: int | None = None
+    settling: int | None = None
     patience_s: float = 10.0
     real_time: bool = False
     readouts: Readouts = ALL
@@ -145,8 +151,11 @@ class Loop:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         if self.warm_up is None:
             object.__setattr__(self, "warm_up", 2 if self.pulses == 1 else 0)
-        if not (isinstance(self.warm_up, int) and 0 <= self.warm_up <= MOST_WARM_UP):
-            raise InvalidArgument(f"warm_up: expected a whole number from 0 to {MOST_WARM_UP}, got {self.warm_up!r}")
+        if self.settling is None:
+            object.__setattr__(self, "settling", 10 if self.pulses == 1 and self.adaptive_from is not None else 0)
+        for name in ("warm_up", "settling"):
+            if not (isinstance(number := getattr(self, name), int) and 0 <= number <= MOST_WARM_UP):
+                raise InvalidArgument(f"{name}: expected a whole number from 0 to {MOST_WARM_UP}, got {number!r}")
         for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
@@ -154,6 +163,11 @@ class Loop:
             raise InvalidArgument("patience_s: expected above 0 s, got 0: nothing answers at once")
         if self.patterns is not None and self.patterns < 1:
             raise InvalidArgument(f"patterns: expected at least 1, got {self.patterns}")
+
+    def rounds_before(self, episode: int, *, is_silent: bool) -> list[int]:
+        """How often each condition is presented after each of the pauses before an episode."""
+        settling = self.settling if episode == 0 else 0
+        return [SETTLING_ROUNDS] * (settling or 0) + [0 if is_silent else self.warm_up or 0]
 
     @property
     def presentation(self) -> Presentation:

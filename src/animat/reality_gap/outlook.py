@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.closed_loop.loop import Loop
+from animat.closed_loop.loop import SETTLING_ROUNDS, Loop
 from animat.cultures.budget import Account
 from animat.reality_gap.calibration import Calibration
 from animat.responses.condition import RESTING
@@ -77,6 +77,9 @@ def outlook(
         presented = acted + (loop.warm_up or 0) * is_stimulated
         total_s += n * (loop.pause_s + float(presented @ interval_s))
         pulses += n * is_stimulated * loop.pulses * float(presented[gives].sum())
+    settling = loop.settling or 0
+    total_s += settling * (loop.pause_s + SETTLING_ROUNDS * float(interval_s.sum()))
+    pulses += settling * SETTLING_ROUNDS * loop.pulses * int(gives.sum())
     of, drift, since_min = account.budget.pulses, calibration.drift, calibration.start_min - now_min
     return Outlook(
         total_s / 60,

@@ -133,7 +133,7 @@ class RealityGap:
                 *(["-" if net is None else f"{net:.1f}" for net in (row.predicted_net, row.net)] if cost else []),
             ]
             cells.append([row.name, f"{told['predicted']:.1f}", anew, *measured, *counts, p, row.meaning])
-        interval = "95 % interval"
+        interval = "its 95 % interval"
         head = [
             "",
             "predicted",
@@ -146,7 +146,7 @@ class RealityGap:
             "pulses/action",
             "electrode pulses",
             *(("predicted net", "net") if cost else ()),
-            "p",
+            "p value",
             "",
         ]
         lines = [
@@ -167,7 +167,11 @@ class RealityGap:
         lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
-        lines.append(f"  p: two-sided Mann-Whitney test against this control; stimulation: {self.account}")
+        lines.append(
+            "  p value: that policies and this control have the same returns (Mann-Whitney test, two-sided); electrode "
+            "pulses: of a whole episode, one for each electrode of each pulse"
+        )
+        lines.append(f"  stimulation: {self.account}")
         lines.append(
             f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
             f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"

@@ -28,11 +28,11 @@ _POSTS = tuple((x, y, 0.015) for x1, y1, x2, y2 in _SCREENS for x, y in ((x1, y1
 @register_robot
 @record
 class Detour(Wheeled):
-    """Wheels in an arena in which the straight way from the start to the goal is always blocked (see `Wheeled`).
+    """Wheels in an arena in which the straight way from the start to the goal is always blocked.
 
-    A goal is drawn from the places that the robot can reach and cannot drive straight to: somewhere on the straight way
-    its body would touch a wall or an obstacle. By default the start is in the middle of four screens with a post at
-    both ends of each, and goals are behind the screens.
+    Sensors, commands and rewards are those of `Wheeled`. A goal is drawn from the places that the robot can reach and
+    cannot drive straight to: somewhere on the straight way its body would touch a wall or an obstacle. By default the
+    start is in the middle of four screens with a post at both ends of each, and goals are behind the screens.
 
     Raises:
         InvalidArgument: as `Wheeled`, and for surroundings in which no straight way is blocked.

@@ -14,7 +14,10 @@ from animat.robots.wheeled import Wheeled
 @register_robot
 @record
 class Wheels(Wheeled):
-    """Four round obstacles between the middle of an arena and goals anywhere in it (see `Wheeled`)."""
+    """Wheels, four round obstacles around the start, and goals anywhere in the arena.
+
+    Sensors, commands and rewards are those of `Wheeled`.
+    """
 
     obstacles: Obstacles = ((0.3, 0.3, 0.08), (0.72, 0.35, 0.06), (0.35, 0.72, 0.06), (0.7, 0.7, 0.08))
 

@@ -33,7 +33,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
 
     Args:
         path: of its folder or its log.
-        span_s: on the session's clock; None: its first minute.
+        span_s: on the session's clock; None: a minute from just before the robot moves first.
 
     Raises:
         InvalidFile: if there is no session, or its log cannot be read.
@@ -44,6 +44,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
     file = session.folder / LOG_FILE
     header, words = read_header(file, session.log.header), session.log.header
     from_s, to_s = span_s or (0.0, USUAL_S)
+    is_found = span_s is not None
     reading = _Reading(header.conditions)
     with expecting_a_session(file):
         reading.window_s = float(words["loop"]["window_ms"][1]) * 1e-3
@@ -52,6 +53,11 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
             if record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s:
                 break
             reading.add(record.words)
+            if not is_found and reading.moments:
+                # While it does not move, the film begins later and later.
+                is_found = reading.moments[-1].iteration >= 0
+                from_s = max(0.0, reading.moments[-1].time_s - LOOK_BACK_S)
+                to_s = from_s + USUAL_S
             if reading.stop_s > from_s - LOOK_BACK_S and len(record.spike_times_s):
                 reading.spikes.append((record.spike_times_s, record.spike_channels))
     if not reading.moments:
