@@ -60,7 +60,7 @@ RANDOM = Agent("random", "any", AnyCondition(5))
 
 def loop_of(**changed: Any) -> Loop:
     given = {"robot": SHORT, "mapping": Thresholds(9), "conditions": CONDITIONS, "percentiles": PERCENTILES}
-    return Loop(**(given | {"pause_s": 0.1, "warm_up": 0} | changed))
+    return Loop(**(given | {"pause_s": 0.1, "warm_up": 0, "settling": 0} | changed))
 
 
 class TestFake(CultureContract):
@@ -415,6 +415,37 @@ def test_the_warm_up_counts_for_adaptive_thresholds(tmp_path: Path) -> None:
     )
 
 
+def test_thresholds_settle_before_the_first_episode(tmp_path: Path) -> None:
+    loop = loop_of(settling=3, warm_up=1, pause_s=0.5, adaptive_from=tuple(np.zeros(15) for _ in HZ))
+    # Silence comes first: what settles is given all the same.
+    silent = Agent("silent", "", OneCondition(0), "silent")
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [silent, RANDOM], tmp_path, episodes=[1, 1], seed=2)
+    first, second = session.episodes
+    assert (first.agent, first.iterations, second.iterations) == ("silent", 6, 6)
+    settling = [tick for tick in session.ticks if tick.handled == "warm-up" and tick.episode == 0]
+    assert len(settling) == 3 * 6 * 5
+    assert all(tick.iteration == -1 and len(tick.pulse_time_s) == 1 for tick in settling)
+    delivered = np.reshape([tick.delivered for tick in settling], (18, 5))
+    np.testing.assert_array_equal(np.sort(delivered), np.tile(range(5), (18, 1)))
+    # Each part after a pause and its own first interval.
+    at_s = np.reshape([tick.pulse_time_s[0] for tick in settling], (3, 30))
+    rests_s = at_s[:, 0] - np.array([0.0, *at_s[:-1, -1]]) - [1 / HZ[c] for c in delivered[::6, 0]]
+    assert np.all((rests_s > 0.499) & (rests_s < 0.53))
+    told = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
+    newest = [[t.rate_hz for t in settling if t.delivered == condition][-15:] for condition in range(5)]
+    np.testing.assert_array_equal(told[0], np.percentile(newest, np.linspace(0, 100, 11)).astype(np.float32))
+    assert len([tick for tick in session.ticks if tick.handled == "warm-up" and tick.episode == 1]) == 5
+    assert_read_alike(tmp_path, loop)
+
+
+def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
+    recorded = tuple(np.zeros(3) for _ in HZ)
+    assert [loop_of(pulses=n, adaptive_from=recorded, settling=None).settling for n in (1, 2)] == [10, 0]
+    assert loop_of(settling=None).settling == 0
+    assert loop_of(pulses=2, settling=1).settling == 1
+
+
 def test_several_pulses_need_no_warm_up() -> None:
     assert [loop_of(pulses=n, warm_up=None).warm_up for n in (1, 2, 5)] == [2, 0, 0]
     assert loop_of(pulses=5, warm_up=1).warm_up == 1
@@ -508,6 +539,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"pause_s": -1.0}, "pause_s"),
         ({"warm_up": -1}, "warm_up"),
         ({"warm_up": 1.5}, "warm_up: expected a whole number"),
+        ({"settling": -1}, "settling: expected a whole number from 0 to 100, got -1"),
         ({"patience_s": float("nan")}, "patience_s"),
         ({"patience_s": 0.0}, "patience_s"),
         ({"patterns": 0}, "patterns"),

@@ -72,6 +72,23 @@ def test_the_scene_of_a_session_is_its_log(folder: Path) -> None:
     assert scene.n_channels == CHANNELS
 
 
+def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path) -> None:
+    loop = Loop(
+        robot=Navigation(episode_limit=6),
+        mapping=Thresholds(9),
+        conditions=(Condition("20 Hz", 20.0, "Hz"),),
+        percentiles=np.linspace(0.0, 125.0, 11),
+        settling=5,
+    )
+    with FakeCulture(1) as culture:
+        run_session(culture, loop, [Agent("constant", "", OneCondition(0))], tmp_path, episodes=1)
+    moved_s = next(tick.read_after_s for tick in read_session(tmp_path).ticks if tick.iteration == 0)
+    scene = scene_of_session(tmp_path)
+    assert scene.start_s == pytest.approx(moved_s + 0.01 - 5) and scene.start_s > 5
+    assert scene.moments[0].iteration == -1 and scene.moments[-1].iteration == 5
+    assert scene_of_session(tmp_path, (0.0, 60.0)).start_s == 0.0
+
+
 def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:
     whole = scene_of_session(folder)
     start_s, stop_s = 0.5 * whole.stop_s, 0.7 * whole.stop_s

@@ -76,6 +76,11 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     assert found.budget_min == pytest.approx(total_s / 60 / 4)
     assert found.is_long
     assert not replace(found, budget_min=math.inf).is_long
+    # Three more pauses before the first episode, with six of each.
+    longer = outlook(replace(loop, settling=3), calibration, plan, account, 15.0)
+    longer_s = total_s + 3 * (3 + 6 / 5 + 6 / 80)
+    assert longer.planned_min == pytest.approx(longer_s / 60)
+    assert longer.budget_min == pytest.approx(longer_s / 60 * 94 / (4 * 94 + 36))
 
 
 def test_one_line_tells_it() -> None:

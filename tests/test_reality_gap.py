@@ -809,6 +809,7 @@ class TestCommand:
             (["--pause-s", "-1"], "--pause-s: expected a finite number from 0"),
             (["--warm-up", "-1"], "--warm-up: expected a whole number from 0 to 100, got -1"),
             (["--warm-up", "101"], "--warm-up: expected a whole number from 0 to 100, got 101"),
+            (["--settling", "-1"], "--settling: expected a whole number from 0 to 100, got -1"),
             (["--patience-s", "nan"], "--patience-s: expected a finite number from 0"),
             (["--patience-s", "0"], "--patience-s: expected above 0 s"),
             (["--budget-pulses", "-1"], "--budget-pulses: expected 0 or more"),

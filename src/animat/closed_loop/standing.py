@@ -42,9 +42,9 @@ class Standing:
         self.episodes_done += 1
 
     def note(self) -> str:
-        """The return of the episode, whole or so far, and the mean of each agent's."""
+        """The return of the episode, whole or so far, and the mean of each agent's; before the first move `"warm-up"`."""
         if not self._agent:
-            return ""
+            return "warm-up"
         told = f"{self._agent}: return {self._return:.1f}{'' if self._is_over else ' so far'}"
         # Copied at once: the loop's thread adds to it.
         of_each = tuple(self._of_each.items())
