@@ -42,7 +42,7 @@ class Standing:
         self.episodes_done += 1
 
     def note(self) -> str:
-        """The return of the episode, whole or so far, and the mean of each agent's; before the first move `"warm-up"`."""
+        """The return of the episode, whole or so far, and each agent's mean; `"warm-up"` before the first move."""
         if not self._agent:
             return "warm-up"
         told = f"{self._agent}: return {self._return:.1f}{'' if self._is_over else ' so far'}"
