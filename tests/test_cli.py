@@ -181,7 +181,7 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     printed = capsys.readouterr().out
     assert len(last_json(printed)["recordings"]) == 2 and "there already" not in printed  # type: ignore[arg-type]
     assert main(record) == 0
-    assert f"2 recordings in {series}, which were there already" in capsys.readouterr().out
+    assert f"2 recordings in {series}; all were there already" in capsys.readouterr().out
 
     assert main(["inspect", str(series), "--out", str(figures), "--json"]) == 0
     told = last_json(capsys.readouterr().out)["recordings"]

@@ -94,7 +94,7 @@ class Record:
                 files = self._synthetic(progress)
             else:
                 files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
-        were_there = ", which were there already" if files and there.issuperset(files) else ""
+        were_there = "; all were there already" if files and there.issuperset(files) else ""
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{were_there}")
         if protocol is not None and protocol.places:
             print("each place is a condition; --conditions frequency mixes the places")

@@ -147,7 +147,7 @@ class RealityGap:
             "electrode pulses",
             *(("predicted net", "net") if cost else ()),
             "p value",
-            "",
+            "meaning",
         ]
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
