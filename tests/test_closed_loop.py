@@ -29,9 +29,11 @@ from animat.closed_loop.agents import (
     interleaved,
 )
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.outline import Outline
 from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
+from animat.closed_loop.standing import Standing
 from animat.closed_loop.tick import Tick
 from animat.closed_loop.timing import ahead_of_other_programs, among_other_programs
 from animat.coding.mapping import Linear, Thresholds
@@ -437,6 +439,33 @@ def test_thresholds_settle_before_the_first_episode(tmp_path: Path) -> None:
     np.testing.assert_array_equal(told[0], np.percentile(newest, np.linspace(0, 100, 11)).astype(np.float32))
     assert len([tick for tick in session.ticks if tick.handled == "warm-up" and tick.episode == 1]) == 5
     assert_read_alike(tmp_path, loop)
+    outline = Outline(1)
+    for record in session.log.records:
+        outline.add(record.words)
+    assert (
+        outline.moved_at_s == next(tick.wall_s for tick in session.ticks if tick.iteration == 0) > settling[-1].wall_s
+    )
+
+
+def test_thresholds_settle_by_the_culture_s_own_responses(tmp_path: Path) -> None:
+    loop = loop_of(settling=1, adaptive_from=tuple(np.zeros(6) for _ in HZ))
+    drawing = Agent("random spikes", "", AnyCondition(5), "silent", drawn_from=np.array([999.0]))
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [drawing], tmp_path, episodes=1)
+    settling = [tick for tick in session.ticks if tick.handled == "warm-up"]
+    acted = [tick.rate_hz for tick in session.ticks if tick.handled == "used"]
+    assert len(settling) == 30 and max(tick.rate_hz for tick in settling) < 999 and set(acted) == {999.0}
+    (told,) = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
+    np.testing.assert_array_equal(
+        told, np.percentile([t.rate_hz for t in settling], np.linspace(0, 100, 11)).astype(np.float32)
+    )
+
+
+def test_what_is_told_of_a_session_before_its_first_move() -> None:
+    standing = Standing(6)
+    assert standing.note() == "warm-up"
+    standing.begin("p0")
+    assert standing.note() == "p0: return 0.0 so far"
 
 
 def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
@@ -540,6 +569,8 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"warm_up": -1}, "warm_up"),
         ({"warm_up": 1.5}, "warm_up: expected a whole number"),
         ({"settling": -1}, "settling: expected a whole number from 0 to 100, got -1"),
+        ({"settling": 101}, "settling: expected a whole number from 0 to 100, got 101"),
+        ({"settling": 2.5}, "settling: expected a whole number from 0 to 100, got 2.5"),
         ({"patience_s": float("nan")}, "patience_s"),
         ({"patience_s": 0.0}, "patience_s"),
         ({"patterns": 0}, "patterns"),

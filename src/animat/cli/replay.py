@@ -24,7 +24,7 @@ class Replay(Fitting):
     at_min: float | None = None
     """Of policies: minute whose newest recording answers; default: the last recording"""
     span_s: tuple[float, float] | None = None
-    """What to show, in s from the start; default: a minute from just before the robot first moves"""
+    """What to show, in s from the start; default: a minute, of a session from just before the first move"""
     robot: str | None = None
     """The robot that is expected, and imported: my_package.robots:Rover"""
     seed: int = 1

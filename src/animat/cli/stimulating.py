@@ -33,11 +33,11 @@ class Stimulating:
     on_late: Literal["continue", "stop"] = "continue"
     """A pulse that comes late: continue and log it, or stop"""
     pause_s: float = 2.0
-    """Without stimulation before each episode"""
+    """Without stimulation before each episode, and each time in the settling"""
     warm_up: int | None = None
     """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
     settling: int | None = None
-    """How often a pause, and each condition six times, come before the first episode, for thresholds to adapt;
+    """How many times a pause and six trials of each condition precede the first episode, for thresholds to adapt;
     default: 10 with one pulse and adaptive thresholds, else 0"""
     patience_s: float = 10.0
     """How much longer than it should a culture may take to answer before the session is ended"""

@@ -181,7 +181,7 @@ class Driver:
         return observation
 
     def _warm_up(self, agent: Agent, episode: int, rounds: int) -> None:
-        """A pause, then what brings the culture to where it was recorded: rested it answers otherwise."""
+        """A pause, then what brings the culture to where it was recorded: a rested one responds differently."""
         self._see((), self._loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been given at the end of the pause.
         self._last_pulse_s = self._now_s()
@@ -227,7 +227,7 @@ class Driver:
         due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
         late_s = float(np.max(pulse_time_s - due_at_s))
         late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
-        read = read_response(loop, agent, stretch, self._members, after_s, self._rng)
+        read = read_response(loop, None if is_warm_up else agent.drawn_from, stretch, self._members, after_s, self._rng)
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = read.is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {

@@ -87,13 +87,13 @@ class Loop:
             it, and move the robot by the command before it (0 where there was none).
         most_repeats: of one action; the response after that is used.
         on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
-        pause_s: observed without a stimulus before each episode.
+        pause_s: observed without a stimulus before each episode, and each time in the settling.
         warm_up: how often each condition is presented after that, in random order, before the robot moves: a culture
             that has rested answers otherwise than in a recording. The responses count for adaptive thresholds. None:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
-        settling: how often a pause comes before the first episode, each with a warm-up of `SETTLING_ROUNDS`: a
-            recording tires a culture more than a loop, which recovers in the first minute, and its thresholds lag
-            behind. None: 10 where thresholds adapt and an action is one pulse, else 0.
+        settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode. A recording
+            tires a culture more than a loop does. The culture recovers in the first minute, and thresholds lag behind.
+            None: 10 where thresholds adapt and an action is one pulse, else 0.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.

@@ -78,6 +78,7 @@ class Outline:
         bursts: responses that were bursts.
         late: ticks whose pulses came late.
         latest_s: the largest lateness.
+        moved_at_s: when a robot first moved, on the clock of `wall_s`; None before.
     """
 
     def __init__(self, pulses: int) -> None:
@@ -85,6 +86,7 @@ class Outline:
         self.left_out: dict[str, int] = {}
         self.ticks = self.pulses = self.bursts = self.late = 0
         self.latest_s = 0.0
+        self.moved_at_s: float | None = None
         self._presented = pulses
         self._starts: dict[int, tuple[float, ...]] = {}
         self._episodes: dict[int, Episode] = {}
@@ -148,6 +150,7 @@ class Outline:
         episode.bursts += tick["is_burst"]
         episode.late += is_late
         if tick["handled"] != "warm-up":
+            self.moved_at_s = tick.get("wall_s") if self.moved_at_s is None else self.moved_at_s
             acted = episode.acted
             acted.trials += 1
             acted.actions += tick["command"] is not None

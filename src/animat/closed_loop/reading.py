@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from animat.closed_loop.agents import Agent
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.stretch import Stretch
 from animat.responses.windows import read_windows
@@ -29,13 +28,13 @@ class Read(NamedTuple):
 
 def read_response(
     loop: Loop,
-    agent: Agent,
+    drawn_from: Float64[np.ndarray, "responses *readouts"] | None,
     stretch: Stretch,
     members: Bool[np.ndarray, "readouts channels"],
     after_s: Float64[np.ndarray, "1"],
     rng: np.random.Generator,
 ) -> Read:
-    """The response after a pulse, or what is drawn in its place for an agent whose responses are."""
+    """The response after a pulse, or one drawn in its place."""
     rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
     x_hz, readout_hz = rate_hz[0], ()
     # Of what was seen, also where another response is drawn.
@@ -44,11 +43,11 @@ def read_response(
     if not loop.readouts.are_all:
         x_hz = loop.readouts.read(stretch, members, after_s, loop.window_ms)[0]
         readout_hz = tuple(np.atleast_1d(x_hz).tolist())
-    if agent.drawn_from is not None:
-        x_hz = agent.drawn_from[rng.integers(len(agent.drawn_from))]
+    if drawn_from is not None:
+        x_hz = drawn_from[rng.integers(len(drawn_from))]
         readout_hz = tuple(np.atleast_1d(x_hz).tolist()) if readout_hz else ()
         rate_hz = rate_hz if readout_hz else np.atleast_1d(x_hz)
-    is_burst = bool(active_ratio[0] > loop.burst_threshold) and agent.drawn_from is None
+    is_burst = bool(active_ratio[0] > loop.burst_threshold) and drawn_from is None
     told = {
         "spikes": spikes,
         "rate_hz": float(rate_hz[0]),

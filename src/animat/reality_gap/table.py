@@ -168,7 +168,7 @@ class RealityGap:
         outline = self.session.to_dict()
         lines.append(f"  {self.verdict()}")
         lines.append(
-            "  p value: that policies and this control have the same returns (Mann-Whitney test, two-sided); electrode "
+            "  p value: of the two-sided Mann-Whitney test of the policies' returns against this control's; electrode "
             "pulses: of a whole episode, one for each electrode of each pulse"
         )
         lines.append(f"  stimulation: {self.account}")

@@ -167,7 +167,9 @@ class SessionView(View):
         done = self._done
         last = self._last_tick()
         planned, wall_s = len(listed(self._words.get("turns"))), number(mapped(last).get("wall_s"))
-        left_s = None if not done or wall_s is None else wall_s * (planned - done) / done
+        # What comes before the first move comes once.
+        moving_s = None if wall_s is None else wall_s - (number(outline.moved_at_s) or 0.0)
+        left_s = None if not done or moving_s is None else moving_s * (planned - done) / done
         return {
             **self._state(),
             "summed": sums.share,
