@@ -72,13 +72,15 @@ def test_the_scene_of_a_session_is_its_log(folder: Path) -> None:
     assert scene.n_channels == CHANNELS
 
 
-def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("pause_s", "settling"), [(2.0, 5), (70.0, 0)])
+def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path, pause_s: float, settling: int) -> None:
     loop = Loop(
         robot=Navigation(episode_limit=6),
         mapping=Thresholds(9),
         conditions=(Condition("20 Hz", 20.0, "Hz"),),
         percentiles=np.linspace(0.0, 125.0, 11),
-        settling=5,
+        pause_s=pause_s,
+        settling=settling,
     )
     with FakeCulture(1) as culture:
         run_session(culture, loop, [Agent("constant", "", OneCondition(0))], tmp_path, episodes=1)
@@ -86,7 +88,7 @@ def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path) -> None
     scene = scene_of_session(tmp_path)
     assert scene.start_s == pytest.approx(moved_s + 0.01 - 5) and scene.start_s > 5
     assert scene.moments[0].iteration == -1 and scene.moments[-1].iteration == 5
-    assert scene_of_session(tmp_path, (0.0, 60.0)).start_s == 0.0
+    assert scene_of_session(tmp_path, (0.0, 58.0 + pause_s)).start_s == 0.0
 
 
 def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:

@@ -50,7 +50,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
         reading.window_s = float(words["loop"]["window_ms"][1]) * 1e-3
         robot_data, seed = words["loop"] | {"robot": words["loop"]["robot"]}, int(words["seed"])
         for record in session.log.records:
-            if record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s:
+            if is_found and record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s:
                 break
             reading.add(record.words)
             if not is_found and reading.moments:
