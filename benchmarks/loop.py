@@ -244,14 +244,14 @@ def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         agent = Agent("policy", "random weights", Greedy(policy()))
         session = run_session(culture, loop_of(ticks, real_time=True), [agent], folder, episodes=1)
         assert session.ending.by == "plan", session.ending
-        # Read while the log is there.
-        late = np.array([1e3 * tick.late_s for tick in session.ticks])[1:]
-        assert len(late) == ticks - 1
+        # Ticks are read from the log, which goes with the folder.
+        late = np.array([1e3 * tick.late_s for tick in session.ticks])
+        assert len(late) == ticks
     here.send("over")
     idle_late = here.recv()
     # A window's end that it never saw, it slept over. The first pulse is an interval after the pause, without hurry.
     ends_s = culture.ends_s[1:-1]
-    return late, np.array([idle_late.get(end_s, 1e3 * PERIOD_S) for end_s in ends_s]), np.diff(culture.used_ms)[1:]
+    return late[1:], np.array([idle_late.get(end_s, 1e3 * PERIOD_S) for end_s in ends_s]), np.diff(culture.used_ms)[1:]
 
 
 def outline(us: np.ndarray) -> dict[str, float]:
