@@ -35,6 +35,12 @@ def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = Non
     return path
 
 
+def expect_no_file(folder: Path, what: str) -> None:
+    """Raise InvalidFile if a file is in the place of a folder for something."""
+    if folder.exists() and not folder.is_dir():
+        raise InvalidFile(f"{folder}: expected a folder for {what}, got a file")
+
+
 def is_folder(path: Path) -> bool:
     """Whether a folder is there; not, and no error either, for a name that the system cannot have."""
     try:

@@ -15,6 +15,7 @@ from tyro.conf import Positional
 from animat.cli.responses import fit_as, policies_for
 from animat.cli.stimulating import Stimulating, expect_no_fault
 from animat.errors import InvalidArgument
+from animat.plain_file import expect_no_file
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
@@ -239,7 +240,7 @@ def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
     Where the culture `is_recording` first, a recording of a run that failed must not be there: each costs a living
     culture some thousand pulses.
     """
-    from animat.closed_loop.session import expect_no_file, expect_no_session
+    from animat.closed_loop.session import expect_no_session
 
     expect_no_file(folder, "the session")
     with exclusive_lock(folder):

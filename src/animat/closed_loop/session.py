@@ -26,6 +26,7 @@ from animat.closed_loop.log import Log, Records, read_log
 from animat.closed_loop.outline import Episode, Outline
 from animat.closed_loop.tick import Ending, Tick
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.plain_file import expect_no_file
 from animat.progress import Progress
 from animat.recordings.recording import Recording
 from animat.writing import clear_away, exclusive_lock, is_unfinished
@@ -203,18 +204,12 @@ def read_session(path: str | os.PathLike[str]) -> Session:
     return Session(file.parent, log, ending)
 
 
-def expect_no_file(folder: Path, what: str) -> None:
-    """Raise InvalidArgument if a file is in the place of a folder for something."""
-    if folder.exists() and not folder.is_dir():
-        raise InvalidArgument(f"{folder}: expected a folder for {what}, got a file")
-
-
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
     """Raise unless a folder can take a new session; says what can be done with one that is there. Makes the folder.
 
     Raises:
-        InvalidArgument: if a session is there, or a file in the folder's place.
-        InvalidFile: if the folder cannot be made or written to.
+        InvalidArgument: if a session is there.
+        InvalidFile: if a file is in the folder's place, or the folder cannot be made or written to.
     """
     folder = Path(folder)
     expect_no_file(folder, "the session")

@@ -89,8 +89,8 @@ class Thresholds(Mapping):
     def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
         """The level between the thresholds that `x` falls in (see `Mapping.command`)."""
         half = (self.count + 1) // 2
-        # Times 1 before adding: the sum of two numpy booleans would be a boolean.
-        n_passed = sum(1 * (x >= percentiles[i]) for i in self.percentile_indices)
+        # Added to a whole number from the first on: the sum of two numpy booleans would be a boolean.
+        n_passed = sum((x >= percentiles[i] for i in self.percentile_indices), start=0)
         # The middle threshold is passed by a step of two, over the zero. Dividing whole numbers rounds each level
         # to the float nearest to it, so numpy and JAX give the same ones.
         return (n_passed - half + (x >= percentiles[5])) / half

@@ -78,7 +78,10 @@ class Account:
     def spend(self, stimuli: Sequence[Stimulus]) -> None:
         """Write stimuli down as delivered."""
         self.pulses += _pulses(stimuli)
-        self._on.update(_counted(stimuli))
+        # One by one: a counter of its own took five times as long, before every pulse of a closed loop.
+        for stimulus in stimuli:
+            for electrode in stimulus.electrodes:
+                self._on[electrode] += 1
 
     def take_back(self, stimuli: Sequence[Stimulus]) -> None:
         """Write stimuli down as not delivered after all: the culture refused them."""

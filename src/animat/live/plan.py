@@ -15,9 +15,9 @@ from animat.closed_loop.gathering import LOG_FILE as SESSION_LOG
 from animat.closed_loop.gathering import RECORDING_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_episodes
-from animat.closed_loop.session import expect_no_file
 from animat.coding.mapping import N_PERCENTILES
 from animat.errors import InvalidArgument, Mismatch
+from animat.plain_file import expect_no_file
 from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
@@ -72,7 +72,8 @@ def check_plan(
 
     Raises:
         InvalidArgument: for a training without neurons or with a neural observation, recordings that take longer than
-            an interval, no episodes, a setting of the closed loop that cannot be, or a file in the folder's place.
+            an interval, no episodes, or a setting of the closed loop that cannot be.
+        InvalidFile: if a file is in the folder's place.
         Mismatch: if something is in the folder already; for an earlier live run, what, and what can be done with it.
     """
     if training.mapping is None:

@@ -14,6 +14,7 @@ from animat.differences import description_in, first_difference, of_another, wit
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
+from animat.plain_file import expect_no_file
 from animat.recordings.formats.csv import stimuli_beside
 from animat.robots.host import HostRobot
 from animat.studies.places import OWN_FOLDERS
@@ -130,8 +131,7 @@ def held(
         Mismatch: if it is another one's, holds other files, or another run is at work in it.
         InvalidFile: if it cannot be read or made.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InvalidFile(f"{folder}: expected a folder for the {what}, got a file")
+    expect_no_file(folder, f"the {what}")
     files = {file: json.dumps(manifest, indent=1, sort_keys=True) + "\n", **beside}
     _is_ours(folder, what, manifest, [*files])
     with exclusive_lock(folder):

@@ -16,9 +16,10 @@ import numpy as np
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.differences import description_in, fingerprint_of, first_difference, of_another
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, Mismatch
 from animat.goals.robot import without_goal
 from animat.neurons.timeline import SimulatorTimeline
+from animat.plain_file import expect_no_file
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
@@ -182,8 +183,7 @@ def _description_in(folder: Path) -> dict[str, Any] | None:
     """What a folder says it holds; None if it is free."""
     if (found := description_in(folder / MANIFEST, "training")) is not None:
         return _renamed(found, FORMER, ("a presentation", "a trial"))
-    if folder.exists() and not folder.is_dir():
-        raise InvalidFile(f"{folder}: expected a folder for the policies, got a file")
+    expect_no_file(folder, "the policies")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     return None
