@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -82,7 +82,7 @@ def read_header(file: Path, words: Mapping[str, Any]) -> Header:
         datetime.fromisoformat(recorded_at)
     except ValueError:
         of.refuse("recorded_at", "a date in ISO 8601")
-    agents = of.listed("agents", dict, "a list of who acted, each with a name")
+    agents = of.listed("agents", lambda each: isinstance(each, dict), "a list of who acted, each with a name")
     try:
         channels = Channels(np.array(label, np.str_), np.array(electrode, np.int64), np.array(x_um), np.array(y_um))
         presentation = Presentation("mixed", int(pulses))
@@ -135,23 +135,17 @@ class _Fields:
             self.refuse(name, _NUMBER[is_whole])
         return value  # type: ignore[no-any-return]
 
-    def listed(self, name: str, kind: type, expected: str) -> Sequence[Any]:
+    def listed(self, name: str, is_one: Callable[[Any], bool], expected: str) -> Sequence[Any]:
         value = self.at(name)
-        if not isinstance(value, list) or not all(isinstance(each, kind) for each in value):
+        if not isinstance(value, list) or not all(map(is_one, value)):
             self.refuse(name, expected)
         return value
 
     def texts(self, name: str) -> Sequence[str]:
-        value = self.listed(name, str, "a list of texts")
-        if not all(map(_is_text, value)):
-            self.refuse(name, "a list of texts")
-        return value
+        return self.listed(name, _is_text, "a list of texts")
 
     def numbers(self, name: str, *, is_whole: bool = False) -> Sequence[float]:
-        value = self.listed(name, int | float, f"a list, each {_NUMBER[is_whole]}")  # type: ignore[arg-type]
-        if not all(_is_number(each, is_whole) for each in value):
-            self.refuse(name, f"a list, each {_NUMBER[is_whole]}")
-        return value
+        return self.listed(name, lambda each: _is_number(each, is_whole), f"a list, each {_NUMBER[is_whole]}")
 
     def words(self, name: str) -> dict[str, str]:
         value = self.at(name)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 PREDICTED_FILE = "predicted.json"
 _MOST_BYTES = 2**24
@@ -21,8 +21,7 @@ def write_predicted(folder: Path, returns: Mapping[str, tuple[float, float, floa
         InvalidFile: if it cannot be written.
     """
     words = {name: dict(zip(("mean", "low", "high"), map(float, of), strict=True)) for name, of in returns.items()}
-    with atomic_write(folder / PREDICTED_FILE) as beside:
-        beside.write_text(json.dumps({"predicted_returns": words}, indent=1) + "\n", encoding="utf-8")
+    write_whole(folder / PREDICTED_FILE, json.dumps({"predicted_returns": words}, indent=1) + "\n")
 
 
 def read_predicted(folder: Path) -> dict[str, tuple[float, float, float]]:

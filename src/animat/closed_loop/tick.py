@@ -74,12 +74,9 @@ class Tick:
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """From what `vars` gave, through JSON."""
         # Logs of before know of no readouts, nor of neurons.
-        later = ("readout_hz", "neurons")
-        values = {each.name: data[each.name] for each in fields(cls) if each.name not in later}
-        values |= {name: data.get(name, ()) for name in later}
-        for name, value in values.items():
-            values[name] = tuple(value) if isinstance(value, list) else value
-        return cls(**values)
+        known: dict[str, Any] = {"readout_hz": (), "neurons": (), **data}
+        known = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
+        return cls(**{each.name: known[each.name] for each in fields(cls)})
 
 
 @dataclass(frozen=True)
