@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -24,6 +24,7 @@ from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.training.policy import Policy
 
 OnBurst = Literal["use", "repeat", "skip"]
 OnLate = Literal["continue", "stop"]
@@ -32,34 +33,6 @@ MOST_WARM_UP = 100
 """Presentations of each condition in a warm-up: as many as a recording holds; more wears a culture out for nothing."""
 SETTLING_ROUNDS = 6
 """Presentations of each condition after each pause of the settling: with five of them 2.3 s, next to a pause of 2 s."""
-
-
-class Trained(Protocol):
-    """What a loop takes from a policy, besides letting it act."""
-
-    @property
-    def robot(self) -> Robot[Any]:
-        """The robot it was trained on."""
-
-    @property
-    def mapping(self) -> Mapping | None:
-        """From a response to a command; None for a policy without neurons."""
-
-    @property
-    def readouts(self) -> Readouts:
-        """What is read of the neurons."""
-
-    @property
-    def conditions(self) -> tuple[Condition, ...]:
-        """What its actions are."""
-
-    @property
-    def window_ms(self) -> tuple[float, float] | None:
-        """The response window."""
-
-    @property
-    def presentation(self) -> Presentation | None:
-        """How stimuli were presented when its neurons were recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +159,7 @@ class Loop:
 
     @classmethod
     def of_policy(
-        cls, policy: Trained, percentiles: ArrayLike, *, pulses: int | None = None, **settings: Any
+        cls, policy: Policy, percentiles: ArrayLike, *, pulses: int | None = None, **settings: Any
     ) -> tuple[Self, tuple[Finding, ...]]:
         """The loop that a policy was trained for, and where it differs from how the policy's recordings were made.
 
@@ -234,7 +207,7 @@ class Loop:
         }
 
 
-def _differences(policy: Trained, loop: Loop) -> tuple[Finding, ...]:
+def _differences(policy: Policy, loop: Loop) -> tuple[Finding, ...]:
     findings = list(other_presentation(policy.presentation, loop.presentation))
     if policy.window_ms is not None and policy.window_ms != loop.window_ms:
         message = f"the policy was trained on responses in {policy.window_ms} ms, the loop reads {loop.window_ms}"
