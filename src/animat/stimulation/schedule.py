@@ -133,42 +133,28 @@ def make_schedule(
     else:
         orders = [rng.permutation(np.repeat(np.arange(n_conditions), each))]
     if places:
-        return Schedule(protocol, seed, _at_places(protocol, orders, patterns, places))
-    # Each pattern as often as the others, one round after the other, each round in random order.
-    rounds = range(-(-each // protocol.patterns))
-    read = [np.concatenate([rng.permutation(protocol.patterns) for _ in rounds])[:each] for _ in range(n_frequencies)]
-    taken = [0] * n_frequencies
-    blocks, presentation = [], 0
-    for order in orders:
-        pattern = np.empty((len(order), protocol.pulses), dtype=np.int64)
-        for row, frequency in enumerate(order):
-            pattern[row] = _train(rng, protocol, int(read[frequency][taken[frequency]]))
-            taken[frequency] += 1
-        frequency_hz = np.repeat(np.array(protocol.frequencies_hz)[order], protocol.pulses)
-        number = np.repeat(np.arange(presentation, presentation + len(order)), protocol.pulses)
-        presentation += len(order)
-        blocks.append(_block(protocol, frequency_hz, patterns[pattern.ravel()], pattern.ravel(), number))
-    return Schedule(protocol, seed, tuple(blocks))
-
-
-def _at_places(
-    protocol: Protocol,
-    orders: Sequence[Int64[np.ndarray, " trials"]],
-    patterns: Int64[np.ndarray, "patterns size"],
-    places: Sequence[tuple[int, ...]],
-) -> tuple[Block, ...]:
-    """Blocks of which each presentation is all on one place; one that is a pattern of the culture has its number."""
-    number_of = {frozenset(row) - {UNKNOWN}: number for number, row in enumerate(patterns.tolist())}
-    pattern = np.array([number_of.get(frozenset(place), UNKNOWN) if place else NOTHING for place in places])
-    electrodes = padded(places)
-    blocks, presentation = [], 0
-    for order in orders:
-        of = np.repeat(np.arange(presentation, presentation + len(order)), protocol.pulses)
-        frequency, where = np.divmod(np.repeat(order, protocol.pulses), len(places))
+        # A place that is a pattern of the culture has its number.
+        number_of = {frozenset(row) - {UNKNOWN}: i for i, row in enumerate(patterns.tolist())}
+        number = np.array([number_of.get(frozenset(place), UNKNOWN) if place else NOTHING for place in places])
+        electrodes = padded(places)
+    else:
+        number, electrodes = np.arange(len(patterns)), patterns
+        # Each pattern as often as the others, one round after the other, each round in random order.
+        rounds = range(-(-each // protocol.patterns))
+        left = [
+            iter([pattern for _ in rounds for pattern in rng.permutation(protocol.patterns).tolist()])
+            for _ in range(n_frequencies)
+        ]
+    blocks = []
+    for i, order in enumerate(orders):
+        frequency, place = np.divmod(order, max(1, len(places)))
+        if places:
+            row = np.repeat(place, protocol.pulses)
+        else:
+            row = np.concatenate([_train(rng, protocol, next(left[f])) for f in frequency.tolist()])
         frequency_hz = np.array(protocol.frequencies_hz)[frequency]
-        blocks.append(_block(protocol, frequency_hz, electrodes[where], pattern[where], of))
-        presentation += len(order)
-    return tuple(blocks)
+        blocks.append(_block(protocol, frequency_hz, electrodes[row], number[row], i * len(order)))
+    return Schedule(protocol, seed, tuple(blocks))
 
 
 def on_ticks(time_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
@@ -179,11 +165,14 @@ def on_ticks(time_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " tim
 
 def _block(
     protocol: Protocol,
-    frequency_hz: Float64[np.ndarray, " pulses"],
+    frequency_hz: Float64[np.ndarray, " trials"],
     electrodes: Int64[np.ndarray, "pulses size"],
     pattern: Int64[np.ndarray, " pulses"],
-    presentation: Int64[np.ndarray, " pulses"],
+    first: int,
 ) -> Block:
+    """A block of trials, numbered from `first`."""
+    presentation = np.repeat(first + np.arange(len(frequency_hz)), protocol.pulses)
+    frequency_hz = np.repeat(frequency_hz, protocol.pulses)
     since_s = 1 / frequency_hz
     since_s[0] = protocol.pause_s
     time_s = on_ticks(np.cumsum(since_s))
