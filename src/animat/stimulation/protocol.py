@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, SkipValidation
@@ -129,11 +129,11 @@ class Protocol:
 
     def to_json(self) -> str:
         """As one line of JSON, the way a recording's file keeps it under `"protocol"`."""
-        data = {each.name: getattr(self, each.name) for each in fields(self)}
+        data = vars(self) | {"pulse": self.pulse.to_list()}
         if not self.places:
             # A series knows its own protocol by its text, and those of before have no places.
             del data["places"]
-        return json.dumps({**data, "pulse": self.pulse.to_list()})
+        return json.dumps(data)
 
     @staticmethod
     def from_json(text: str, defaults: Protocol | None = None) -> Protocol:
@@ -146,18 +146,19 @@ class Protocol:
         Raises:
             InvalidArgument: for anything else, naming the key, what was expected and what came.
         """
+        strange = f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}"
         try:
             data = json.loads(text, object_pairs_hook=_each_once)
+        except InvalidArgument:
+            raise
+        except json.JSONDecodeError as error:
+            raise InvalidArgument(
+                f"protocol: expected JSON, got a mistake in line {error.lineno}, column {error.colno} ({error.msg})"
+            ) from error
         except (ValueError, RecursionError) as error:
-            if isinstance(error, InvalidArgument):
-                raise
-            if isinstance(error, json.JSONDecodeError):
-                raise InvalidArgument(
-                    f"protocol: expected JSON, got a mistake in line {error.lineno}, column {error.colno} ({error.msg})"
-                ) from error
-            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}") from error
+            raise InvalidArgument(strange) from error
         if not isinstance(data, dict):
-            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
+            raise InvalidArgument(strange)
         if defaults is None and "pulse" not in data:
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
         if "trials" not in data:
