@@ -150,12 +150,12 @@ def record_when_due(
             if culture.now_s < due_s + interval_s:
                 culture.rest(max(0.0, due_s - culture.now_s))
                 part = Part(progress, session, 1, len(files), files[session].name)
-                yield session, culture.record(protocol, _order(seed, session), part, follow)
+                yield session, culture.record(protocol, order_seed(seed, session), part, follow)
                 follow.remove()
                 progress.update(session + 1, len(files), files[session].name)
 
 
-def _order(seed: int, session: int) -> int:
+def order_seed(seed: int, session: int) -> int:
     """The seed of a session's schedule: other cultures and other sessions have other orders."""
     return seed * 10_000 + session
 
@@ -218,31 +218,34 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
             f"sessions, interval_min: expected recordings within a year, got {shown(sessions)} every "
             f"{interval_min:g} min"
         )
-    # How long a schedule takes does not depend on the electrodes: no culture need be opened to refuse.
-    patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
-    takes_min = make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
+    takes_min = minutes_of(protocol, n_patterns)
     if sessions > 1 and interval_min < takes_min:
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, got {interval_min:g}"
         )
 
 
+def minutes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
+    """How long a recording takes, set-up included; InvalidArgument where that many patterns are too few."""
+    # On whatever electrodes it takes as long: no culture need be opened.
+    patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
+    return make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
+
+
 def _expect_series(files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_min: float) -> None:
     for session, file in enumerate(files):
-        if file.exists():
-            _expect_of_series(file, culture, protocol, session, 60 * session * interval_min)
-
-
-def _expect_of_series(file: Path, culture: VirtualCulture, protocol: Protocol, session: int, start_s: float) -> None:
-    there = read_recording(file)
-    expected = culture.settings | {"protocol_seed": str(_order(culture.seed, session))}
-    if difference := difference_from(expected, protocol, there):
-        raise Mismatch(
-            f"{file}: expected a recording of the same culture and protocol, got another ({difference}): remove it, or "
-            "choose another folder"
-        )
-    if abs(there.start_min * 60 - start_s) > 1e-6:
-        raise Mismatch(f"{file}: expected a recording at {start_s / 60:g} min, got one at {there.start_min:g} min")
+        if not file.exists():
+            continue
+        there = read_recording(file)
+        expected = culture.settings | {"protocol_seed": str(order_seed(culture.seed, session))}
+        if difference := difference_from(expected, protocol, there):
+            raise Mismatch(
+                f"{file}: expected a recording of the same culture and protocol, got another ({difference}): remove "
+                "it, or choose another folder"
+            )
+        start_s = 60 * session * interval_min
+        if abs(there.start_min * 60 - start_s) > 1e-6:
+            raise Mismatch(f"{file}: expected a recording at {start_s / 60:g} min, got one at {there.start_min:g} min")
 
 
 def difference_from(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:

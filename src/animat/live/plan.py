@@ -16,11 +16,11 @@ from animat.closed_loop.gathering import RECORDING_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_episodes
 from animat.coding.mapping import N_PERCENTILES
+from animat.cultures.series import minutes_of
 from animat.errors import InvalidArgument, Mismatch
 from animat.plain_file import expect_no_file
 from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
-from animat.stimulation.schedule import make_schedule
 from animat.training.folder import expect_trainable
 from animat.training.specification import Training
 from animat.writing import LOCK
@@ -92,9 +92,7 @@ def check_plan(
             f"takes {n}: record, train with --readouts, and run"
         )
     expect_trainable(training, is_saved=True)
-    # How long it takes does not depend on which electrodes are pulsed.
-    patterns, places = np.zeros((protocol.patterns, 1), np.int64), [(0,)] * protocol.n_places
-    takes_min = make_schedule(protocol, patterns, 0, places=places).duration_s / 60
+    takes_min = minutes_of(protocol)
     if takes_min > timetable.interval_min:
         raise InvalidArgument(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, "

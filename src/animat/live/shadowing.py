@@ -18,7 +18,7 @@ import jax
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.series import STATE_FILE
+from animat.cultures.series import STATE_FILE, order_seed
 from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
@@ -194,7 +194,7 @@ class _Run:
         timeline = self._record(0, self._progress)
         if timeline is None:
             raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
-        exchange.publish(0, float(timeline.start_min[-1]), _newest(timeline))
+        _publish(exchange, 0, timeline)
         groups = groups_of(self._training, timeline, describe(self._training, timeline))
         minutes = self._timetable.duration_min
         self._progress = in_phase(self._progress, "training", minutes, "min of the culture")
@@ -231,14 +231,14 @@ class _Run:
             self.write("interrupted" if is_person else "fault", message=told)
 
     def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
-        published, in_budget = 0, True
-        for number in range(1, self._timetable.recordings + 1):
-            self._wait(number * self._timetable.interval_min, trainers, published)
-            if number == self._timetable.recordings or not in_budget:
+        duration_min, published, in_budget = self._timetable.duration_min, 0, True
+        for number in range(1, self._timetable.recordings):
+            minute = number * self._timetable.interval_min
+            self._wait(minute, trainers, published)
+            if not in_budget:
                 continue
+            beside = Part(self._progress, minute, 0, duration_min, f"recording {number + 1}")
             try:
-                here = min(number * self._timetable.interval_min, self._timetable.duration_min)
-                beside = Part(self._progress, here, 0, self._timetable.duration_min, f"recording {number + 1}")
                 timeline = self._record(number, beside)
             except BudgetSpent as spent:
                 self.write("budget", message=str(spent))
@@ -246,11 +246,11 @@ class _Run:
                 continue
             if timeline is not None:
                 published = number
-                exchange.publish(number, float(timeline.start_min[-1]), _newest(timeline))
+                _publish(exchange, number, timeline)
+        self._wait(duration_min, trainers, published)
 
     def _wait(self, minute: float, trainers: Trainers, number: int) -> None:
         """Let the culture's clock come to a minute of the run, training going on."""
-        minute = min(minute, self._timetable.duration_min)
         due_s = self._wall_zero_s + 60 * minute / self._timetable.speed
         while time.monotonic() < due_s or not trainers.all_use(number):
             self._note(trainers.swaps(_POLL_S))
@@ -265,11 +265,10 @@ class _Run:
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:
         """Record and fit; None where the recording cannot be trained on, which is written down."""
         began_s = time.monotonic()
-        # Other cultures and other recordings have other orders.
-        seed = self._training.seed * 10_000 + number
         folder = self.folder / RECORDINGS
         # Held as by `animat record`: whoever looks knows that it goes on.
         with exclusive_lock(folder), UnderWay(folder) as follow:
+            seed = order_seed(self._training.seed, number)
             recording = record_within(self.account, self._culture, self._protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))
             write_nwb(recording, file)
@@ -329,5 +328,7 @@ class _Run:
         return self._known_s
 
 
-def _newest(timeline: SimulatorTimeline) -> Any:
-    return jax.device_get(timeline.at(float(timeline.start_min[-1])))
+def _publish(exchange: Exchange, number: int, timeline: SimulatorTimeline) -> None:
+    """Put up the newest simulator of a timeline."""
+    start_min = float(timeline.start_min[-1])
+    exchange.publish(number, start_min, jax.device_get(timeline.at(start_min)))
