@@ -88,11 +88,10 @@ def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: 
     Of a virtual culture its seed, and the state that was written after them; of a CL1 the seed of its patterns, so that
     it is stimulated through the electrodes that it was recorded with.
     """
-    found: dict[str, Any] = {}
     culture = recordings[0].culture if recordings else None
     if culture is None or culture.kind != kind:
-        return found
-    found["seed"] = culture.seed
+        return {}
+    found: dict[str, Any] = {"seed": culture.seed}
     if kind == "virtual":
         from animat.cultures.series import STATE_FILE
 
