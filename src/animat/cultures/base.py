@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from inspect import getattr_static
 from types import FunctionType
@@ -47,7 +47,7 @@ class Culture(Openable):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        refuse_overrides(cls, Culture, leaving=("__init__", "left_out", "device", "recorded_as", "stretch_s"))
+        _refuse_overrides(cls)
 
     # What a backend is: data. Valid once it is open.
 
@@ -286,33 +286,28 @@ class Culture(Openable):
 
 _BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
 """They are called before whatever the base class has, or in its place."""
+_REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
+"""What a backend may have of its own though it is not abstract."""
 
 
-def refuse_overrides(cls: type, base: type, *, leaving: Collection[str]) -> None:
-    """Refuse a subclass in which anything but abstract methods of the base class is replaced, private or not.
+def _refuse_overrides(cls: type[Culture]) -> None:
+    """Refuse a subclass in which anything else of `Culture` is replaced, private or not (TypeError).
 
-    Args:
-        cls: the subclass; wherever it has a name from, what stands before `base` among its bases counts.
-        base: whose methods and properties are called.
-        leaving: names that may be replaced though they are not abstract.
-
-    Raises:
-        TypeError: naming the first one.
+    Wherever it has a name from, what stands before `Culture` among its bases counts.
     """
     own = {
         name: member
-        for kind in reversed(base.__mro__)
+        for kind in reversed(Culture.__mro__)
         for name, member in vars(kind).items()
         if kind.__module__.startswith(f"{__package__}.")
         and isinstance(member, FunctionType | property | classmethod)
         and not getattr(member, "__isabstractmethod__", False)
-        and name not in leaving
-    } | {name: getattr_static(base, name, None) for name in _BEFORE_ALL}
+        and name not in _REPLACEABLE
+    } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
     for name, member in own.items():
         if getattr_static(cls, name, None) is not member:
-            raise TypeError(
-                f"{cls.__name__}.{name}: final in {base.__name__}; implement the methods that its description names"
-            )
+            expected = "implement the methods that its description names"
+            raise TypeError(f"{cls.__name__}.{name}: final in Culture; {expected}")
 
 
 class ComputedCulture(Culture):
