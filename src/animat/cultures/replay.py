@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 
 from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.recording import Channels, Recording
-from animat.stimulation.stimulus import Stimulus
+from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
 NS = 1_000_000_000
@@ -126,10 +126,11 @@ class ReplayCulture(ComputedCulture):
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         start_ns = self._now_ns
         end_ns = start_ns + round(duration_s * NS)
+        numbers = np.array([stimulus.presentation for stimulus in admitted.stimuli])
         # All answers are found before anything changes: a condition that was never recorded must leave no trace.
         answers = [
             (start_ns + round(stimulus.time_s * NS), self._pool(stimulus, is_last))
-            for stimulus, is_last in zip(admitted.stimuli, _is_last(admitted.stimuli), strict=True)
+            for stimulus, is_last in zip(admitted.stimuli, is_last_of(numbers), strict=True)
         ]
         for time_ns, (recording, key, pool) in answers:
             self._answer(time_ns, recording, self._choose(key, pool))
@@ -209,9 +210,3 @@ def _numbered_sets(
     """A number for every set of electrodes, and the number of each pulse's."""
     rows, number = np.unique(np.sort(electrodes, axis=1), axis=0, return_inverse=True)
     return {frozenset(row) - {UNKNOWN}: i for i, row in enumerate(rows.tolist())}, number.reshape(-1)
-
-
-def _is_last(stimuli: Sequence[Stimulus]) -> Bool[np.ndarray, " stimuli"]:
-    """Whether each is the last of its presentation."""
-    number = np.array([stimulus.presentation for stimulus in stimuli])
-    return np.append(number[1:] != number[:-1], True)[: len(stimuli)]

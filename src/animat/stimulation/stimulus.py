@@ -142,11 +142,14 @@ class Stimuli:
     @property
     def is_last_of_presentation(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Whether a pulse is the last one of its presentation, the one whose response is read; shape (stimuli,)."""
-        last = np.ones(len(self), dtype=bool)
-        last[:-1] = self.presentation[1:] != self.presentation[:-1]
-        return last
+        return is_last_of(self.presentation)
 
     @property
     def is_rest(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Whether nothing was delivered, shape (stimuli,)."""
         return (self.pattern == NOTHING) & np.all(self.electrodes == UNKNOWN, axis=1)  # type: ignore[no-any-return]
+
+
+def is_last_of(presentation: Int64[np.ndarray, " stimuli"]) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Whether each pulse is the last one of its presentation, by the presentations' numbers; shape (stimuli,)."""
+    return np.append(presentation[1:] != presentation[:-1], True)[: len(presentation)]
