@@ -190,13 +190,9 @@ def controls(
         found.append(Agent("silent", "no pulse; the culture's own activity is read", who, "silent"))
         found.append(Agent("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
     if means is not None:
-        found.append(
-            Agent(
-                "heuristic",
-                "no learning: the stimulus nearest to the command of the robot's heuristic",
-                HeuristicController(robot, tuple(means)),
-            )
-        )
+        nearest = HeuristicController(robot, tuple(means))
+        meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
+        found.append(Agent("heuristic", meaning, nearest))
     return found
 
 

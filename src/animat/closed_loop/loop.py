@@ -178,12 +178,8 @@ class Loop:
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses
-        settings = {
-            "conditions": policy.conditions,
-            "window_ms": policy.window_ms,
-            "readouts": policy.readouts,
-            **settings,
-        }
+        taken = {"conditions": policy.conditions, "window_ms": policy.window_ms, "readouts": policy.readouts}
+        settings = {**taken, **settings}
         if settings["window_ms"] is None:
             del settings["window_ms"]
         loop = cls(

@@ -137,28 +137,25 @@ class Outline:
             episode = Episode(number, tick["agent"], self._starts.pop(number, ()))
             self._episodes[number] = episode
         self.ticks += 1
-        self.pulses += n_pulses
-        self.bursts += tick["is_burst"]
-        self.late += is_late
         self.latest_s = max(self.latest_s, tick["late_s"])
         if tick["reward"] is not None:
             episode.total += tick["reward"]
             episode.iterations += 1
         episode.terminated = tick["terminated"]
         episode.is_whole = tick["terminated"] or tick["truncated"]
-        episode.pulses += n_pulses
-        episode.bursts += tick["is_burst"]
-        episode.late += is_late
+        counted: list[Any] = [self, episode]
         if tick["handled"] != "warm-up":
             self.moved_at_s = tick.get("wall_s") if self.moved_at_s is None else self.moved_at_s
             acted = episode.acted
             acted.trials += 1
             acted.actions += tick["command"] is not None
-            acted.pulses += n_pulses
             acted.electrode_pulses += electrode_pulses
             acted.pulses_s += self._presented / tick["frequency_hz"]
-            acted.bursts += tick["is_burst"]
-            acted.late += is_late
+            counted.append(acted)
+        for each in counted:
+            each.pulses += n_pulses
+            each.bursts += tick["is_burst"]
+            each.late += is_late
 
 
 def electrode_pulses_of(seen: Mapping[str, Any]) -> int:

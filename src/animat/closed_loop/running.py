@@ -346,16 +346,15 @@ def _after_their_sources(turns: list[int], agents: Sequence[Agent]) -> list[int]
 
 
 def _told(agent: Agent) -> dict[str, Any]:
-    told: dict[str, Any] = {"name": agent.name, "meaning": agent.meaning, "delivery": agent.delivery}
-    if isinstance(agent.controller, InTurn):
+    told = {"name": agent.name, "meaning": agent.meaning, "delivery": agent.delivery}
+    more = {
         # Episode after episode of this agent, over and over.
-        told["in_turn"] = list(agent.controller.by_name)
-    changed = {
+        "in_turn": list(agent.controller.by_name) if isinstance(agent.controller, InTurn) else [],
         "is_drawn": agent.drawn_from is not None,
         "is_turned_round": agent.is_turned_round,
         "switch_at": agent.switch_at,
     }
-    return told | {name: value for name, value in changed.items() if value}
+    return told | {name: value for name, value in more.items() if value}
 
 
 def check_episodes(name: str, episodes: int) -> None:

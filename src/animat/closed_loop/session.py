@@ -214,11 +214,8 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
     folder = Path(folder)
     expect_no_file(folder, "the session")
     if (folder / LOG_FILE).exists():
-        told = (
-            ""
-            if (folder / RECORDING_FILE).exists()
-            else (f" that was killed or still runs: its recording was not written, `animat recover {folder}` does it")
-        )
+        told = f" that was killed or still runs: its recording was not written, `animat recover {folder}` does it"
+        told = "" if (folder / RECORDING_FILE).exists() else told
         raise InvalidArgument(f"{folder / LOG_FILE}: a session is there already{told}; choose another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -134,21 +134,8 @@ class RealityGap:
             ]
             cells.append([row.name, f"{told['predicted']:.1f}", anew, *measured, *counts, p, row.meaning])
         interval = "its 95 % interval"
-        head = [
-            "",
-            "predicted",
-            interval,
-            "measured",
-            "gap",
-            interval,
-            *(MEANS if objectives else ()),
-            "episodes",
-            "pulses/action",
-            "electrode pulses",
-            *(("predicted net", "net") if cost else ()),
-            "p value",
-            "meaning",
-        ]
+        head = ["", "predicted", interval, "measured", "gap", interval, *(MEANS if objectives else ()), "episodes"]
+        head += ["pulses/action", "electrode pulses", *(("predicted net", "net") if cost else ()), "p value", "meaning"]
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
             f"{self.calibrated_at_min:g} min",
