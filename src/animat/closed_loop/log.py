@@ -16,11 +16,11 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, overload
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int, Int64
@@ -116,7 +116,7 @@ class LogWriter:
         self._whole += len(data)
 
 
-class Records(Sequence[Record]):
+class Records:
     """The records of a log but the first, read from its file as they are asked for: memory may be smaller than it.
 
     Args:
@@ -130,13 +130,7 @@ class Records(Sequence[Record]):
     def __len__(self) -> int:
         return len(self._places) - 1
 
-    @overload
-    def __getitem__(self, index: int) -> Record: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Record, ...]: ...
-    def __getitem__(self, index: int | slice) -> Record | tuple[Record, ...]:
-        if isinstance(index, slice):
-            return tuple(self[i] for i in range(len(self))[index])
+    def __getitem__(self, index: int) -> Record:
         number = range(len(self))[index]
         with opened_log(self._path) as file:
             file.seek(self._places[number])
