@@ -33,7 +33,7 @@ class Asked:
         return {
             "stretch": self.stretch,
             "asked_at_s": self.at_s,
-            "asked_for_s": [float(stimulus.time_s) for stimulus in self.stimuli],
+            "asked_for_s": [stimulus.time_s for stimulus in self.stimuli],
             "stimuli": rows_of(self.stimuli),
         }
 

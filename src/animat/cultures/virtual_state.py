@@ -24,7 +24,6 @@ from animat.cultures.tissue.snapshot import (
     expect_within,
 )
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
-from animat.plain_file import expect_plain_file
 from animat.stimulation.array import MAXONE
 from animat.stimulation.selection import Selection
 from animat.writing import atomic_write
@@ -78,9 +77,8 @@ def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state
         np.savez_compressed(file, head=np.array(json.dumps(head)), **held, **arrays)
 
 
-def read_state(path: str | os.PathLike[str], settings: Mapping[str, str], tissue: Tissue) -> VirtualState:
+def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> VirtualState:
     """Read the state of a culture of these settings into its fresh tissue; see `VirtualCulture.restore_state`."""
-    path = expect_plain_file(path)
     fresh = tissue.snapshot()
     lengths = {f"state_{name}": values.nbytes for name, values in fresh.state._asdict().items()}
     lengths |= dict.fromkeys((*(f"kicks_{name}" for name in Kicks._fields), *_HELD, "head"), _MOST_BYTES)

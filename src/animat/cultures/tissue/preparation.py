@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64
 from animat.cultures.tissue import kernel
 from animat.cultures.tissue.arrays import Constants, State, Wiring
 from animat.cultures.tissue.network import Network
-from animat.cultures.tissue.parameters import ShortTerm, TissueParameters
+from animat.cultures.tissue.parameters import TissueParameters
 
 BLOCK_MIDDLE_MV, BLOCK_HALF_MV, BLOCK_DEGREE = -60.0, 25.0, 9
 """Where a polynomial stands for the NMDA block, to 1e-7; outside, its value at the nearer end holds."""
@@ -22,10 +22,7 @@ def prepare_constants(parameters: TissueParameters) -> Constants:
         return f4(-np.expm1(-step_ms / time_constant_ms))
 
     def table(of: str) -> Float64[np.ndarray, "from_type to_type"]:
-        kinds: tuple[tuple[ShortTerm, ShortTerm], ...] = (
-            (parameters.e_to_e, parameters.e_to_i),
-            (parameters.i_to_any, parameters.i_to_any),
-        )
+        kinds = (parameters.e_to_e, parameters.e_to_i), (parameters.i_to_any, parameters.i_to_any)
         return np.array([[getattr(kind, of) for kind in row] for row in kinds])
 
     noise_keep = np.exp(-kernel.NOISE_STEPS * step_ms / parameters.noise_ms)
@@ -115,11 +112,8 @@ def fresh_state(seed: int, parameters: TissueParameters, network: Network, wirin
     n = len(network)
     drive_mv = wiring.drive_mv + parameters.noise_mv * rng.standard_normal(n)
     ring = 1 << int(max(network.delay_steps, default=1)).bit_length()
-    use = np.where(
-        network.is_excitatory[:, None],
-        np.array([[parameters.e_to_e.use, parameters.e_to_i.use]]),
-        np.array([[parameters.i_to_any.use, parameters.i_to_any.use]]),
-    )
+    of_excitatory = parameters.e_to_e.use, parameters.e_to_i.use
+    use = np.where(network.is_excitatory[:, None], of_excitatory, parameters.i_to_any.use)
 
     def zeros(*shape: int) -> np.ndarray:
         return np.zeros(shape, np.float32)

@@ -106,7 +106,7 @@ class Tissue:
         Raises:
             InvalidArgument: for a negative duration, or a pulse outside this stretch of time; nothing has then passed.
         """
-        end_ns = self._now_ns + _nanoseconds("duration_s", duration_s)
+        end_ns = self._now_ns + _nanoseconds(duration_s)
         if pulses:
             new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
             self._kicks = in_order(self._kicks, *new)
@@ -141,7 +141,7 @@ class Tissue:
         Raises:
             InvalidArgument: for a negative duration.
         """
-        end_ns = self._now_ns + _nanoseconds("duration_s", duration_s)
+        end_ns = self._now_ns + _nanoseconds(duration_s)
         while self._now_ns < end_ns:
             self.advance(min(end_ns - self._now_ns, MINUTE_NS) / NS)
 
@@ -180,7 +180,7 @@ class Tissue:
         return self._coupling.kicks(pulse, -(-pulse_ns // self._step_ns))
 
 
-def _nanoseconds(name: str, seconds: float) -> int:
-    if not 0 <= seconds < float("inf"):
-        raise InvalidArgument(f"{name}: expected a time of 0 s or more, got {seconds}")
-    return round(seconds * NS)
+def _nanoseconds(duration_s: float) -> int:
+    if not 0 <= duration_s < float("inf"):
+        raise InvalidArgument(f"duration_s: expected a time of 0 s or more, got {duration_s}")
+    return round(duration_s * NS)
