@@ -182,15 +182,9 @@ def select_electrodes(
     Source: the paper's methods; the spacing and the score are ours (it says "by spike shape and amplitude").
     """
     rule = rule or SelectionRule()
-    if not 1 <= rule.recording_sites <= array.channels:
-        raise InvalidArgument(
-            f"recording_sites: expected 1 to {array.channels} on the {array.name}, got {rule.recording_sites}"
-        )
-    if not 1 <= rule.stimulation_sites <= array.stimulation_units:
-        raise InvalidArgument(
-            f"stimulation_sites: expected 1 to {array.stimulation_units} on the {array.name}, "
-            f"got {rule.stimulation_sites}"
-        )
+    for name, most in (("recording_sites", array.channels), ("stimulation_sites", array.stimulation_units)):
+        if not 1 <= (sites := getattr(rule, name)) <= most:
+            raise InvalidArgument(f"{name}: expected 1 to {most} on the {array.name}, got {sites}")
     ratio = scan.signal_to_noise
     passed = np.flatnonzero((ratio >= rule.signal_to_noise) & (scan.rate_hz > 0))
     if rule.spacing_um > 0 and len(passed):
