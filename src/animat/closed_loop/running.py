@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import json
 import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -146,12 +145,15 @@ class _Supervisor:
     def run(self) -> Ending:
         """Start the loop and stay with it to its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
-        with (
-            told_instead(self._stop_for_a_person),
-            _without_collector(),
-            _switching_every(_SWITCH_S),
-            self._ahead(with_those_it_starts=True),
-        ):
+        with ExitStack() as stack:
+            stack.enter_context(told_instead(self._stop_for_a_person))
+            if gc.isenabled():
+                # A collection can take 50 ms, and the loop makes no cycles.
+                stack.callback(gc.enable)
+                gc.disable()
+            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(_SWITCH_S)
+            stack.enter_context(self._ahead(with_those_it_starts=True))
             thread.start()
             try:
                 ending = self._watch(thread)
@@ -159,7 +161,7 @@ class _Supervisor:
                 # The caller's progress, or a fault of our own: a loop that nobody watches must not go on.
                 is_person = isinstance(error, KeyboardInterrupt)
                 told = "stopped by a person" if is_person else f"what watches the loop raised {in_words(error)}"
-                with contextlib.suppress(Exception):
+                with suppress(Exception):
                     self._end_it(thread, Ending("person" if is_person else "crash", told))
                 raise
             if ending is not None:
@@ -184,10 +186,10 @@ class _Supervisor:
         with self._ahead(with_those_it_starts=False):
             self._ending = self._driver.run()
 
-    def _ahead(self, *, with_those_it_starts: bool) -> contextlib.AbstractContextManager[None]:
+    def _ahead(self, *, with_those_it_starts: bool) -> AbstractContextManager[None]:
         """Ahead of other programs, if there are deadlines: what computes as fast as it can would leave them nothing."""
         if not self._loop.real_time and self._culture.device is None:
-            return contextlib.nullcontext()
+            return nullcontext()
         return ahead_of_other_programs(with_those_it_starts=with_those_it_starts)
 
     def _watch(self, thread: threading.Thread) -> Ending | None:
@@ -281,29 +283,6 @@ class _Supervisor:
             self._not_halted = f"the culture could not be stopped ({in_words(error)})"
         else:
             self._not_halted = None
-
-
-@contextlib.contextmanager
-def _without_collector() -> Iterator[None]:
-    """Keep Python's cycle collector, which can take 50 ms, out of the loop; the loop makes no cycles."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-@contextlib.contextmanager
-def _switching_every(interval_s: float) -> Iterator[None]:
-    """Let threads take turns more often than Python has them."""
-    before_s = sys.getswitchinterval()
-    sys.setswitchinterval(interval_s)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before_s)
 
 
 def _header(
