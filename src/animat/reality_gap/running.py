@@ -182,15 +182,15 @@ def run_policies(
         acts = CouplingController(reflex, animat.scales)
         agents.append(Agent("coupling", "the best reflex: no memory, no goal", acts))
 
-    networks = networks_of(list(policies.values()), greedy=greedy)
-    fields = environment, simulator, networks, len(policies), seed
     ideal = None
     if with_interventions:
         if isinstance(loop.robot, HostRobot):
             raise InvalidArgument(f"--interventions: expected a robot in JAX, got {loop.robot.name}")
-        ideal = with_ideal_actuator(*fields)
+        networks = networks_of(list(policies.values()), greedy=greedy)
+        on_simulator = environment, simulator, networks, len(policies), seed
+        ideal = with_ideal_actuator(*on_simulator)
         pooled = np.concatenate(calibration.responses_hz)
-        agents += interventions(loop.robot, acting, pooled, half_an_episode(*fields))
+        agents += interventions(loop.robot, acting, pooled, half_an_episode(*on_simulator))
 
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
