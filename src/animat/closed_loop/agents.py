@@ -134,8 +134,8 @@ class Agent:
         delivery: `"chosen"`: the culture gets what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
             `"silent"`: no pulse, and what the culture fires by itself is read where the response would be; `"yoked"`:
             what was given in the last whole episode of those who take turns here, over and over.
-        calibrates: whether its responses count for adaptive thresholds; one condition presented over
-            and over is answered otherwise than between others. The warm-up of its episodes always counts.
+        calibrates: whether its responses count for adaptive thresholds; one condition presented over and over is
+            answered otherwise than between others. The warm-up of its episodes always counts.
         drawn_from: responses that one is drawn from in place of the culture's; None: the culture's own is read.
         is_turned_round: whether every command is turned into its opposite.
         switch_at: after how many iterations the robot is given another goal; None: never.

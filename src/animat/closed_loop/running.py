@@ -62,11 +62,10 @@ def run_session(
     """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
     Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, with what was asked
-    of the culture and not answered yet; and once this returns, or `recover_session` did its work, `session.nwb` is a
-    recording like any other. Unless the plan was done
-    or the budget spent, the culture is then stopped: it delivers nothing until it is closed and opened again.
-    `ending` says what happened; nothing is raised for it, Ctrl-C (and SIGTERM) included, nor for a file `STOP`
-    that somebody puts in the folder: it ends the session before the next pulse. What `progress` raises is
+    of the culture and not answered yet. Once this returns, or `recover_session` did its work, `session.nwb` is a
+    recording like any other. Unless the plan was done or the budget spent, the culture is then stopped: it delivers
+    nothing until it is closed and opened again. `ending` says what happened; nothing is raised for it, Ctrl-C and
+    SIGTERM included. A file `STOP` in the folder ends the session before the next pulse. What `progress` raises is
     raised, once the culture is stopped and the log is written.
 
     Args:
@@ -82,8 +81,7 @@ def run_session(
 
     Raises:
         InvalidArgument: for a culture that is closed or stopped, no agents, one that sees the history state in a loop
-            that does not remember, or a session or a file `STOP` in the folder
-            already.
+            that does not remember, or a session or a file `STOP` that is in the folder already.
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read.
         InvalidFile: if the log cannot be begun.

@@ -28,10 +28,9 @@ class ReplayCulture(ComputedCulture):
 
     The last pulse of a presentation is answered by one that was the last of a recorded presentation, the others by
     ones that were not, where there are any; of these by one on the same electrodes, where there are any; a stimulus
-    without a frequency by one of any. The newest recording at the
-    culture's clock answers; the clock starts where the first recording did. There is no memory beyond that and no
-    activity between responses: what a closed loop does has no effect on what comes next, which is just what a loop on
-    living matter is there to test.
+    without a frequency by one of any. The newest recording at the culture's clock answers; the clock starts where the
+    first recording did. There is no memory beyond that and no activity between responses: what a closed loop does has
+    no effect on what comes next, which is just what a loop on living matter is there to test.
 
     Args:
         recordings: of one culture, at least one, with stimuli of known frequencies and electrodes.
