@@ -36,23 +36,20 @@ def read_response(
 ) -> Read:
     """The response after a pulse, or one drawn in its place."""
     rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
-    x_hz, readout_hz = rate_hz[0], ()
+    reads_all = loop.readouts.are_all
+    x_hz = rate_hz[0] if reads_all else loop.readouts.read(stretch, members, after_s, loop.window_ms)[0]
     # Of what was seen, also where another response is drawn.
     window_s = (loop.window_ms[1] - loop.window_ms[0]) * 1e-3
     spikes = round(float(rate_hz[0]) * window_s * len(stretch.channels))
-    if not loop.readouts.are_all:
-        x_hz = loop.readouts.read(stretch, members, after_s, loop.window_ms)[0]
-        readout_hz = tuple(np.atleast_1d(x_hz).tolist())
     if drawn_from is not None:
         x_hz = drawn_from[rng.integers(len(drawn_from))]
-        readout_hz = tuple(np.atleast_1d(x_hz).tolist()) if readout_hz else ()
-        rate_hz = rate_hz if readout_hz else np.atleast_1d(x_hz)
+        rate_hz = np.atleast_1d(x_hz) if reads_all else rate_hz
     is_burst = bool(active_ratio[0] > loop.burst_threshold) and drawn_from is None
     told = {
         "spikes": spikes,
         "rate_hz": float(rate_hz[0]),
         "active_ratio": float(active_ratio[0]),
         "is_burst": is_burst,
-        "readout_hz": readout_hz,
+        "readout_hz": () if reads_all else tuple(np.atleast_1d(x_hz).tolist()),
     }
     return Read(x_hz, told, is_burst)
