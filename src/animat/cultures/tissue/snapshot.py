@@ -51,13 +51,12 @@ def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) 
     expect_whole("tissue_now_ns", snapshot.now_ns, 0, LONGEST_NS)
     step = snapshot.now_ns // step_ns
     expect_whole("tissue_step", snapshot.step, step, step)
-    neurons = len(wiring.needed)
     for name, values in snapshot.state._asdict().items():
         expect_array(name, values, getattr(like, name).dtype, getattr(like, name).shape)
-        low, high = (0.0, 1.0) if name in _SHARES else (-LARGEST, LARGEST)
         if values.dtype.kind == "f":
             # A share is the difference of two: rounding may take it past its end by a last bit.
-            expect_within(name, values, low - 1e-9 * (low == 0), high + 1e-9 * (low == 0))
+            low, high = (-1e-9, 1 + 1e-9) if name in _SHARES else (-LARGEST, LARGEST)
+            expect_within(name, values, low, high)
     for name in ("arriving_ampa", "arriving_nmda", "arriving_gaba"):
         # The kernel notes once what arrives at a neuron: what cancels out would be noted twice.
         expect_within(name, getattr(snapshot.state, name), 0.0, LARGEST)
@@ -73,7 +72,7 @@ def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) 
     expect_within("scaling", snapshot.state.scaling, 0.0, snapshot.parameters.scaling_rest * (1 + 1e-9))
     for name, values in snapshot.kicks._asdict().items():
         expect_array(f"kicks.{name}", values, np.float32 if name == "mv" else np.int64, (len(snapshot.kicks.step),))
-    expect_within("kicks.neuron", snapshot.kicks.neuron, 0, neurons - 1)
+    expect_within("kicks.neuron", snapshot.kicks.neuron, 0, len(wiring.needed) - 1)
     expect_within("kicks.mv", snapshot.kicks.mv, -LARGEST, LARGEST)
     expect_within("kicks.step", snapshot.kicks.step, step, step + KICKS_WITHIN_NS // step_ns)
     expect_rising("kicks.step", snapshot.kicks.step)
