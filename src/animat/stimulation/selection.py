@@ -116,12 +116,8 @@ class Selection:
             "format": "animat electrode selection 1",
             "array": dict(vars(self.array)),
             "rule": dict(vars(self.rule)),
-            "seed": self.seed,
-            "scanned": self.scanned,
-            "passed": self.passed,
-            "stimulation": self.stimulation.tolist(),
-            "patterns": self.patterns.tolist(),
-            "recording": self.recording.tolist(),
+            **{name: getattr(self, name) for name in ("seed", "scanned", "passed")},
+            **{name: getattr(self, name).tolist() for name in ("stimulation", "patterns", "recording")},
         }
 
     @staticmethod
@@ -134,15 +130,10 @@ class Selection:
         saved = read_record(_Saved, data, "selection")
         if len(set(map(len, saved.patterns))) > 1:
             raise InvalidArgument("selection.patterns: expected as many electrodes in each, got other numbers in some")
+        given = saved.recording, saved.stimulation, saved.patterns or np.empty((0, 0))
+        recording, stimulation, patterns = (np.array(electrodes, np.int64) for electrodes in given)
         return Selection(
-            saved.array,
-            np.array(saved.recording, np.int64),
-            np.array(saved.stimulation, np.int64),
-            np.array(saved.patterns or np.empty((0, 0)), np.int64),
-            saved.rule,
-            saved.seed,
-            saved.scanned,
-            saved.passed,
+            saved.array, recording, stimulation, patterns, saved.rule, saved.seed, saved.scanned, saved.passed
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
