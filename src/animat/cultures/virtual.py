@@ -82,7 +82,7 @@ class VirtualCulture(ComputedCulture):
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")
         self.seed = seed
         self._parameters = None if parameters is None else _with_floats(parameters)
-        self._rule, self._scan_s = None if rule is None else _with_floats(rule), float(scan_s)
+        self._rule, self._scan_s = rule or SelectionRule(), float(scan_s)
         self._progress = progress or Silent()
         self._selection = selection
         self._scan: ScannedActivity | None = None
@@ -146,7 +146,7 @@ class VirtualCulture(ComputedCulture):
     @property
     def n_patterns(self) -> int:
         """How many patterns it has, known before it is opened."""
-        return (self._rule or SelectionRule()).patterns if self._selection is None else len(self._selection.patterns)
+        return self._rule.patterns if self._selection is None else len(self._selection.patterns)
 
     @property
     def now_s(self) -> float:
@@ -182,7 +182,7 @@ class VirtualCulture(ComputedCulture):
             "source": "virtual culture: simulated by animat.cultures.virtual",
             "seed": str(self.seed),
             "scan_s": str(self._scan_s),
-            "selection_rule": json.dumps(dataclasses.asdict(self._rule or SelectionRule())),
+            "selection_rule": json.dumps(dataclasses.asdict(self._rule)),
             "tissue_revision": str(REVISION),
             "tissue_parameters": json.dumps(dataclasses.asdict(self._parameters or TissueParameters())),
         }
