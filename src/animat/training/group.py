@@ -279,8 +279,24 @@ class SideBySide:
         return replace(now, assessments=assessments, best=kept)
 
     def _as_policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
-        network = jax.tree.map(lambda leaf: np.array(leaf[i]), networks)
-        return _policy(self._places[i][0], self._environment.scales, network, curve)
+        group, _ = self._places[i]
+        training, timeline = group.training, group.timeline
+        return Policy(
+            weights=tuple(np.array(layer.weight[i]) for layer in networks),
+            biases=tuple(np.array(layer.bias[i])[0] for layer in networks),
+            scales=self._environment.scales,
+            robot=training.robot,
+            mapping=training.mapping,
+            conditions=timeline.conditions if timeline and training.mapping is not None else (),
+            commands=training.commands,
+            window_ms=timeline.window_ms if timeline else None,
+            presentation=timeline.presentation if timeline else None,
+            readouts=timeline.readouts if timeline else ALL,
+            neural_observation=training.neural_observation,
+            pulse_cost=training.pulse_cost,
+            provenance=group.provenance,
+            learning_curve=curve,
+        )
 
     def keep(self, checkpoint: Path) -> None:
         """Write a checkpoint."""
@@ -310,27 +326,6 @@ class SideBySide:
     @property
     def _standing(self) -> Any:
         return () if self._course is None else self._course.standing
-
-
-def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> Policy:
-    training, timeline = group.training, group.timeline
-    through_neurons = training.mapping is not None and timeline is not None
-    return Policy(
-        weights=tuple(layer.weight for layer in actor),
-        biases=tuple(layer.bias[0] for layer in actor),
-        scales=scales,
-        robot=training.robot,
-        mapping=training.mapping,
-        conditions=timeline.conditions if through_neurons and timeline else (),
-        commands=training.commands,
-        window_ms=timeline.window_ms if timeline else None,
-        presentation=timeline.presentation if timeline else None,
-        readouts=timeline.readouts if timeline else ALL,
-        neural_observation=training.neural_observation,
-        pulse_cost=training.pulse_cost,
-        provenance=group.provenance,
-        learning_curve=curve,
-    )
 
 
 def _read_checkpoint(
