@@ -33,7 +33,7 @@ from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
 from animat.training.provenance import expect_provenance
 from animat.training.settings import PulseCost
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 FORMAT = "animat-policy-1"
 HIDDEN_ACTIVATION = "relu"
@@ -266,9 +266,7 @@ class Policy:
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
-        data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
-        with atomic_write(path) as beside:
-            beside.write_bytes(data)
+        write_whole(Path(path), save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata))
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Policy:
