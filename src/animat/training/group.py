@@ -374,4 +374,4 @@ def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:
         fewest: groups at least, where there are as many policies: two keep two cores busy.
     """
     n_groups = max(-(-policies // 5), min(fewest, policies))
-    return [tuple(int(i) for i in part) for part in np.array_split(np.arange(policies), n_groups)]
+    return [tuple(part.tolist()) for part in np.array_split(np.arange(policies), n_groups)]
