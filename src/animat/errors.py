@@ -69,14 +69,14 @@ class BodyFailed(AnimatError):
     """A body of somebody else (`gymnasium:...`) raised, hung, or gave no finite numbers; what was finished stays."""
 
 
-def shown(value: object, most: int = 80) -> str:
+def shown(value: object) -> str:
     """A value as a message shows it: in one line, and cut where it is longer than anyone reads."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):
         # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
         text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"
-    return text if len(text) <= most else f"{text[:most]}... ({len(text):,} characters)"
+    return text if len(text) <= 80 else f"{text[:80]}... ({len(text):,} characters)"
 
 
 def did_you_mean(word: str, among: Iterable[str]) -> str:

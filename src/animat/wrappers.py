@@ -186,7 +186,8 @@ class YokedDelivery(Wrapper[RobotState]):
 
     def __post_init__(self) -> None:
         _expect_neurons(self)
-        _expect_jax(self.robot)
+        if isinstance(self.robot, HostRobot):
+            raise InvalidArgument(f"robot: expected one that is stepped in JAX, got {self.robot.name}, which is not")
 
     @property
     def noise_size(self) -> int:
@@ -293,11 +294,6 @@ def _remembering(state: State, remembered: dict[str, Any]) -> State:
 
 def _where(condition: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(partial(jnp.where, condition), yes, no)
-
-
-def _expect_jax(robot: Robot[Any]) -> None:
-    if isinstance(robot, HostRobot):
-        raise InvalidArgument(f"robot: expected one that is stepped in JAX, got {robot.name}, which is not")
 
 
 def _expect_neurons(wrapper: Wrapper[Any]) -> None:

@@ -58,10 +58,7 @@ class Evaluate(Fitting):
             expect_writable(self.out.parent)
         policies = policies_for(self.robot, self.mapping, self.policies)
         check_at_once("--episodes", self.episodes, len(policies))
-        through_neurons = any(policy.mapping is not None for policy in policies.values())
-        # On what they were trained on, unless asked otherwise.
-        trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
-        timeline = self.timeline(self.recordings, trained) if through_neurons else None
+        timeline = self.timeline_for(policies, self.recordings)
 
         from animat.evaluation.table import evaluate
 

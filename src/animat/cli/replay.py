@@ -67,6 +67,5 @@ class Replay(Fitting):
         if self.source.is_dir() and not any(self.source.glob("*.safetensors")):
             raise InvalidArgument(f"{self.source}: expected a session (session.log) or policies in it, got neither")
         policies = policies_for(self.robot, None, self.source)
-        trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
-        timeline = None if trained is None else self.timeline(self.recordings, trained)
+        timeline = self.timeline_for(policies, self.recordings)
         return scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)

@@ -72,6 +72,11 @@ class Fitting(Responding):
         say_findings(timeline.findings)
         return timeline
 
+    def timeline_for(self, policies: Mapping[str, Policy], recordings: Sequence[Path]) -> SimulatorTimeline | None:
+        """As the training of policies had it, by the first that has a mapping; None where none has one."""
+        trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
+        return None if trained is None else self.timeline(recordings, trained)
+
 
 def fit_as(trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None) -> dict[str, Any]:
     """How simulators are made: as those that policies were trained on, unless another kind is asked for.

@@ -93,15 +93,7 @@ def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
         counts = f"{row.larger_in} of {row.cultures}", row.found_better
         cells.append([f"{row.robot}, {row.comparison}", *means, interval, *counts])
     if cells:
-        head = [
-            "",
-            "first",
-            "second",
-            "difference",
-            "95 % interval",
-            "second mean larger in",
-            "significantly better in",
-        ]
+        head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(lined_up(head, cells)))
     jobs = sum(len(each.done_now) for each in found.ran.values())
     print(f"{len(found.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")

@@ -29,9 +29,6 @@ class Watch:
         if not self.folder.is_dir():
             got = "a file" if self.folder.exists() else "none"
             raise InvalidArgument(f"{self.folder}: expected a folder to watch, got {got}")
-        serve(self.folder, self.port, _say)
+        said = "(Ctrl-C ends the page, and nothing else)"
+        serve(self.folder, self.port, lambda address: print(f"{address}  {said}", flush=True))
         return {"folder": str(self.folder)}
-
-
-def _say(address: str) -> None:
-    print(f"{address}  (Ctrl-C ends the page, and nothing else)", flush=True)

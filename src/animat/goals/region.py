@@ -65,11 +65,6 @@ class Range:
         return "outside" if self.outside else "in"
 
     @property
-    def quantities(self) -> tuple[str, ...]:
-        """Of which it is a region."""
-        return (self.quantity,)
-
-    @property
     def has_its_edge(self) -> bool:
         """Whether its ends belong to it."""
         return self.relation == "in"

@@ -119,11 +119,10 @@ def outcome(objectives: Sequence[Objective], tally: Tally, episode_limit: int) -
             return jnp.where(inside > 0, (tally.iterations - 1) / episode_limit, 1.0)
         return 1.0 + jnp.minimum(margin, 0.0) if kind == "reach" else inside / out_of
 
-    told = zip(objectives, tally.margins, tally.is_inside, strict=True)
-    of_all = [(of.kind, margin, inside) for of, margin, inside in told]
-    avoided = [margin for kind, margin, _ in of_all if kind == "avoid"]
-    reaches = [margin for kind, margin, _ in of_all if kind == "reach"]
-    others = [(margin, inside) for kind, margin, inside in of_all if kind not in ("avoid", "reach")]
+    told = list(zip((of.kind for of in objectives), tally.margins, tally.is_inside, strict=True))
+    avoided = [margin for kind, margin, _ in told if kind == "avoid"]
+    reaches = [margin for kind, margin, _ in told if kind == "reach"]
+    others = [(margin, inside) for kind, margin, inside in told if kind not in ("avoid", "reach")]
     # What is reached ends the episode, and nothing else is then asked but that it has not failed.
     deciding = [reduce(jnp.maximum, reaches)] if reaches else [margin for margin, _ in others]
     met = tally.reached if reaches else reduce(jnp.logical_and, [inside for _, inside in others], jnp.bool_(True))

@@ -264,7 +264,7 @@ def placed(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
 
 def stacked(leaves: Sequence[Any]) -> Array:
     """`jnp.stack` of arrays that are ready, which are put together on the host: nothing is compiled."""
-    return placed(np.stack([np.asarray(leaf) for leaf in leaves]), None)
+    return placed(np.stack(leaves), None)
 
 
 def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts"]:

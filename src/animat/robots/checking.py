@@ -25,17 +25,17 @@ def check_robot(robot: Robot[Any]) -> None:
     Raises:
         InvalidArgument: naming the method or attribute, what was expected and what came.
     """
-    name = _named(robot)
+    _expect_attributes(robot)
     if isinstance(robot, HostRobot):
         _check_on_host(robot)
     else:
-        _check_compiled(robot, name)
+        _check_compiled(robot)
 
 
 @lru_cache(maxsize=64)
-def _check_compiled(robot: Robot[Any], name: str) -> None:
+def _check_compiled(robot: Robot[Any]) -> None:
     """Once for each robot: compiling its episode takes some tenths of a second."""
-    observations, noise = len(robot.observation_spec), robot.noise_size
+    name, observations, noise = type(robot).__name__, len(robot.observation_spec), robot.noise_size
     one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)
 
@@ -85,8 +85,7 @@ def _check_on_host(robot: HostRobot) -> None:
             bodies.begin()
 
 
-def _named(robot: Any) -> str:
-    """What a message calls the robot, once its attributes are what they are said to be."""
+def _expect_attributes(robot: Any) -> None:
     kind = type(robot).__name__
     if not isinstance(robot, Robot):
         raise InvalidArgument(f"robot: expected a robot or the name of one, got {shown(robot)}")
@@ -114,7 +113,6 @@ def _named(robot: Any) -> str:
         json.dumps(dataclasses.asdict(robot))  # type: ignore[call-overload]
     except (TypeError, ValueError) as error:
         raise InvalidArgument(f"{kind}: expected a frozen dataclass of plain parameters ({error})") from error
-    return kind
 
 
 def _tried(what: str, call: Callable[..., Any], *arguments: Any) -> Any:

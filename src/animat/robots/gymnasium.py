@@ -18,6 +18,7 @@ from animat.errors import InvalidArgument, first_line, shown
 from animat.records import Flag, Number, Whole, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Iterations, Quantity
 from animat.robots.host import LONGEST_KEPT, Body, HostRobot, within
+from animat.robots.measuring import is_repeatable, measured_scales
 from animat.robots.registry import REGISTRY
 
 FAMILY = "gymnasium"
@@ -27,9 +28,6 @@ MOST_OBSERVED = 4_096
 MOST_LEVELS = 1_024
 LARGEST_BOUND = 1e6
 """Of an observation: a bound beyond says nothing on how large it usually is."""
-MEASURED_STEPS = 1_000
-"""Of random actions, from which the scales of unbounded observations are measured."""
-_SEED = 20_260_000
 
 Scale = Annotated[Number, Field(ge=LEAST_SCALE, le=LARGEST_SCALE)]
 
@@ -127,7 +125,7 @@ class GymnasiumRobot(HostRobot):
         return body
 
     def prepare(self) -> None:
-        _imported(self.id)
+        self.import_module(self.id)
 
     def caveats(self) -> tuple[str, ...]:
         if self.keeps_episodes:
@@ -145,7 +143,15 @@ class GymnasiumRobot(HostRobot):
     @staticmethod
     def import_module(id: str) -> None:
         """Import the module that an id names, if it names one; errors as those of `named`."""
-        _imported(id)
+        module = id.rpartition(":")[0]
+        if not module:
+            return
+        try:
+            importlib.import_module(module)
+        except (Exception, SystemExit) as error:
+            raise InvalidArgument(
+                f"robot: expected {FAMILY}:module:Id with a module that can be imported, got {first_line(error)}"
+            ) from error
 
     @classmethod
     @lru_cache(maxsize=32)  # a study asks for its robots often
@@ -164,10 +170,11 @@ class GymnasiumRobot(HostRobot):
         """
         if not _ID.fullmatch(id):
             raise InvalidArgument(f"robot: expected gymnasium: and an environment's id, got {shown(f'{FAMILY}:{id}')}")
-        _imported(id)
-        at_first = cls(id, tuple(settings.items()), 1, (0.0,), (1.0,), 0, (1.0,), False)
+        cls.import_module(id)
+        given = tuple(settings.items())
+        at_first = cls(id, given, 1, (0.0,), (1.0,), 0, (1.0,), False)
         with within(at_first, "being made"):
-            body = _Environment(id, tuple(settings.items()))
+            body = _Environment(id, given)
         limit = body.limit if episode_limit is None else episode_limit
         if limit is None:
             raise InvalidArgument(
@@ -176,12 +183,9 @@ class GymnasiumRobot(HostRobot):
             )
         if not 1 <= limit <= LONGEST_EPISODE:
             raise InvalidArgument(f"episode_limit: expected from 1 to {LONGEST_EPISODE:,} iterations, got {limit:,}")
-        from animat.robots.measuring import is_repeatable, measured_scales
-
-        scales = tuple(body.bounds) if all(body.bounds) else (1.0,) * body.observed
-        robot = cls(id, tuple(settings.items()), limit, body.low, body.high, body.levels, scales, False)
-        scales = measured_scales(robot, body.bounds, MEASURED_STEPS, _SEED)
-        return cls(id, robot.settings, limit, body.low, body.high, body.levels, scales, is_repeatable(robot, _SEED))
+        action_space = body.low, body.high, body.levels
+        robot = cls(id, given, limit, *action_space, (1.0,) * body.observed, False)
+        return cls(id, given, limit, *action_space, measured_scales(robot, body.bounds), is_repeatable(robot))
 
 
 REGISTRY.add_family(FAMILY, GymnasiumRobot)
@@ -234,18 +238,6 @@ class _Environment(Body):
                 f"{self._name}: expected observations of {self.observed} numbers, got one of {len(observation)}"
             )
         return observation  # type: ignore[no-any-return]
-
-
-def _imported(id: str) -> None:
-    module = id.rpartition(":")[0]
-    if not module:
-        return
-    try:
-        importlib.import_module(module)
-    except (Exception, SystemExit) as error:
-        raise InvalidArgument(
-            f"robot: expected {FAMILY}:module:Id with a module that can be imported, got {first_line(error)}"
-        ) from error
 
 
 def _why(error: Exception | SystemExit) -> str:

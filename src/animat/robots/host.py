@@ -186,7 +186,8 @@ class Bodies:
         """Start an episode of each, or of some; returns the last observations of all."""
         for body in range(len(self._bodies)) if which is None else which:
             self._begin(body)
-        return self._expect_finite(self._at.observation).copy()
+        self._expect_finite()
+        return self.observation
 
     def step(self, commands: Float[np.ndarray, "bodies commands"]) -> Stepped:
         """One iteration of each; ended episodes wait for `begin`.
@@ -207,7 +208,7 @@ class Bodies:
         if kept.shape[1]:
             kept[np.arange(len(bodies)), iterations] = commands
         iterations += 1
-        self._expect_finite(observation)
+        self._expect_finite()
         if not np.isfinite(reward).all():
             raise BodyFailed(f"{robot.name}: expected finite rewards, got NaN or infinite ones")
         truncated |= iterations >= robot.episode_limit
@@ -252,12 +253,9 @@ class Bodies:
         self._at.episodes[body] += 1
         self._at.iterations[body] = 0
 
-    def _expect_finite(
-        self, observation: Float32[np.ndarray, "bodies observations"]
-    ) -> Float32[np.ndarray, "bodies observations"]:
-        if not np.isfinite(observation).all():
+    def _expect_finite(self) -> None:
+        if not np.isfinite(self._at.observation).all():
             raise BodyFailed(f"{self.robot.name}: expected finite observations, got NaN or infinite ones")
-        return observation
 
 
 def tried(robot: HostRobot, what: str, call: Callable[..., Answer], *arguments: Any) -> Answer:

@@ -8,27 +8,29 @@ import numpy as np
 
 from animat.robots.host import Bodies, HostRobot
 
+_MEASURED_STEPS = 1_000
+"""Of random commands, in episodes one after the other."""
 _REPEATED_STEPS = 50
+_SEED = 20_260_000
 
 
-def measured_scales(robot: HostRobot, bounds: Sequence[float], steps: int, seed: int) -> tuple[float, ...]:
+def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, ...]:
     """The scale of each observed number: its bound, or where none is known the root mean square over random commands.
 
     To two digits, so that it is the same where a processor rounds otherwise; 1 for what is always 0.
 
     Args:
         bounds: how large each number can be; 0 where that is not known.
-        steps: iterations, in episodes one after the other.
 
     Raises:
         BodyFailed: as `Bodies.step`.
     """
     if all(bounds):
         return tuple(map(float, bounds))
-    rng = np.random.default_rng(seed)
-    bodies = Bodies(robot, [(seed,)])
+    rng = np.random.default_rng(_SEED)
+    bodies = Bodies(robot, [(_SEED,)])
     observed = [bodies.begin()[0]]
-    for _ in range(steps):
+    for _ in range(_MEASURED_STEPS):
         stepped = bodies.step(_random_command(robot, rng))
         observed.append(stepped.observation[0])
         if stepped.ended[0]:
@@ -40,17 +42,17 @@ def measured_scales(robot: HostRobot, bounds: Sequence[float], steps: int, seed:
     )
 
 
-def is_repeatable(robot: HostRobot, seed: int) -> bool:
+def is_repeatable(robot: HostRobot) -> bool:
     """Whether an episode is the same again in a new body, by its seed and commands, whatever was before it."""
-    used, new = Bodies(robot, [(seed, 1)]), Bodies(robot, [(seed, 2)])
-    rng = np.random.default_rng(seed)
+    used, new = Bodies(robot, [(_SEED, 1)]), Bodies(robot, [(_SEED, 2)])
+    rng = np.random.default_rng(_SEED)
     used.begin()
     for _ in range(_REPEATED_STEPS):
         if used.step(_random_command(robot, rng)).ended[0]:
             break
-    again = Bodies(robot, [(seed, 2)])
+    again = Bodies(robot, [(_SEED, 2)])
     # The same episode, the one body fresh, the other after an episode of its own.
-    used.take_seeds([(seed, 2)])
+    used.take_seeds([(_SEED, 2)])
     starts = [each.begin() for each in (used, new, again)]
     if any(not np.array_equal(start, starts[0]) for start in starts):
         return False

@@ -55,13 +55,7 @@ def assess(
         after = jax.vmap(limited.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
         ends = going & jnp.logical_or(*after.ended)
         succeeded |= ends & jax.vmap(environment.succeeded)(after)
-        return (
-            index + 1,
-            after.carried,
-            going & ~ends,
-            returns + jnp.where(going, after.reward, 0.0),
-            succeeded,
-        )
+        return index + 1, after.carried, going & ~ends, returns + jnp.where(going, after.reward, 0.0), succeeded
 
     first = (jnp.int32(0), started, none == 0, none, none > 0)
     *_, returns, succeeded = jax.lax.while_loop(lambda at: jnp.any(at[2]), iteration, first)
@@ -206,9 +200,7 @@ class Course:
         """Each policy's share of successes, NaN for a robot that does not tell, and mean return."""
         key = jax.random.fold_in(jax.random.key(self._training.seed), MOST_POLICIES)
         returns, succeeded = map(np.asarray, self._programs[2](self.ranges, networks, simulator, key))
-        success = (
-            succeeded.mean(axis=1) if hasattr(self._training.robot, "succeeded") else np.full(len(returns), np.nan)
-        )
+        success = np.where(hasattr(self._training.robot, "succeeded"), succeeded.mean(axis=1), np.nan)
         return np.column_stack([success, returns.mean(axis=1, dtype=np.float64)])
 
     def _minute(self, index: int) -> float:

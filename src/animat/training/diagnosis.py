@@ -46,20 +46,17 @@ def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, ava
         learner: after a chunk.
         available: how many transitions its replay has; none give NaN.
     """
-    is_continuous, n_drawn = environment.n_actions is None, environment.n_drawn
+    n_drawn = environment.n_drawn
     uniforms = jax.random.uniform(jax.random.key(0), (1 + 2 * n_drawn, _TRANSITIONS))
     batch = batch_of(environment, learner.replay, available, uniforms[0])
     noise = uniforms[1:].reshape(2, n_drawn, _TRANSITIONS).swapaxes(1, 2)
     outputs = forward(learner.trained.actor, batch.observation)
-    if is_continuous:
-        critic_loss, _, _ = continuous_losses(
-            learner.trained, learner.targets, batch, noise, settings, paid_for_entropy(learner.exploration)
-        )
-        log_pi = squashed_normal(outputs, noise[1])[1]
+    paid = paid_for_entropy(learner.exploration)
+    if environment.n_actions is None:
+        critic_loss, _, _ = continuous_losses(learner.trained, learner.targets, batch, noise, settings, paid)
+        _, log_pi = squashed_normal(outputs, noise[1])
     else:
-        critic_loss, _, _ = discrete_losses(
-            learner.trained, learner.targets, batch, settings, paid_for_entropy(learner.exploration)
-        )
+        critic_loss, _, _ = discrete_losses(learner.trained, learner.targets, batch, settings, paid)
         log_pi = jnp.sum(jax.nn.softmax(outputs) * jax.nn.log_softmax(outputs), axis=-1)
     found = -jnp.mean(log_pi), jnp.exp(learner.trained.log_alpha), critic_loss
     return Diagnosis(*(jnp.where(available > 0, number, jnp.nan) for number in found))

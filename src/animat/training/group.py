@@ -211,17 +211,13 @@ class SideBySide:
         keys = [jax.random.fold_in(jax.random.key(each.training.seed), member) for each, member in self._places]
         self._diagnose = diagnosing(self._environment, training.algorithm)
         self._learners = beginning(jnp.stack(keys))
-        self._curve: list[np.ndarray] = []
+        self.curve: list[Float64[np.ndarray, "policies columns"]] = []
+        """The learning curves so far: of each part, a row a policy."""
 
     def split(self, rows: Rows) -> list[Rows]:
         """What there is of each policy, cut into that of each group."""
         ends = np.cumsum([len(group.members) for group in self._groups])
         return [rows[end - len(group.members) : end] for group, end in zip(self._groups, ends, strict=True)]
-
-    @property
-    def curve(self) -> Sequence[Float64[np.ndarray, "policies columns"]]:
-        """The learning curves so far: of each part, a row a policy."""
-        return self._curve
 
     def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
         """Train one chunk; returns the mean return of the episodes that ended in it, NaN for none.
@@ -254,7 +250,7 @@ class SideBySide:
         available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
         diagnosis = map(np.asarray, self._diagnose(self._learners, available))
         with np.errstate(invalid="ignore"):
-            self._curve.append(np.stack([iterations, episodes, returns / episodes, *diagnosis], axis=1))
+            self.curve.append(np.stack([iterations, episodes, returns / episodes, *diagnosis], axis=1))
         if self._course is not None:
             self._course.assess(index, self._learners.deployed, simulator)
         return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")
@@ -268,8 +264,8 @@ class SideBySide:
         return [self._policy(i) for i in range(len(self._places))]
 
     def _policy(self, i: int) -> Policy:
-        done = len(self._curve)
-        curve = np.stack(self._curve)[:, i] if done else np.zeros((0, len(CURVE)))
+        done = len(self.curve)
+        curve = np.stack(self.curve)[:, i] if done else np.zeros((0, len(CURVE)))
         now = self._as_policy(i, self._learners.deployed, curve)
         if self._course is None or not done or not self._groups[0].training.episodes_assessed:
             return now
@@ -279,18 +275,34 @@ class SideBySide:
         return replace(now, assessments=assessments, best=kept)
 
     def _as_policy(self, i: int, networks: Network, curve: np.ndarray) -> Policy:
-        network = jax.tree.map(lambda leaf: np.array(leaf[i]), networks)
-        return _policy(self._places[i][0], self._environment.scales, network, curve)
+        group, _ = self._places[i]
+        training, timeline = group.training, group.timeline
+        return Policy(
+            weights=tuple(np.array(layer.weight[i]) for layer in networks),
+            biases=tuple(np.array(layer.bias[i])[0] for layer in networks),
+            scales=self._environment.scales,
+            robot=training.robot,
+            mapping=training.mapping,
+            conditions=timeline.conditions if timeline and training.mapping is not None else (),
+            commands=training.commands,
+            window_ms=timeline.window_ms if timeline else None,
+            presentation=timeline.presentation if timeline else None,
+            readouts=timeline.readouts if timeline else ALL,
+            neural_observation=training.neural_observation,
+            pulse_cost=training.pulse_cost,
+            provenance=group.provenance,
+            learning_curve=curve,
+        )
 
     def keep(self, checkpoint: Path) -> None:
         """Write a checkpoint."""
         learners = self._learners._replace(key=jax.random.key_data(self._learners.key))
         leaves = jax.tree.leaves((learners, self._standing))
         arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-        arrays |= {"fingerprint": np.array(self.fingerprint), "done": np.array(len(self._curve))}
+        arrays |= {"fingerprint": np.array(self.fingerprint), "done": np.array(len(self.curve))}
         with atomic_write(checkpoint) as beside, beside.open("wb") as file:
             # Whose curves they are is for the live page alone.
-            np.savez(file, curve=np.stack(self._curve), members=[member for _, member in self._places], **arrays)
+            np.savez(file, curve=np.stack(self.curve), members=[member for _, member in self._places], **arrays)
 
     def resume(self, checkpoint: Path) -> int:
         """Go on from a checkpoint; returns how many chunks are done."""
@@ -299,7 +311,7 @@ class SideBySide:
         )
         if self._course is not None:
             self._course.standing = standing
-        self._curve = list(curve[:done])
+        self.curve = list(curve[:done])
         return done
 
     @property
@@ -310,27 +322,6 @@ class SideBySide:
     @property
     def _standing(self) -> Any:
         return () if self._course is None else self._course.standing
-
-
-def _policy(group: Group, scales: np.ndarray, actor: Any, curve: np.ndarray) -> Policy:
-    training, timeline = group.training, group.timeline
-    through_neurons = training.mapping is not None and timeline is not None
-    return Policy(
-        weights=tuple(layer.weight for layer in actor),
-        biases=tuple(layer.bias[0] for layer in actor),
-        scales=scales,
-        robot=training.robot,
-        mapping=training.mapping,
-        conditions=timeline.conditions if through_neurons and timeline else (),
-        commands=training.commands,
-        window_ms=timeline.window_ms if timeline else None,
-        presentation=timeline.presentation if timeline else None,
-        readouts=timeline.readouts if timeline else ALL,
-        neural_observation=training.neural_observation,
-        pulse_cost=training.pulse_cost,
-        provenance=group.provenance,
-        learning_curve=curve,
-    )
 
 
 def _read_checkpoint(
@@ -383,4 +374,4 @@ def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:
         fewest: groups at least, where there are as many policies: two keep two cores busy.
     """
     n_groups = max(-(-policies // 5), min(fewest, policies))
-    return [tuple(int(i) for i in part) for part in np.array_split(np.arange(policies), n_groups)]
+    return [tuple(part.tolist()) for part in np.array_split(np.arange(policies), n_groups)]

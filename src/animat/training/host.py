@@ -208,16 +208,14 @@ class _Chunks:
         flat = Standing(
             *(np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
         )
-        episodes = learners.episodes
         is_there = True
         if self._bodies is None or not flat.commands.shape[1]:
             self._bodies = Bodies(self._robot, self._seeds)
             is_there = self._bodies.stand(flat)
-        observation = self._by_policy(self._bodies.observation)
+        episodes = learners.episodes._replace(robot=self._by_policy(self._bodies.observation))
         if is_there:
-            return learners._replace(episodes=episodes._replace(robot=observation)), self._bodies
+            return learners._replace(episodes=episodes), self._bodies
         anew = episodes._replace(
-            robot=observation,
             iteration=jnp.zeros_like(episodes.iteration),
             info=jax.tree.map(jnp.zeros_like, episodes.info),
             neurons=jnp.broadcast_to(jnp.array(AT_FIRST, jnp.float32), episodes.neurons.shape),

@@ -50,4 +50,4 @@ def parts_that_fit(groups: Sequence[Group]) -> list[list[int]]:
     """
     available = _SHARE * device_memory_bytes()
     parts = 1 if math.isinf(available) else math.ceil(bytes_at_once(groups) / available)
-    return [[int(i) for i in part] for part in np.array_split(np.arange(len(groups)), min(parts, len(groups)))]
+    return [part.tolist() for part in np.array_split(np.arange(len(groups)), min(parts, len(groups)))]

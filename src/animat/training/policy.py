@@ -33,7 +33,7 @@ from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
 from animat.training.provenance import expect_provenance
 from animat.training.settings import PulseCost
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 FORMAT = "animat-policy-1"
 HIDDEN_ACTIVATION = "relu"
@@ -168,10 +168,8 @@ class Policy:
     @property
     def fitted(self) -> Dict[str, Any]:
         """How the simulators it was trained on were made: `FITTED` of a timeline; empty where that is not known."""
-        told = self.provenance.get("simulators")
-        if not (isinstance(told, Dict) and isinstance(told.get("kind"), str)):
-            return {}
-        return {name: told[name] for name in FITTED if name in told}
+        told = self.provenance.get("simulators") or {}
+        return {name: told[name] for name in FITTED if name in told} if "kind" in told else {}
 
     @property
     def recorded_at_min(self) -> tuple[float, ...]:
@@ -180,8 +178,7 @@ class Policy:
 
     @property
     def _trained(self) -> Dict[str, Any]:
-        told = self.provenance.get("training")
-        return told if isinstance(told, Dict) else {}
+        return self.provenance.get("training") or {}
 
     def trained_until_min(self, first_min: float) -> float | None:
         """The minute of the culture's clock that its training came to, where the first recording is of `first_min`.
@@ -269,9 +266,7 @@ class Policy:
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}
-        data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata)
-        with atomic_write(path) as beside:
-            beside.write_bytes(data)
+        write_whole(Path(path), save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata))
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Policy:

@@ -24,7 +24,7 @@ from animat.goals.robot import RobotWithGoal, without_goal
 from animat.neurons.simulator import NeuronSimulator, Stored
 from animat.robots.base import Robot
 from animat.training.lessons import Lesson
-from animat.wrappers import Wrapper
+from animat.wrappers import Wrapper, with_inmost
 
 Kind = TypeVar("Kind", bound=Robot[Any])
 
@@ -122,7 +122,10 @@ class Varied(Wrapper[RobotState]):
 
     def _with(self, parameters: Float[Array, " parameters"]) -> Environment[RobotState]:
         values = dict(zip(self.varying.parameters, parameters, strict=True))
-        return _with_robot(self.inside, with_parameters(self.robot, values)) if values else self.inside
+        if not values:
+            return self.inside
+        varied = with_parameters(self.robot, values)
+        return with_inmost(self.inside, lambda inmost: dataclasses.replace(inmost, robot=varied))  # type: ignore[type-var]
 
     def _drawn(self, state: State, simulator: NeuronSimulator | None) -> NeuronSimulator | None:
         if not self.varying.recordings:
@@ -193,9 +196,3 @@ def _between(key: PRNGKeyArray, ends: Float[Stored, "2 numbers"]) -> Float[Array
     low, high = jnp.asarray(ends)
     drawn: Float[Array, " numbers"] = low + (high - low) * jax.random.uniform(key, low.shape)
     return drawn
-
-
-def _with_robot(environment: Environment[RobotState], robot: Robot[RobotState]) -> Environment[RobotState]:
-    if isinstance(environment, Wrapper):
-        return dataclasses.replace(environment, inside=_with_robot(environment.inside, robot))
-    return dataclasses.replace(environment, robot=robot)  # type: ignore[type-var]
