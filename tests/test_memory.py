@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 import animat.gym  # noqa: F401
-from animat.cli.train import _memory
+from animat.cli.train import _memories
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
@@ -29,7 +29,7 @@ from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
-from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory, found_memory
+from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
@@ -260,33 +260,6 @@ def test_a_condition_of_few_responses_takes_nothing_from_the_others() -> None:
     slopes, expected = (np.asarray(each.toward)[:2, 1] for each in (simulator, whole))
     np.testing.assert_allclose(slopes, expected, rtol=0.35)
     assert np.all(np.isfinite(simulator.toward))
-
-
-def test_what_responses_hang_on_is_told_by_all_recordings_together() -> None:
-    """Slopes of four recordings lie nearer to the mean of many others' than slopes of a single recording do."""
-    memory = Memory(0.0, 0.0, 0.7, 2.0)
-    usual = np.mean([fit_memory(loaded(300, 100 + i, slope=-60.0), memory=memory).toward for i in range(60)], axis=0)
-    alone, together = [], []
-    for seed in range(10):
-        series = [loaded(300, 4 * seed + i, slope=-60.0) for i in range(4)]
-        alone += [np.asarray(fit_memory(each, memory=memory).toward) - usual for each in series]
-        together.append(np.asarray(fit_memory(series[0], series=series, memory=memory).toward) - usual)
-    assert np.mean(np.square(together)) < 0.5 * np.mean(np.square(alone))
-
-
-def test_recordings_of_a_culture_share_a_memory_and_keep_their_responses() -> None:
-    series = [replace(loaded(600, i, slope=-60.0), start_min=10.0 * i) for i in range(3)]
-    # Of the last one the times of trials are not known: it has no load, and takes none from the others.
-    series[2] = replace(series[2], presented=replace(series[2].presentations[0], time_s=None))
-    simulators = [fit_timeline(series, kind="memory").at(10.0 * i) for i in range(3)]
-    memory = found_memory(series)
-    expected = [memory, memory, memory._replace(load_s=0.0)]
-    found = [simulator.memory for simulator in simulators]  # type: ignore[attr-defined]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
-    for simulator, responses in zip(simulators, series, strict=True):
-        for c in range(3):
-            kept = np.asarray(simulator.after_hz)[c, : simulator.followers[c]]  # type: ignore[attr-defined]
-            np.testing.assert_allclose(np.sort(kept), np.sort(responses.rates_of(c)), rtol=1e-6)
 
 
 def test_responses_that_are_all_the_same_have_no_slopes() -> None:
@@ -759,17 +732,19 @@ def test_too_few_to_draw_the_nearest_from_is_told() -> None:
 
 
 def test_training_tells_what_is_remembered() -> None:
-    series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9), seed=seed) for seed in (1, 2)]
-    series[1] = replace(series[1], start_min=10.0)
-    (told,) = _memory(fit_timeline(series, kind="memory"))
-    decay, weight, neighbour_exponent, _ = found_memory(series)
-    assert told.startswith(f"memory: a response depends on those before it (decay {decay:.2g} a trial; ")
-    assert f"stimuli count {weight:.2g} where responses count 1; " in told
-    assert told.endswith(f"drawn from the n^{neighbour_exponent:.2g} of n with the nearest histories)")
-    (told,) = _memory(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
-    assert told.endswith(" and on how much was stimulated in the last 1 s")
-    assert list(_memory(fit_timeline([independent(0)], kind="memory"))) == ["memory: none was found"]
-    assert not list(_memory(fit_timeline(series)))
+    series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
+    series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
+    first, last = _memories(fit_timeline(series, kind="memory"))
+    decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
+    assert first.startswith(
+        f"memory at 0 min: {decay:.2g} of the history state is left by each trial, which weighs {weight:g} "
+    )
+    assert f"one of the n^{neighbour_exponent:.2g} responses" in first
+    assert "tells too" not in first
+    (told,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
+    assert told.endswith("; how much was stimulated in the last 1 s tells too")
+    assert last == "memory at 10 min: none was found"
+    assert not list(_memories(fit_timeline(series)))
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:

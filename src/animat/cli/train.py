@@ -250,21 +250,22 @@ def _control(timeline: SimulatorTimeline) -> str:
         told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
     said = next((f.message for f in timeline.findings if f.name == "difference"), None)
     first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
-    return "\n".join([first, *([f"in the recording {said}"] if said else []), *_memory(timeline)])
+    return "\n".join([first, *([f"in the recording {said}"] if said else []), *_memories(timeline)])
 
 
-def _memory(timeline: SimulatorTimeline) -> Iterator[str]:
-    """What the simulators remember, where they are of the kind that does: the same of all recordings."""
+def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
+    """What each simulator remembers, where they are of the kind that does."""
     from animat.neurons.history import NO_MEMORY
     from animat.neurons.memory import MemorySimulator
 
-    simulator = timeline.at(float(timeline.start_min[-1]))
-    if isinstance(simulator, MemorySimulator):
-        decay, weight, reach, load_s = memory = simulator.memory
-        told = (
-            f"a response depends on those before it (decay {decay:.2g} a trial; stimuli count {weight:.2g} where "
-            f"responses count 1; it is drawn from the n^{reach:.2g} of n with the nearest histories)"
-        )
-        if load_s:
-            told += f" and on how much was stimulated in the last {load_s:g} s"
-        yield f"memory: {'none was found' if memory == NO_MEMORY else told}"
+    for start_min in timeline.start_min.tolist():
+        simulator = timeline.at(start_min)
+        if isinstance(simulator, MemorySimulator):
+            decay, weight, reach, load_s = memory = simulator.memory
+            told = (
+                f"{decay:.2g} of the history state is left by each trial, which weighs {weight:.2g} beside its answer; "
+                f"one of the n^{reach:.2g} responses with the nearest history states is drawn"
+            )
+            if load_s:
+                told += f"; how much was stimulated in the last {load_s:g} s tells too"
+            yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

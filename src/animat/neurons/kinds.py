@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal, get_args
 
 from animat.errors import InvalidArgument
@@ -24,10 +23,9 @@ def fit_simulator(
     range_hz: float | None = None,
     room: int | None = None,
     memory: Memory | None = None,
-    series: Sequence[Responses] = (),
 ) -> NeuronSimulator:
     """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others and of
-    histograms of several readouts, `memory` and `series` of one with memory.
+    histograms of several readouts, `memory` of one.
 
     Raises:
         InvalidArgument: for another kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
@@ -40,5 +38,5 @@ def fit_simulator(
     if kind == "empirical":
         return fit_empirical(responses, room=room)
     if kind == "memory":
-        return fit_memory(responses, series=series, room=room, memory=memory)
+        return fit_memory(responses, room=room, memory=memory)
     raise InvalidArgument(f"kind: expected one of {', '.join(get_args(Kind))}, got {kind!r}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -28,9 +28,6 @@ _UNLIKELY = 0.01
 """How often a load would explain as much by chance, at most."""
 _CERTAIN = 2.0
 """Standard errors by which a memory must tell responses better than none: the best of many does by chance, a little."""
-
-_Errors: TypeAlias = Float64[np.ndarray, " responses"]
-_Centred: TypeAlias = tuple[Float64[np.ndarray, " responses"], Float64[np.ndarray, "responses 2"]]
 
 
 @jax.tree_util.register_dataclass
@@ -114,13 +111,7 @@ class MemorySimulator(EmpiricalSimulator):
         return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
 
 
-def fit_memory(
-    responses: Responses,
-    *,
-    series: Sequence[Responses] = (),
-    room: int | None = None,
-    memory: Memory | None = None,
-) -> MemorySimulator:
+def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory | None = None) -> MemorySimulator:
     """Keep every condition's non-burst responses, and what was before them, to draw from.
 
     What is remembered, and the neighbour exponent, are found by leaving out each response in turn and telling it, in
@@ -130,13 +121,9 @@ def fit_memory(
     either. Where there is, and the times of the trials are known, a load of one second is taken too if it explains
     ranks beyond the trace (p < 0.01, F test of linear regressions).
 
-    How much a response hangs on its history is the culture's, and one recording tells it badly: where there are more of
-    the same culture, all of them tell it, each by ranks among its own responses.
-
     Args:
         responses: of one recording, every condition with at least one non-burst response. Those that came after a
             burst, which the simulator never answers itself, are only drawn where a condition has no others.
-        series: of all recordings of the culture, these among them, with the same conditions; none: of these alone.
         room: as in `fit_empirical`.
         memory: to be used in place of the one that is found: for responses that are drawn from others.
 
@@ -148,8 +135,7 @@ def fit_memory(
     """
     values = fit_empirical(responses, room=room)
     ranked = Ranked(responses)
-    series = series or (responses,)
-    memory = memory or found_memory(series)
+    memory = memory or _found(ranked)
     trace, load = ranked.traces(memory), ranked.loads(memory.load_s)
     memory = memory if load.added else memory._replace(load_s=0.0)
     history, state = (np.stack([trace, each], axis=-1) for each in (load.at, load.after))
@@ -157,8 +143,7 @@ def fit_memory(
     before, after, left = np.full(shape, np.inf), np.zeros(values.values_hz.shape), np.zeros(shape)
     histories, toward = np.zeros((*shape, 2)), np.tile([1.0, 0.0], (shape[0], 1))
     if memory.load_s:
-        every = [ranked if each is responses else Ranked(each) for each in series]
-        toward = _slopes(_centred(every, memory), len(every))
+        toward = _slopes([ranked.rank[rows] for rows in ranked.rows], [history[rows] for rows in ranked.rows])
     for condition, rows in enumerate(ranked.rows):
         at = history[rows] @ toward[condition]
         in_order = rows[np.argsort(at, kind="stable")]
@@ -184,30 +169,18 @@ def fit_memory(
     )
 
 
-def found_memory(series: Sequence[Responses]) -> Memory:
-    """The memory that tells the responses of all recordings of a culture best (see `fit_memory`)."""
-    return _found([Ranked(responses) for responses in series])
-
-
-def _found(every: Sequence[Ranked]) -> Memory:
-    rows = [[rows for rows in ranked.rows if len(rows) > 1] for ranked in every]
-    if not any(rows):
+def _found(ranked: Ranked) -> Memory:
+    """The memory that tells responses best, as `fit_memory` says."""
+    rows = [rows for rows in ranked.rows if len(rows) > 1]
+    if not rows:
         return NO_MEMORY
-
-    def errors_of(in_order: Sequence[Sequence[Int64[np.ndarray, " rows"]]], neighbour_exponent: float) -> _Errors:
-        pairs = zip(every, in_order, strict=True)
-        return np.concatenate([_errors(ranked.rank, each, neighbour_exponent) for ranked, each in pairs])
-
     # With all of them nearest, every history is as good as any.
-    errors = {NO_MEMORY: errors_of(rows, 1.0)}
+    errors = {NO_MEMORY: _errors(ranked.rank, rows, 1.0)}
     for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
-        histories = [ranked.traces(Memory(decay, weight, 1.0)) for ranked in every]
-        in_order = [
-            [each[np.argsort(history[each], kind="stable")] for each in of]
-            for history, of in zip(histories, rows, strict=True)
-        ]
+        history = ranked.traces(Memory(decay, weight, 1.0))
+        in_order = [each[np.argsort(history[each], kind="stable")] for each in rows]
         for neighbour_exponent in _EXPONENTS:
-            errors[Memory(decay, weight, neighbour_exponent)] = errors_of(in_order, neighbour_exponent)
+            errors[Memory(decay, weight, neighbour_exponent)] = _errors(ranked.rank, in_order, neighbour_exponent)
     best = min(errors, key=lambda memory: float(errors[memory].mean()))
 
     def is_as_good(memory: Memory, standard_errors: float) -> bool:
@@ -218,39 +191,36 @@ def _found(every: Sequence[Ranked]) -> Memory:
         return NO_MEMORY
     alike = [memory for memory in errors if memory[:2] == best[:2] and memory.neighbour_exponent < 1]
     found = max((memory for memory in alike if is_as_good(memory, 1.0)), key=lambda each: each.neighbour_exponent)
-    with_load = found._replace(load_s=_LOAD_S)
-    timed = [ranked for ranked in every if ranked.loads(_LOAD_S).added]
-    return with_load if timed and _has_load(_centred(timed, with_load), len(timed)) else found
+    return found._replace(load_s=_LOAD_S if _has_load(ranked, found) else 0.0)
 
 
-def _centred(every: Sequence[Ranked], memory: Memory) -> list[_Centred]:
-    """Ranks of each condition's responses, with trace and load before them, each from its mean in its recording."""
-    parts: list[list[_Centred]] = [[] for _ in every[0].rows]
-    for ranked in every:
-        history = np.stack([ranked.traces(memory), ranked.loads(memory.load_s).at], axis=-1)
-        for part, rows in zip(parts, ranked.rows, strict=True):
-            part.append((ranked.rank[rows] - ranked.rank[rows].mean(), history[rows] - history[rows].mean(axis=0)))
-    return [(np.concatenate([rank for rank, _ in part]), np.concatenate([x for _, x in part])) for part in parts]
-
-
-def _has_load(centred: Sequence[_Centred], recordings: int) -> bool:
+def _has_load(ranked: Ranked, memory: Memory) -> bool:
     """Whether a load explains ranks that the trace does not."""
     from scipy.stats import f
 
-    def squares_left(columns: int) -> float:
-        """By a linear regression of each condition on its own."""
-        fits = [(rank, x[:, :columns], np.linalg.lstsq(x[:, :columns], rank, rcond=None)[0]) for rank, x in centred]
-        return sum(float(np.sum((rank - x @ slopes) ** 2)) for rank, x, slopes in fits)
+    trace, load = ranked.traces(memory), ranked.loads(_LOAD_S)
+    if not load.added:
+        return False
+    # Of each condition on its own, so that its mean explains nothing.
+    one = np.concatenate([np.eye(len(ranked.rows))[[c] * len(rows)] for c, rows in enumerate(ranked.rows)])
+    every = np.concatenate(ranked.rows)
+    rank = ranked.rank[every]
 
-    without, with_load = squares_left(1), squares_left(2)
-    more = len(centred)
-    left = sum(len(rank) for rank, _ in centred) - (recordings + 2) * more
+    def squares_left(*given: Float64[np.ndarray, " responses"]) -> float:
+        """By a linear regression."""
+        design = np.concatenate([one * x[every, None] for x in (np.ones_like(trace), *given)], axis=1)
+        return float(np.sum((rank - design @ np.linalg.lstsq(design, rank, rcond=None)[0]) ** 2))
+
+    without, with_load = squares_left(trace), squares_left(trace, load.at)
+    more, left = len(ranked.rows), len(every) - 3 * len(ranked.rows)
     if left <= 0 or with_load <= 0:
         return False
     return bool(f.sf((without - with_load) / more / (with_load / left), more, left) < _UNLIKELY)
 
 
-def _slopes(centred: Sequence[_Centred], recordings: int) -> Float64[np.ndarray, "conditions 2"]:
+def _slopes(
+    ranks: Sequence[Float64[np.ndarray, " rows"]], histories: Sequence[Float64[np.ndarray, "rows 2"]]
+) -> Float64[np.ndarray, "conditions 2"]:
     """Slopes of each condition's ranks over trace and load, shrunk towards those of all conditions together.
 
     Least squares of some hundred responses tell a slope to about its own size. What slopes of conditions differ by
@@ -258,14 +228,17 @@ def _slopes(centred: Sequence[_Centred], recordings: int) -> Float64[np.ndarray,
 
     Source: Morris 1983 (doi:10.1080/01621459.1983.10477920).
     """
+    centred = [
+        (rank - rank.mean(), history - history.mean(axis=0)) for rank, history in zip(ranks, histories, strict=True)
+    ]
     squares = np.array([x.T @ x for _, x in centred])
     products = np.array([x.T @ y for y, x in centred])
     common = np.linalg.lstsq(squares.sum(axis=0), products.sum(axis=0), rcond=None)[0]
-    n = sum(len(y) for y, _ in centred) - recordings * len(centred) - 2
+    n = sum(map(len, ranks)) - len(ranks) - 2
     variance = sum(float(np.sum((y - x @ common) ** 2)) for y, x in centred) / max(n, 1)
-    slopes = np.tile(common, (len(centred), 1))
+    slopes = np.tile(common, (len(ranks), 1))
     # The slopes of a few responses would tell more of chance than of how conditions differ.
-    known = [i for i, of in enumerate(squares) if len(centred[i][0]) >= _FEWEST and np.linalg.matrix_rank(of) == 2]
+    known = [i for i, of in enumerate(squares) if len(ranks[i]) >= _FEWEST and np.linalg.matrix_rank(of) == 2]
     if len(known) < 2 or variance <= 0:
         return slopes
     errors = variance * np.linalg.inv(squares[known])

@@ -13,7 +13,6 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument, Mismatch
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.memory import found_memory
 from animat.neurons.simulator import NeuronSimulator, placed, stacked
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, other_stimulus
@@ -160,10 +159,7 @@ def fit_timeline(
         raise Mismatch(f"start_min: expected one recording a minute mark, got two at {twice:g} min")
 
     room = room_for(ordered)
-    fit: dict[str, Any] = {"kind": kind, "bins": bins, "range_hz": range_hz, "room": room}
-    if kind == "memory":
-        fit |= {"memory": found_memory(ordered), "series": ordered}
-    fitted = [fit_simulator(responses, **fit) for responses in ordered]
+    fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(
         replace(finding, message=f"at {responses.start_min:g} min: {finding.message}", at_min=responses.start_min)

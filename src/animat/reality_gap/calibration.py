@@ -92,22 +92,15 @@ class Calibration:
         row = timeline.row_asked_for(at_min)
         start_min = float(timeline.start_min[row])
         responses = next(each for each in series if each.start_min == start_min)
-        others = [each for each in timeline.responses if each.start_min != start_min]
         rng = np.random.default_rng(0)
         simulator = timeline.at(start_min)
         # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
         memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
         # All of one shape: what runs on them is compiled once.
         fit |= {"memory": memory, "room": room_for(series)}
-
-        def bootstrap() -> NeuronSimulator:
-            drawn = responses.bootstrapped(rng)
-            # What a response hangs on is told by all recordings, which could as well have been others too.
-            return fit_simulator(drawn, **fit, series=[drawn, *(each.bootstrapped(rng) for each in others)])
-
         calibration = cls(
             simulator=simulator,
-            bootstraps=tuple(bootstrap() for _ in range(BOOTSTRAPS)),
+            bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
