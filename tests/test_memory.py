@@ -736,13 +736,11 @@ def test_training_tells_what_is_remembered() -> None:
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
     decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
-    assert first.startswith(
-        f"memory at 0 min: {decay:.2g} of the history state is left by each trial, which weighs {weight:g} "
-    )
-    assert f"one of the n^{neighbour_exponent:.2g} responses" in first
-    assert "tells too" not in first
+    assert first.startswith(f"memory at 0 min: a response depends on those before it (decay {decay:.2g} a trial; ")
+    assert f"stimuli count {weight:.2g} where responses count 1; " in first
+    assert first.endswith(f"drawn from the n^{neighbour_exponent:.2g} of n with the nearest histories)")
     (told,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
-    assert told.endswith("; how much was stimulated in the last 1 s tells too")
+    assert told.endswith(" and on how much was stimulated in the last 1 s")
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 

@@ -261,11 +261,11 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
     for start_min in timeline.start_min.tolist():
         simulator = timeline.at(start_min)
         if isinstance(simulator, MemorySimulator):
-            decay, weight, reach, load_s = memory = simulator.memory
+            decay, weight, exponent, load_s = memory = simulator.memory
             told = (
-                f"{decay:.2g} of the history state is left by each trial, which weighs {weight:.2g} beside its answer; "
-                f"one of the n^{reach:.2g} responses with the nearest history states is drawn"
+                f"a response depends on those before it (decay {decay:.2g} a trial; stimuli count {weight:.2g} where "
+                f"responses count 1; it is drawn from the n^{exponent:.2g} of n with the nearest histories)"
             )
             if load_s:
-                told += f"; how much was stimulated in the last {load_s:g} s tells too"
+                told += f" and on how much was stimulated in the last {load_s:g} s"
             yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

@@ -84,7 +84,7 @@ def run_session(
             that does not remember, or a session or a file `STOP` that is in the folder already.
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read.
-        InvalidFile: if the log cannot be begun.
+        InvalidFile: if a file is in the folder's place, or the log cannot be begun.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
     _check(culture, loop, agents, planned, seed)

@@ -117,7 +117,7 @@ def live(
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
-        InvalidArgument, Mismatch: before anything is delivered, as `animat.live.plan.check_plan` does.
+        InvalidArgument, InvalidFile, Mismatch: before anything is delivered, as `animat.live.plan.check_plan` does.
         BudgetSpent: if the budget does not hold the first recording.
         AnimatError: if a process that trains fails, or the culture does: the culture is then stopped, and recordings
             and policies are kept as they are.
