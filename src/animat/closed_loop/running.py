@@ -37,7 +37,7 @@ from animat.progress import Progress, Silent
 MOST_EPISODES = 100_000
 """Of each agent in a session."""
 _POLL_S = 0.02
-_BATCH, _PAUSE_S = 4, 5e-4
+_BATCH, _PAUSE_S = 4, 2.5e-4
 """Records written in a row, some 0.2 ms, and the pause after them: the loop's thread may have a deadline."""
 _SWITCH_S = 2e-4
 """How long the loop's thread may keep the interpreter while the log is waiting for it; Python's own is 5 ms."""
