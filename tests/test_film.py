@@ -17,6 +17,7 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
+from animat.errors import InvalidArgument
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.reading import read_sources
 from animat.recordings.synthetic import write_synthetic_series
@@ -156,7 +157,9 @@ def test_what_cannot_be_filmed_is_one_line_and_leaves_nothing(
         ("expected a film's name to end in .mp4 or .gif, got '.avi'", folder, "--out", tmp_path / "film.avi"),
         ("begins within the session's", folder, "--out", out, "--span-s", 1000, 1001),
         ("expected a start from 0 s and a later end", folder, "--out", out, "--span-s", 2, 1),
-        ("expected none with a session", folder, "--out", out, "--recordings", folder),
+        ("--recordings: expected none with a session", folder, "--out", out, "--recordings", folder),
+        ("--at-min: expected none with a session", folder, "--out", out, "--at-min", 0),
+        ("expected a session of cartpole, got one of navigation", folder, "--out", out, "--robot", "cartpole"),
     ):
         assert film(*arguments) == 1
         (line,) = capsys.readouterr().err.splitlines()
@@ -184,6 +187,9 @@ def test_policies_on_the_simulator_move_as_their_robot_does(tmp_path: Path, caps
     out = tmp_path / "film.gif"
     assert film(tmp_path / "p0.safetensors", "--recordings", tmp_path / "recordings", "--out", out) == 0
     assert "navigation on the simulator" in capsys.readouterr().out
+    for seed in (-1, 2**32):
+        with pytest.raises(InvalidArgument, match="seed: expected a whole number from 0 to 4294967295"):
+            scene_of_policies(policies, timeline, seed=seed)
     with Image.open(out) as gif:
         assert gif.n_frames > 1
 

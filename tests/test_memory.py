@@ -738,7 +738,9 @@ def test_training_tells_what_is_remembered() -> None:
     decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
     assert first.startswith(f"memory at 0 min: a response depends on those before it (decay {decay:.2g} a trial; ")
     assert f"stimuli count {weight:.2g} where responses count 1; " in first
-    assert first.endswith(f"drawn from the n^{neighbour_exponent:.2g} of n with the nearest histories)")
+    n = int(np.median([np.count_nonzero(series[0].condition == c) for c in range(2)]))
+    near = int(np.median([np.rint(len(series[0].rates_of(c)) ** neighbour_exponent) for c in range(2)]))
+    assert first.endswith(f"drawn from the {near} of {n} with the nearest histories)")
     (told,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
     assert told.endswith(" and on how much was stimulated in the last 1 s")
     assert last == "memory at 10 min: none was found"

@@ -9,7 +9,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.plain_file import is_nothing
 
 
@@ -51,9 +51,12 @@ class Replay(Fitting):
         if is_nothing(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
-            if self.recordings:
-                raise InvalidArgument("--recordings: expected none with a session, which is shown as it was")
+            for option, given in (("--recordings", self.recordings or None), ("--at-min", self.at_min)):
+                if given is not None:
+                    raise InvalidArgument(f"{option}: expected none with a session, which is shown as it was")
             scene = scene_of_session(self.source, self.span_s)
+            if self.robot is not None and REGISTRY.name_of(self.robot) != scene.robot.name:
+                raise Mismatch(f"{self.source}: expected a session of {self.robot}, got one of {scene.robot.name}")
         else:
             scene = self._on_simulator()
         with Bar("drawing") as progress:
@@ -65,7 +68,9 @@ class Replay(Fitting):
         from animat.report.film.simulated import scene_of_policies
 
         if self.source.is_dir() and not any(self.source.glob("*.safetensors")):
-            raise InvalidArgument(f"{self.source}: expected a session (session.log) or policies in it, got neither")
+            raise InvalidArgument(
+                f"{self.source}: expected a session (session.log) or policies in this folder, got neither"
+            )
         policies = policies_for(self.robot, None, self.source)
         timeline = self.timeline_for(policies, self.recordings)
         return scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)

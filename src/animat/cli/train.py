@@ -255,16 +255,19 @@ def _control(timeline: SimulatorTimeline) -> str:
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
     """What each simulator remembers, where they are of the kind that does."""
+    import numpy as np
+
     from animat.neurons.history import NO_MEMORY
     from animat.neurons.memory import MemorySimulator
 
     for start_min in timeline.start_min.tolist():
         simulator = timeline.at(start_min)
         if isinstance(simulator, MemorySimulator):
-            decay, weight, exponent, load_s = memory = simulator.memory
+            decay, weight, _, load_s = memory = simulator.memory
+            near, of = (int(np.median(each)) for each in (simulator.nearest, simulator.followers))
             told = (
                 f"a response depends on those before it (decay {decay:.2g} a trial; stimuli count {weight:.2g} where "
-                f"responses count 1; it is drawn from the n^{exponent:.2g} of n with the nearest histories)"
+                f"responses count 1; it is drawn from the {near} of {of} with the nearest histories)"
             )
             if load_s:
                 told += f" and on how much was stimulated in the last {load_s:g} s"

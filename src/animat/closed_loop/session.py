@@ -267,7 +267,9 @@ def _expect_no_less(session: Session) -> None:
 
 def told_unanswered(session: Session) -> str:
     """What is to be known of pulses that were never answered, in a sentence."""
+    n = unanswered_pulses(session.outline)
+    pulses, them = ("1 pulse was", "it") if n == 1 else (f"{n} pulses were", "them")
     return (
-        f"{unanswered_pulses(session.outline)} pulses were asked for and never answered: whether they came is not "
-        f"known; {LOG_FILE} has their times and electrodes"
+        f"{pulses} asked for and never answered: whether the culture got {them} is not known; {LOG_FILE} has times and "
+        "electrodes"
     )

@@ -125,6 +125,12 @@ class Episodes:
     outcome: Outcome | None = None
 
 
+def check_seed(seed: int) -> None:
+    """Refuse a seed of more than 32 bits (InvalidArgument): JAX takes no more, and two would give the same draws."""
+    if not 0 <= seed < 2**32:
+        raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
+
+
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
     """Refuse episodes that are none, or more than fit: all of them are run side by side.
 
@@ -184,9 +190,7 @@ def roll_out(
         InvalidArgument: for fewer episodes than one or more than fit, or a seed of more than 32 bits.
     """
     check_at_once("episodes", episodes, n_actors)
-    # JAX takes 32 bits of a seed: beyond them two seeds would give the same draws.
-    if not 0 <= seed < 2**32:
-        raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
+    check_seed(seed)
     keys = jax.random.split(jax.random.key(seed), 1 if alike else n_actors)
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):

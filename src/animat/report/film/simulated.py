@@ -13,6 +13,7 @@ import numpy as np
 from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument
+from animat.evaluation.rollouts import check_seed
 from animat.neurons.timeline import SimulatorTimeline
 from animat.report.film.scene import Moment, Scene
 from animat.report.film.session import USUAL_S
@@ -47,8 +48,10 @@ def scene_of_policies(
         seed: decides every random draw.
 
     Raises:
-        InvalidArgument: for a span that begins after the last episode, or conditions that are not the policies'.
+        InvalidArgument: for a span that begins after the last episode, conditions that are not the policies', or a seed
+            of more than 32 bits.
     """
+    check_seed(seed)
     first = first_of_alike(policies, _ALIKE, "film it alone")
     from_s, to_s = span_s or (0.0, USUAL_S)
     robot, simulator = first.robot, None
