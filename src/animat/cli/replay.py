@@ -46,8 +46,7 @@ class Replay(Fitting):
             raise InvalidArgument(
                 f"--span-s: expected a start from 0 s and a later end, got {self.span_s[0]:g} {self.span_s[1]:g}"
             )
-        if self.robot is not None:
-            REGISTRY.name_of(self.robot)
+        expected = None if self.robot is None else REGISTRY.name_of(self.robot)
         if is_nothing(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
@@ -55,8 +54,11 @@ class Replay(Fitting):
                 if given is not None:
                     raise InvalidArgument(f"{option}: expected none with a session, which is shown as it was")
             scene = scene_of_session(self.source, self.span_s)
-            if self.robot is not None and REGISTRY.name_of(self.robot) != scene.robot.name:
-                raise Mismatch(f"{self.source}: expected a session of {self.robot}, got one of {scene.robot.name}")
+            if expected not in (None, scene.robot.name):
+                raise Mismatch(
+                    f"{self.source}: expected a session of {expected}, got one of {scene.robot.name}; give another, or "
+                    "no --robot"
+                )
         else:
             scene = self._on_simulator()
         with Bar("drawing") as progress:
