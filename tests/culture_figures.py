@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -142,7 +143,7 @@ def network_bursts_s(rig: Rig) -> np.ndarray:
 
 @dataclasses.dataclass
 class Figures:
-    """The acceptance figures of one seed; lists are over the five frequencies."""
+    """The acceptance figures of one seed, or of several; lists are over the five frequencies."""
 
     seed: int
     channel_rate_hz: float
@@ -166,6 +167,8 @@ class Figures:
     mixed_hz: list[float]
     mixed_five_hz: list[float]
     over_median: dict[str, list[float]]
+    kept: dict[int, np.ndarray]
+    """Responses of the first recording that are no bursts, in Hz."""
 
 
 def measure(seed: int, parameters: TissueParameters | None = None) -> Figures:
@@ -234,6 +237,7 @@ def measure(seed: int, parameters: TissueParameters | None = None) -> Figures:
         mixed_hz=median_of["mixed, 1 pulse"],
         mixed_five_hz=median_of["mixed, 5 pulses"],
         over_median=over_median,
+        kept=quiet,
     )
 
 
@@ -305,9 +309,23 @@ def print_often(seeds: list[int]) -> None:
         )
 
 
+def of_all(rows: list[Figures]) -> Figures:
+    """The figures over all seeds: means, and distributions of the responses of all seeds together."""
+    together = {f: np.concatenate([row.kept[f] for row in rows]) for f in FREQUENCIES_HZ}
+    averaged: dict[str, Any] = {
+        field.name: np.mean([getattr(row, field.name) for row in rows], axis=0).tolist()
+        for field in dataclasses.fields(Figures)
+        if field.type in ("float", "list[float]")
+    }
+    averaged["ratio"] = averaged["medians_hz"][-1] / averaged["medians_hz"][0]
+    averaged["right_short"] = short_of(together)
+    return dataclasses.replace(rows[0], **averaged, kept=together)
+
+
 def main(seeds: list[int]) -> None:
     """Print the table of the docs."""
     rows = [measure(seed) for seed in seeds]
+    columns = [*rows, of_all(rows)]
 
     def line(name: str, bound: str, values: list[str]) -> None:
         print(f"| {name} | {bound} | {' | '.join(values)} |")
@@ -315,29 +333,31 @@ def main(seeds: list[int]) -> None:
     def hz(values: list[float]) -> str:
         return " ".join(f"{value:.1f}" for value in values)
 
-    line("figure", "bound", [f"seed {f.seed}" for f in rows])
-    print("|---" * (2 + len(rows)) + "|")
-    line("spontaneous rate, Hz a channel", "0.3-4", [f"{f.channel_rate_hz:.2f}" for f in rows])
-    line("network bursts a minute (100-800 ms), first two minutes", "2-15", [f"{f.bursts_per_min:.1f}" for f in rows])
-    line("their mean duration, ms", "100-800", [f"{f.burst_ms:.0f}" for f in rows])
-    line("medians at 5, 10, 20, 40, 80 Hz", "seed means rise", [hz(f.medians_hz) for f in rows])
-    line("80/5 ratio", "1.6-3", [f"{f.ratio:.2f}" for f in rows])
-    right = [f"no, by {f.right_short:.2f}" if f.right_short else "yes" for f in rows]
+    line("figure", "bound", [*(f"seed {f.seed}" for f in rows), "all"])
+    print("|---" * (2 + len(columns)) + "|")
+    line("spontaneous rate, Hz a channel", "0.3-4", [f"{f.channel_rate_hz:.2f}" for f in columns])
+    bursts = [f"{f.bursts_per_min:.1f}" for f in columns]
+    line("network bursts a minute (100-800 ms), first two minutes", "2-15", bursts)
+    line("their mean duration, ms", "100-800", [f"{f.burst_ms:.0f}" for f in columns])
+    line("medians at 5, 10, 20, 40, 80 Hz", "seed means rise", [hz(f.medians_hz) for f in columns])
+    line("80/5 ratio", "1.6-3", [f"{f.ratio:.2f}" for f in columns])
+    right = [f"no, by {f.right_short:.3f}" if f.right_short else "yes" for f in columns]
     line("80 Hz right of 5 Hz at every edge", "yes", right)
-    line("between-class over total variance", "> 0.6", [f"{f.separability:.2f}" for f in rows])
-    line("smallest non-burst share", "0.9 or more", [f"{f.smallest_share:.2f}" for f in rows])
-    line("one pattern repeated: 80/5", "< 0.8", [f"{f.one_pattern_ratio:.2f}" for f in rows])
-    line("NMDA off: 80/5", "< 1.1", [f"{f.without_nmda_ratio:.2f}" for f in rows])
-    line("P(x > 18 Hz) at 140 min over 0 min", "0.4 or less", [f"{f.large_left:.2f}" for f in rows])
-    shares = [f"{f.burst_share_start:.3f} to {f.burst_share_end:.3f}" for f in rows]
+    line("between-class over total variance", "> 0.6", [f"{f.separability:.2f}" for f in columns])
+    line("smallest non-burst share", "0.9 or more", [f"{f.smallest_share:.2f}" for f in columns])
+    line("one pattern repeated: 80/5", "< 0.8", [f"{f.one_pattern_ratio:.2f}" for f in columns])
+    line("NMDA off: 80/5", "< 1.1", [f"{f.without_nmda_ratio:.2f}" for f in columns])
+    line("P(x > 18 Hz) at 140 min over 0 min", "0.4 or less", [f"{f.large_left:.2f}" for f in columns])
+    shares = [f"{f.burst_share_start:.3f} to {f.burst_share_end:.3f}" for f in columns]
     line("burst share, first and last three recordings", "falls", shares)
-    halves = [f"{f.half_active_start:.3f} to {f.half_active_end:.3f}" for f in rows]
+    halves = [f"{f.half_active_start:.3f} to {f.half_active_end:.3f}" for f in columns]
     line("responses with more than half of the channels active", "falls", halves)
-    line("mixed, one pulse: medians", "seed means rise", [hz(f.mixed_hz) for f in rows])
-    line("missed", "none", ["; ".join(missed(f)) or "none" for f in rows])
-    print("\nSeed means, blocked:", hz(list(np.mean([f.medians_hz for f in rows], axis=0))))
-    print("Seed means, mixed, one pulse:", hz(list(np.mean([f.mixed_hz for f in rows], axis=0))))
-    print("Seed means, mixed, five pulses:", hz(list(np.mean([f.mixed_five_hz for f in rows], axis=0))))
+    line("mixed, one pulse: medians", "seed means rise", [hz(f.mixed_hz) for f in columns])
+    line("mixed, five pulses: medians", "", [hz(f.mixed_five_hz) for f in columns])
+    out = [missed(f) for f in columns]
+    if np.any(np.diff(columns[-1].medians_hz) <= 0):
+        out[-1].append("seed means of the medians rise")
+    line("missed", "none", ["; ".join(names) or "none" for names in out])
     print("\n| P(x >= P50) at 5, 10, 20, 40, 80 Hz | " + " | ".join(f"seed {f.seed}" for f in rows) + " |")
     print("|---" * (1 + len(rows)) + "|")
     for name in rows[0].over_median:

@@ -288,7 +288,7 @@ def test_the_shared_noise_has_the_spread_and_the_correlation_that_are_said() -> 
 
 
 def test_all_neurons_of_a_community_get_the_same_of_it() -> None:
-    tissue = Tissue(1, dataclasses.replace(SILENT, shared_noise_mv=0.5))
+    tissue = Tissue(1, dataclasses.replace(SILENT, shared_noise_mv=0.5, communities=3))
     community = grow(1, tissue.parameters).community
     tissue.advance(0.5)
     drive_mv, shared_mv = tissue._state.drive_mv, tissue._state.shared_mv
