@@ -78,7 +78,7 @@ class Train(Fitting):
     cluster: str | None = None
     """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
     shared_folder: bool = True
-    """For workers that do not see --out at the same place: files go to them and back through this process"""
+    """Whether its workers see --out at the same place; without, files go to them and back through this process"""
     tensorboard: Path | None = None
     """Folder for TensorBoard: the learning curves as they come, a run a policy; needs animat[tensorboard]"""
     out: Path = Path("policies")
