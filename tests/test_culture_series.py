@@ -241,7 +241,7 @@ def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
         patched.setattr(VirtualCulture, "settings", property(before))
         (file,) = record(tmp_path, sessions=1)
     there = "1" if told else "nothing"
-    with pytest.raises(Mismatch, match=rf"_0000_min.nwb: expected .*\(tissue_revision: {there} there, 5 now\)"):
+    with pytest.raises(Mismatch, match=rf"_0000_min.nwb: expected .*\(tissue_revision: {there} there, 6 now\)"):
         record(tmp_path, sessions=2)
     with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
         small_culture().restore_state(tmp_path / STATE_FILE)

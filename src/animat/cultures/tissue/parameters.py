@@ -7,7 +7,7 @@ from math import isfinite
 
 from animat.errors import InvalidArgument
 
-REVISION = 5
+REVISION = 6
 """Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
 before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
 another revision are then refused, in place of being gone on with as if they were of this tissue."""
@@ -81,7 +81,7 @@ class TissueParameters:
     nmda_ms: float = 110.0
     gaba_ms: float = 10.0
     """[L] Decay of the synaptic conductances."""
-    nmda_ratio: float = 0.785
+    nmda_ratio: float = 0.82
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
     nmda_saturation: float = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
@@ -105,9 +105,9 @@ class TissueParameters:
     """[C] Share of connections regardless of distance."""
     out_degree_sigma: float = 0.4
     """[C] Sigma of the log-normal spread of out-degrees."""
-    communities: int = 3
+    communities: int = 2
     """[C] Number of communities, each the neurons nearest to one of as many centres."""
-    between_share: float = 0.06
+    between_share: float = 0.035
     """[C] A connection between communities is this share as likely as one within, at the same distance."""
     delay_ms: float = 0.8
     """Delay of a synapse without distance."""
@@ -115,7 +115,7 @@ class TissueParameters:
     """[L] Speed of axons."""
 
     # Drive.
-    drive_mv: float = 9.54
+    drive_mv: float = 9.9
     drive_spread_mv: float = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
     community_drive_mv: float = 0.1
@@ -124,7 +124,7 @@ class TissueParameters:
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: float = 5.0
     """[C] Its time constant."""
-    shared_noise_mv: float = 0.78
+    shared_noise_mv: float = 0.6
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
     shared_noise_ms: float = 575.0
     """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
@@ -137,7 +137,7 @@ class TissueParameters:
     """[C] Sigma of its log-normal spread over neurons (median 1)."""
     kick_reach_um: float = 40.0
     """[C] The kick falls as 1 / (1 + (distance / reach)^2)."""
-    axons_per_electrode: float = 16.0
+    axons_per_electrode: float = 14.5
     """[C] Expected number of neurons that an electrode drives through their axons."""
     axon_reach_um: float = 500.0
     """[C] Their probability falls as exp(-distance / reach)."""
@@ -148,7 +148,7 @@ class TissueParameters:
     """[C] Latency: this, conduction, and a share of the spread that is each neuron's own."""
     axon_jitter_ms: float = 0.16
     """[L] Standard deviation of the latency from pulse to pulse."""
-    availability_loss: float = 0.037
+    availability_loss: float = 0.033
     """[C] Share of a neuron's availability lost with each spike."""
     availability_s: float = 2.8
     """[C] Time constant of its recovery (Goldental et al. 2014: failures above a critical frequency)."""
@@ -157,7 +157,7 @@ class TissueParameters:
     """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
 
     # What changes over minutes and hours.
-    scaling_loss: float = 5.5e-5
+    scaling_loss: float = 3e-5
     """[C] Share of all excitatory weights lost with a spike of each excitatory neuron (homeostatic scaling)."""
     scaling_min: float = 120.0
     """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
