@@ -234,7 +234,7 @@ def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
     monkeypatch.setattr("animat.execution.task.SILENT_S", 1.0 if freezes else 60.0)
     (notice := tmp_path / "told" / "a.json").parent.mkdir()
     log = tmp_path / "log"
-    elsewhere = ours.submit(carry_out_alone, Join("a", log=log, takes_s=0.5), tmp_path, notice)
+    elsewhere = ours.submit(carry_out_alone, Join("a", log=log, takes_s=3.0 if freezes else 0.5), tmp_path, notice)
     while not log.exists():
         time.sleep(0.01)
     (at_work,) = [pid for pid in children() if str(notice.with_suffix(".lock")) in open_files(pid)]
