@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import docstring_parser
 import numpy as np
 import pytest
 
@@ -777,6 +778,19 @@ def test_help_shows_no_none(command: str, capsys: pytest.CaptureFixture[str]) ->
     assert "options" in said
     assert "None" not in said
     assert "(default: )" not in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_help_says_of_an_option_is_one_paragraph(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    for option in docstring_parser.parse_from_object(COMMANDS[command]).params:
+        said = " ".join((option.description or "").split())
+        assert any(said in line for line in lines), said
 
 
 @pytest.mark.parametrize("arguments", [["live", "--help"], ["--version"]])

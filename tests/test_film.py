@@ -109,7 +109,7 @@ def test_a_gif_lasts_as_long_as_what_it_shows_and_moves(
     out = tmp_path / "film.gif"
     assert film(folder, "--out", out, "--span-s", 1, 3, "--json") == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation"}
+    assert told == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation", "lost_bytes": 0}
     durations_ms, pictures = [], []
     with Image.open(out) as gif:
         assert gif.size == (WIDTH_PX, HEIGHT_PX)
@@ -133,13 +133,21 @@ def test_an_mp4_has_as_many_pictures_as_it_should(folder: Path, tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
-def test_of_a_killed_session_what_is_there_is_shown(folder: Path, tmp_path: Path) -> None:
+def test_of_a_killed_session_what_is_there_is_shown(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = (folder / LOG_FILE).read_bytes()
     (tmp_path / LOG_FILE).write_bytes(log[: len(log) // 2])
     scene, whole = scene_of_session(tmp_path), scene_of_session(folder)
     assert 0 < len(scene.moments) < len(whole.moments)
     assert scene.moments == whole.moments[: len(scene.moments)]
     assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0, 0.5) == 0
+    (lost,) = [int(line.split()[0]) for line in capsys.readouterr().out.splitlines() if line.endswith("are lost")]
+    whole_records = len(log) // 2 - lost
+    assert whole_records > 0
+    (tmp_path / LOG_FILE).write_bytes(log[:whole_records])
+    assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0, 0.5) == 0
+    assert "lost" not in capsys.readouterr().out
 
 
 def test_what_cannot_be_filmed_is_one_line_and_leaves_nothing(

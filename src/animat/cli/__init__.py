@@ -277,7 +277,9 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
             kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None)]
     if option.default is None or option.default == ():
         kind = Annotated[kind, arg(help_behavior_hint="")]
-    return dataclasses.replace(option, type=kind)
+    said = option.helptext() if callable(option.helptext) else option.helptext
+    # Help takes an indented line of a docstring for a new paragraph.
+    return dataclasses.replace(option, type=kind, helptext=said and " ".join(said.split()))
 
 
 def _say_notes(error: BaseException) -> None:

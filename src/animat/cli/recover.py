@@ -20,7 +20,7 @@ class Recover:
 
     def run(self) -> dict[str, Any]:
         """Recover."""
-        from animat.closed_loop.session import recover_session, told_unanswered
+        from animat.closed_loop.session import recover_session, told_lost, told_unanswered
         from animat.progress import Bar
 
         with Bar("reading the log") as progress:
@@ -33,5 +33,5 @@ class Recover:
         if told["unanswered_pulses"]:
             print(told_unanswered(session))
         if told["lost_bytes"]:
-            print(f"{told['lost_bytes']} bytes of the log, from where it is torn or damaged on, are lost")
+            print(told_lost(told["lost_bytes"]))
         return {"recording": str(session.recording_file), **told}

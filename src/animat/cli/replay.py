@@ -36,6 +36,7 @@ class Replay(Fitting):
 
     def run(self) -> dict[str, Any]:
         """Film."""
+        from animat.closed_loop.session import told_lost
         from animat.progress import Bar
         from animat.report.film.session import is_session, scene_of_session
         from animat.report.film.writing import check_film, write_film
@@ -64,7 +65,10 @@ class Replay(Fitting):
         with Bar("drawing") as progress:
             write_film(scene, self.out, progress)
         print(f"{self.out}: {scene.title}, {scene.start_s:g} to {scene.stop_s:.1f} s")
-        return {"film": str(self.out), "span_s": [scene.start_s, scene.stop_s], "robot": scene.robot.name}
+        if scene.lost_bytes:
+            print(told_lost(scene.lost_bytes))
+        told = {"film": str(self.out), "span_s": [scene.start_s, scene.stop_s], "robot": scene.robot.name}
+        return told | {"lost_bytes": scene.lost_bytes}
 
     def _on_simulator(self) -> Any:
         from animat.report.film.simulated import scene_of_policies

@@ -265,6 +265,11 @@ def _expect_no_less(session: Session) -> None:
         )
 
 
+def told_lost(lost_bytes: int) -> str:
+    """What a log that is torn or damaged lacks, in a sentence."""
+    return f"{lost_bytes} bytes of the log, from where it is torn or damaged on, are lost"
+
+
 def told_unanswered(session: Session) -> str:
     """What is to be known of pulses that were never answered, in a sentence."""
     n = unanswered_pulses(session.outline)

@@ -58,6 +58,7 @@ class Scene:
         spike_times_s, spike_channels: that were seen, in the order of time.
         pulse_times_s: of all stimuli.
         n_channels: of the array; 0: there was none, and responses alone are shown.
+        lost_bytes: of a session's log, from where it is torn or damaged on; nothing of them is shown.
         runner_seed: of the runner that moved a robot on the host (`animat.closed_loop.runner.HostRunner`).
     """
 
@@ -71,4 +72,5 @@ class Scene:
     spike_channels: Int64[np.ndarray, " spikes"] = field(default_factory=_NO_CHANNELS.copy)
     pulse_times_s: Float64[np.ndarray, " pulses"] = field(default_factory=_NO_TIMES.copy)
     n_channels: int = 0
+    lost_bytes: int = 0
     runner_seed: tuple[int, int] = (0, 0)
