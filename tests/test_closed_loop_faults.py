@@ -618,7 +618,7 @@ def test_a_session_comes_back_whatever_its_files_are_like(
         raise error
 
     with monkeypatch.context() as patched, FakeCulture() as culture:
-        patched.setattr("animat.closed_loop.gathering.write_nwb", failing)
+        patched.setattr("animat.closed_loop.session.write_nwb", failing)
         session = run(tmp_path, culture, robot=Navigation(episode_limit=3))
     assert session.ending.by == "plan"
     assert str(error) in session.ending.message

@@ -1,28 +1,25 @@
-"""What a session's records come to, gathered as they are written, or read again by `animat recover`: the same way."""
+"""What a session's records come to, all but the spikes, and what its files are called."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from animat.closed_loop.header import Header
-from animat.closed_loop.log import Record, Records
-from animat.closed_loop.outline import Outline, electrode_pulses_of
+from animat.closed_loop.log import Record
+from animat.closed_loop.outline import Outline
 from animat.closed_loop.tick import Ending
-from animat.closed_loop.tick_table import TickTable
 from animat.errors import AnimatError, InvalidFile
-from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
-from animat.writing import atomic_write
 
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
@@ -137,69 +134,6 @@ class Gathered:
             presentation=header.presentation,
             **from_words(words),
         )
-
-
-class SessionFiles:
-    """Makes `ticks.csv` and `session.nwb` of records that are added one by one; within a `with`, complete or absent.
-
-    Args:
-        folder: of the session.
-        header: of the session.
-
-    Raises:
-        InvalidFile: on entering, if nothing can be written.
-    """
-
-    def __init__(self, folder: Path, header: Header) -> None:
-        self.gathered = Gathered(header)
-        self._folder, self._header = folder, header
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        beside = self._stack.enter_context(atomic_write(self._folder / TICKS_FILE))
-        file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
-        self._table = TickTable(file, self._header.conditions, self._header.observed, self._header.readouts)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.give_up()
-
-    def give_up(self) -> None:
-        """Remove what was not finished."""
-        # That there is no room to end it by then is known.
-        with suppress(OSError, InvalidFile):
-            self._stack.__exit__(_Unfinished, _Unfinished(), None)
-
-    def add(self, record: Record) -> None:
-        """Take in one record.
-
-        Raises:
-            OSError: if its line cannot be written.
-            UnusableData: for spikes that cannot be, perhaps those of an earlier record.
-        """
-        self.gathered.add(record)
-        if record.words["kind"] == "seen" and record.words["tick"]:
-            self._table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
-
-    def finish(self, records: Records, ending: Ending) -> None:
-        """Put the ticks in their place, and the recording after it: once it is there, so are both.
-
-        Args:
-            records: of the log, all of which were added.
-            ending: how the session ended.
-
-        Raises:
-            InvalidFile: if a file cannot be written.
-            UnusableData: for records that do not fit together.
-        """
-        self._stack.close()
-        recording = self.gathered.recording_without_spikes(ending)
-        counts = self.gathered.spike_counts
-        write_nwb(recording, self._folder / RECORDING_FILE, records.spike_blocks(), counts)
-
-
-class _Unfinished(Exception):
-    """Files that are no longer wanted."""
 
 
 @contextmanager

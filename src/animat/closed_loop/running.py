@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 
 from animat.closed_loop.agents import Agent, InTurn, interleaved
 from animat.closed_loop.driver import Driver
-from animat.closed_loop.gathering import LOG_FILE, STOP_FILE, SessionFiles
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
 from animat.closed_loop.interrupts import told_instead
 from animat.closed_loop.log import LogWriter, Record
@@ -98,19 +98,12 @@ def run_session(
     file = Path(folder) / LOG_FILE
     # As whoever reads the log has it.
     header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed)))
-    with ExitStack() as stack:
-        files = stack.enter_context(SessionFiles(file.parent, read_header(file, header)))
-        log = LogWriter(file, header)
-        stack.callback(log.close)
-        supervisor = _Supervisor(culture, loop, driver, log, files, progress, len(turns))
-        ending = supervisor.run()
-        gathered = files.gathered if supervisor.is_gathered else None
-        session = Session(file.parent, log.written(), ending, gathered)
+    read_header(file, header)
+    with closing(LogWriter(file, header)) as log:
+        ending = _Supervisor(culture, loop, driver, log, progress, len(turns)).run()
+        session = Session(file.parent, log.written(), ending)
         try:
-            if gathered is None:
-                session.write()
-            else:
-                files.finish(session.log.records, ending)
+            session.write()
         except Exception as error:
             # What was measured comes back, whatever its files are like.
             told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
@@ -126,14 +119,11 @@ class _Supervisor:
         loop: Loop,
         driver: Driver,
         log: LogWriter,
-        files: SessionFiles,
         progress: Progress,
         episodes: int,
     ) -> None:
-        self.is_gathered = True
-        """Whether `files` has all that is in the log."""
         self._culture, self._loop, self._driver = culture, loop, driver
-        self._log, self._files, self._progress, self._episodes = log, files, progress, episodes
+        self._log, self._progress, self._episodes = log, progress, episodes
         self._synced = time.monotonic()
         self._ending: Ending | None = None
         self._noted = self._seen = -1
@@ -214,7 +204,7 @@ class _Supervisor:
         records = self._driver.records
         # No more than are there now: a loop that is as fast as the log must not keep this thread from watching it.
         for number in range(len(records)):
-            self._append(records[0])
+            self._log.append(records[0])
             # Taken away only once it is written: a full disk loses none that could be written later.
             written = records.popleft().words
             self._seen = written["stretch"] if written["kind"] == "seen" else self._seen
@@ -224,22 +214,11 @@ class _Supervisor:
         asked = self._driver.under_way
         if asked is not None and asked.stretch > self._noted:
             # If the answer never comes, or the program is killed meanwhile, it is known what was asked for.
-            self._append(Record({"kind": "asked", **asked.to_dict()}))
+            self._log.append(Record({"kind": "asked", **asked.to_dict()}))
             self._noted = asked.stretch
         if time.monotonic() - self._synced > _SYNC_S:
             self._log.sync()
             self._synced = time.monotonic()
-
-    def _append(self, record: Record) -> None:
-        """Write a record, and take it in for the files that come of it."""
-        self._log.append(record)
-        if self.is_gathered:
-            try:
-                self._files.add(record)
-            except Exception:
-                # The log is what counts: they are made of it in the end, or it is said then why they cannot be.
-                self.is_gathered = False
-                self._files.give_up()
 
     def _finish(self, ending: Ending) -> Ending:
         """Write what is left, and how it ended."""
@@ -251,10 +230,10 @@ class _Supervisor:
             unfinished = self._driver.unfinished
             self._write()
             if unfinished is not None and unfinished.words["stretch"] > self._seen:
-                self._append(unfinished)
+                self._log.append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
             words = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
-            self._append(Record(words))
+            self._log.append(Record(words))
             self._log.sync()
         except OSError as error:
             left = len(self._driver.records)

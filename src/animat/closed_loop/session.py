@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
@@ -17,19 +17,20 @@ from animat.closed_loop.gathering import (
     RECORDING_FILE,
     TICKS_FILE,
     Gathered,
-    SessionFiles,
     expecting_a_session,
     unanswered_pulses,
 )
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, Records, read_log
-from animat.closed_loop.outline import Episode, Outline
+from animat.closed_loop.outline import Episode, Outline, electrode_pulses_of
 from animat.closed_loop.tick import Ending, Tick
+from animat.closed_loop.tick_table import TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.plain_file import expect_no_file
 from animat.progress import Progress
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
-from animat.writing import clear_away, exclusive_lock, is_unfinished
+from animat.writing import atomic_write, clear_away, exclusive_lock, is_unfinished
 
 _TOLD_EVERY = 1000
 
@@ -75,13 +76,11 @@ class Session:
         folder: where it is.
         log: all that was written.
         ending: how it ended.
-        gathered: what the log's records come to, where that is known already.
     """
 
     folder: Path
     log: Log
     ending: Ending
-    gathered: Gathered | None = field(default=None, repr=False)
 
     @property
     def recording_file(self) -> Path:
@@ -145,13 +144,21 @@ class Session:
         Raises:
             InvalidFile: if the log does not fit together, or a file cannot be written.
         """
-        with expecting_a_session(self.folder / LOG_FILE), SessionFiles(self.folder, self._header) as files:
-            for number, record in enumerate(self.log.records):
-                files.add(record)
-                if progress is not None and number % _TOLD_EVERY == 0:
-                    progress.update(number, len(self.log.records))
-            files.finish(self.log.records, self.ending)
-        object.__setattr__(self, "gathered", files.gathered)
+        header, records = self._header, self.log.records
+        gathered = Gathered(header)
+        with expecting_a_session(self.folder / LOG_FILE):
+            with atomic_write(self.ticks_file) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+                table = TickTable(file, header.conditions, header.observed, header.readouts)
+                for number, record in enumerate(records):
+                    gathered.add(record)
+                    if record.words["kind"] == "seen" and record.words["tick"]:
+                        table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
+                    if progress is not None and number % _TOLD_EVERY == 0:
+                        progress.update(number, len(records))
+            # Read once: what is asked for next is known.
+            vars(self)["_gathered"] = gathered
+            recording = gathered.recording_without_spikes(self.ending)
+            write_nwb(recording, self.recording_file, records.spike_blocks(), gathered.spike_counts)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
@@ -174,15 +181,13 @@ class Session:
     def _header(self) -> Header:
         return read_header(self.folder / LOG_FILE, self.log.header)
 
-    @property
+    @cached_property
     def _gathered(self) -> Gathered:
-        if self.gathered is None:
-            gathered = Gathered(self._header)
-            with expecting_a_session(self.folder / LOG_FILE):
-                for record in self.log.records:
-                    gathered.add(record)
-            object.__setattr__(self, "gathered", gathered)
-        return self.gathered  # type: ignore[return-value]
+        gathered = Gathered(self._header)
+        with expecting_a_session(self.folder / LOG_FILE):
+            for record in self.log.records:
+                gathered.add(record)
+        return gathered
 
 
 def read_session(path: str | os.PathLike[str]) -> Session:
