@@ -472,7 +472,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
     ("more", "words"),
     [
         (["--culture", "cl1", "--speed", "2"], "--speed: expected 1"),
-        (["--speed", "0"], "--speed: expected a number above 0, got 0"),
+        (["--speed", "0"], "--speed: expected more than 0, got 0"),
         (["--duration-min", "-1"], "--duration-min: expected"),
         (["--interval-min", "0.1"], "--interval-min: expected at least"),
         (["--trials", "0"], "--trials: expected at least 1"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -25,12 +25,8 @@ from animat.stimulation.selection import Selection, SelectionRule, select_electr
 from animat.stimulation.stimulus import Stimulus
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
     from animat.cultures.tissue import Pulse as TissuePulse
     from animat.cultures.tissue import Tissue, TissueParameters
-
-Settings = TypeVar("Settings", bound="DataclassInstance")
 
 NS = 1_000_000_000
 _STRETCH_S = 10.0
@@ -81,8 +77,7 @@ class VirtualCulture(ComputedCulture):
         if not 0 < scan_s <= 3600:
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")
         self.seed = seed
-        self._parameters = None if parameters is None else _with_floats(parameters)
-        self._rule, self._scan_s = rule or SelectionRule(), float(scan_s)
+        self._parameters, self._rule, self._scan_s = parameters, rule or SelectionRule(), float(scan_s)
         self._progress = progress or Silent()
         self._selection = selection
         self._scan: ScannedActivity | None = None
@@ -338,15 +333,3 @@ class VirtualCulture(ComputedCulture):
             self._now_ns = min(now_ns, round(self.tissue.now_s * NS))
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
-
-
-def _with_floats(settings: Settings) -> Settings:
-    """The same settings with 18 as 18.0 where a fraction may stand: one culture is then told in one text."""
-    changed: dict[str, Any] = {}
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if field.type in (float, "float"):
-            changed[field.name] = float(value)
-        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-            changed[field.name] = _with_floats(value)
-    return dataclasses.replace(settings, **changed)

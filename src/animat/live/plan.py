@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from animat.coding.mapping import N_PERCENTILES
 from animat.cultures.series import minutes_of
 from animat.errors import InvalidArgument, Mismatch
 from animat.plain_file import expect_no_file
+from animat.records import Positive, record
 from animat.responses.condition import Condition
 from animat.stimulation.protocol import Protocol
 from animat.training.folder import expect_trainable
@@ -30,7 +30,7 @@ RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 _NOT_OF_THE_LOOP = ("adaptive", "greedy")
 
 
-@dataclass(frozen=True)
+@record
 class Timetable:
     """When the culture is recorded.
 
@@ -43,14 +43,9 @@ class Timetable:
         InvalidArgument: for a number that is not above 0.
     """
 
-    interval_min: float = 10.0
-    duration_min: float = 60.0
-    speed: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("interval_min", "duration_min", "speed"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InvalidArgument(f"{name}: expected a number above 0, got {getattr(self, name)}")
+    interval_min: Positive = 10.0
+    duration_min: Positive = 60.0
+    speed: Positive = 1.0
 
     @property
     def recordings(self) -> int:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from math import isfinite
+from typing import Annotated
+
+from pydantic import Field
 
 from animat.errors import InvalidArgument
+from animat.records import Number, Positive, Share, Whole, record
 
 REVISION = 6
 """Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
 before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
 another revision are then refused, in place of being gone on with as if they were of this tissue."""
 
+FromZero = Annotated[Number, Field(ge=0)]
 
-@dataclass(frozen=True)
+
+@record
 class ShortTerm:
     """Short-term plasticity of one kind of synapse (Tsodyks, Pawelzik & Markram 1998, doi 10.1162/089976698300017502).
 
@@ -25,12 +29,12 @@ class ShortTerm:
         facilitation_ms: time constant of u; 0 for a synapse that does not facilitate.
     """
 
-    use: float
-    recovery_ms: float
-    facilitation_ms: float = 0.0
+    use: Annotated[Share, Field(gt=0)]
+    recovery_ms: Positive
+    facilitation_ms: FromZero = 0.0
 
 
-@dataclass(frozen=True)
+@record
 class TissueParameters:
     """The parameters of a virtual tissue; conductances are in units of the leak.
 
@@ -41,161 +45,141 @@ class TissueParameters:
     """
 
     # Size and place.
-    neurons: int = 1200
+    neurons: Annotated[Whole, Field(ge=10)] = 1200
     """[C] Number of neurons, spread uniformly over the array."""
-    excitatory_share: float = 0.8
+    excitatory_share: Share = 0.8
     """[L] Share of excitatory neurons."""
-    width_um: float = 3850.0
-    height_um: float = 2100.0
+    width_um: Positive = 3850.0
+    height_um: Positive = 2100.0
     """The array's sides."""
-    step_ms: float = 0.2
+    step_ms: Positive = 0.2
     """The time step."""
 
     # Membrane.
-    membrane_e_ms: float = 20.0
-    membrane_i_ms: float = 10.0
+    membrane_e_ms: Positive = 20.0
+    membrane_i_ms: Positive = 10.0
     """[L] Membrane time constants."""
-    leak_mv: float = -70.0
-    threshold_mv: float = -50.0
+    leak_mv: Number = -70.0
+    threshold_mv: Number = -50.0
     """[L] Leak reversal and resting threshold."""
-    reset_mv: float = -60.0
+    reset_mv: Number = -60.0
     """[C] Potential after a spike."""
-    potassium_mv: float = -80.0
-    gaba_mv: float = -70.0
+    potassium_mv: Number = -80.0
+    gaba_mv: Number = -70.0
     """[L] Reversal potentials of the after-hyperpolarisation and of inhibition; excitation reverses at 0."""
-    refractory_e_ms: float = 3.0
-    refractory_i_ms: float = 2.0
+    refractory_e_ms: Positive = 3.0
+    refractory_i_ms: Positive = 2.0
     """[L] Absolute refractory periods."""
-    hyperpolarisation: float = 0.0023
+    hyperpolarisation: Number = 0.0023
     """[C] Added to the potassium conductance by each spike."""
-    hyperpolarisation_ms: float = 25000.0
+    hyperpolarisation_ms: Positive = 25000.0
     """[L] Its time constant: after a train the sodium pump hyperpolarises for about 20 s (Gulledge et al. 2013,
     doi 10.1523/JNEUROSCI.0220-13.2013)."""
-    adaptation_mv: float = 0.27
+    adaptation_mv: Number = 0.27
     """[C] Added to the threshold by each spike."""
-    adaptation_ms: float = 126.0
+    adaptation_ms: Positive = 126.0
     """[C] Its time constant."""
 
     # Synapses.
-    ampa_ms: float = 3.0
-    nmda_ms: float = 110.0
-    gaba_ms: float = 10.0
+    ampa_ms: Positive = 3.0
+    nmda_ms: Positive = 110.0
+    gaba_ms: Positive = 10.0
     """[L] Decay of the synaptic conductances."""
-    nmda_ratio: float = 0.82
+    nmda_ratio: Number = 0.82
     """[L] NMDA conductance added for each unit of AMPA; 0 blocks NMDA."""
-    nmda_saturation: float = 2.0
+    nmda_saturation: Number = 2.0
     """[C] The NMDA conductance at which arrivals add no more."""
     e_to_e: ShortTerm = ShortTerm(0.12, 1090.0, 220.0)
     e_to_i: ShortTerm = ShortTerm(0.12, 200.0, 140.0)
     i_to_any: ShortTerm = ShortTerm(0.137, 665.0)
     """[C] within [L]: short-term plasticity."""
-    weight_ee: float = 0.56
-    weight_ei: float = 0.9483
-    weight_ie: float = 0.302
-    weight_ii: float = 0.94
+    weight_ee: Number = 0.56
+    weight_ei: Number = 0.9483
+    weight_ie: Number = 0.302
+    weight_ii: Number = 0.94
     """[C] Mean weights, from the first letter to the second."""
-    weight_sigma: float = 0.5
+    weight_sigma: Number = 0.5
     """[C] Sigma of the log-normal weights."""
-    in_degree_e: int = 52
-    in_degree_i: int = 30
+    in_degree_e: Whole = 52
+    in_degree_i: Whole = 30
     """[C] Synapses on each neuron, from excitatory and from inhibitory ones."""
-    reach_um: float = 220.0
+    reach_um: Positive = 220.0
     """[C] A connection's probability falls as exp(-distance / reach)."""
-    long_range_share: float = 0.1
+    long_range_share: Share = 0.1
     """[C] Share of connections regardless of distance."""
-    out_degree_sigma: float = 0.4
+    out_degree_sigma: Number = 0.4
     """[C] Sigma of the log-normal spread of out-degrees."""
-    communities: int = 2
+    communities: Annotated[Whole, Field(ge=1)] = 2
     """[C] Number of communities, each the neurons nearest to one of as many centres."""
-    between_share: float = 0.035
+    between_share: Annotated[Share, Field(gt=0)] = 0.035
     """[C] A connection between communities is this share as likely as one within, at the same distance."""
-    delay_ms: float = 0.8
+    delay_ms: FromZero = 0.8
     """Delay of a synapse without distance."""
-    conduction_um_per_ms: float = 500.0
+    conduction_um_per_ms: Positive = 500.0
     """[L] Speed of axons."""
 
     # Drive.
-    drive_mv: float = 9.9
-    drive_spread_mv: float = 1.8
+    drive_mv: Number = 9.9
+    drive_spread_mv: Number = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
-    community_drive_mv: float = 0.1
+    community_drive_mv: Number = 0.1
     """[C] Standard deviation over communities of the drive that a community's neurons have in addition: some lead."""
-    noise_mv: float = 7.5
+    noise_mv: Number = 7.5
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
-    noise_ms: float = 5.0
+    noise_ms: Positive = 5.0
     """[C] Its time constant."""
-    shared_noise_mv: float = 0.6
+    shared_noise_mv: Number = 0.6
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
-    shared_noise_ms: float = 575.0
+    shared_noise_ms: Positive = 575.0
     """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
     doi 10.1016/j.neuron.2004.08.011)."""
 
     # Stimulation.
-    kick_mv: float = 68.0
+    kick_mv: Number = 68.0
     """[C] Depolarisation of a neuron on the electrode by a full pulse."""
-    kick_sigma: float = 0.35
+    kick_sigma: Number = 0.35
     """[C] Sigma of its log-normal spread over neurons (median 1)."""
-    kick_reach_um: float = 40.0
+    kick_reach_um: Positive = 40.0
     """[C] The kick falls as 1 / (1 + (distance / reach)^2)."""
-    axons_per_electrode: float = 14.5
+    axons_per_electrode: Number = 14.5
     """[C] Expected number of neurons that an electrode drives through their axons."""
-    axon_reach_um: float = 500.0
+    axon_reach_um: Positive = 500.0
     """[C] Their probability falls as exp(-distance / reach)."""
-    axon_reliability: float = 0.8
+    axon_reliability: Share = 0.8
     """[L] Probability that a pulse drives an axon in its reach."""
-    axon_latency_ms: float = 0.5
-    axon_latency_spread_ms: float = 1.0
+    axon_latency_ms: FromZero = 0.5
+    axon_latency_spread_ms: FromZero = 1.0
     """[C] Latency: this, conduction, and a share of the spread that is each neuron's own."""
-    axon_jitter_ms: float = 0.16
+    axon_jitter_ms: FromZero = 0.16
     """[L] Standard deviation of the latency from pulse to pulse."""
-    availability_loss: float = 0.033
+    availability_loss: Share = 0.033
     """[C] Share of a neuron's availability lost with each spike."""
-    availability_s: float = 2.8
+    availability_s: Positive = 2.8
     """[C] Time constant of its recovery (Goldental et al. 2014: failures above a critical frequency)."""
-    availability_needed_low: float = 0.30
-    availability_needed_high: float = 0.55
+    availability_needed_low: Number = 0.30
+    availability_needed_high: Number = 0.55
     """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
 
     # What changes over minutes and hours.
-    scaling_loss: float = 3e-5
+    scaling_loss: Share = 3e-5
     """[C] Share of all excitatory weights lost with a spike of each excitatory neuron (homeostatic scaling)."""
-    scaling_min: float = 120.0
+    scaling_min: Positive = 120.0
     """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
-    scaling_at_hz: float = 0.62
+    scaling_at_hz: FromZero = 0.62
     """[C] The excitatory neurons' mean rate that scaling holds: loss and recovery then balance at the full weights."""
-    load_gain: float = 0.08
+    load_gain: Share = 0.08
     """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
-    load_min: float = 30.0
+    load_min: Positive = 30.0
     """[C] Time constant with which the load leaves."""
-    conduction_min: float = 90.0
+    conduction_min: Positive = 90.0
     """[C] Time constant with which the share of such spikes that fail follows it (Grubb & Burrone 2010: hours)."""
-    output_loss: float = 1.0
+    output_loss: Share = 1.0
     """[C] How much of what an excitatory neuron's axon fails to conduct is missing in its output too; 1: all of it."""
-    drift_share: float = 0.03
-    drift_min: float = 30.0
+    drift_share: Share = 0.03
+    drift_min: Positive = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""
 
     def __post_init__(self) -> None:
-        if self.neurons < 10:
-            raise InvalidArgument(f"neurons: expected at least 10, got {self.neurons}")
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, ShortTerm):
-                if not (0 < value.use <= 1 and value.recovery_ms > 0 and value.facilitation_ms >= 0):
-                    raise InvalidArgument(f"{each.name}: expected 0 < use <= 1 and times above 0, got {value}")
-                continue
-            if not isfinite(value):
-                raise InvalidArgument(f"{each.name}: expected a finite number, got {value}")
-            if each.name.endswith(("_ms", "_um", "_s", "_min")) and value <= 0 and each.name not in _MAY_BE_ZERO:
-                raise InvalidArgument(f"{each.name}: expected a number above 0, got {value}")
-            if each.name.endswith("_hz") and value < 0:
-                raise InvalidArgument(f"{each.name}: expected 0 or more, got {value}")
-            if each.name.endswith(("_share", "_loss", "_reliability", "_gain")) and not 0 <= value <= 1:
-                raise InvalidArgument(f"{each.name}: expected a number from 0 to 1, got {value}")
-        if self.communities < 1:
-            raise InvalidArgument(f"communities: expected 1 or more, got {self.communities}")
-        if self.between_share == 0:
-            raise InvalidArgument("between_share: expected above 0, got 0: take a small one")
         if self.load_min == self.conduction_min:
             raise InvalidArgument(f"load_min, conduction_min: expected two that differ, got {self.load_min} twice")
         for degree, available in (
@@ -217,6 +201,3 @@ class TissueParameters:
     def n_excitatory(self) -> int:
         """Number of excitatory neurons; they come first in every array."""
         return round(self.neurons * self.excitatory_share)
-
-
-_MAY_BE_ZERO = {"delay_ms", "axon_latency_ms", "axon_latency_spread_ms", "axon_jitter_ms"}
