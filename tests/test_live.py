@@ -15,7 +15,7 @@ from animat.cli import main
 from animat.closed_loop.session import recover_session
 from animat.coding.mapping import Thresholds
 from animat.cultures import under_way
-from animat.cultures.budget import Account, Budget
+from animat.cultures.budget import Account, Budget, record_within
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
 from animat.cultures.under_way import UnderWay
@@ -31,7 +31,6 @@ from animat.errors import (
 )
 from animat.live import shadowing
 from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
-from animat.live.recording import record_within
 from animat.live.shadowing import LiveRun, live
 from animat.live.trainers import Exchange
 from animat.neurons.synthetic import synthetic_simulator

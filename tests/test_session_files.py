@@ -108,7 +108,7 @@ def test_a_damaged_log_is_not_written_over_what_holds_more(tmp_path: Path, capsy
 
 
 def test_a_table_that_cannot_be_written_is_made_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from animat.closed_loop.tick_table import TickTable
+    from animat.closed_loop.tick import TickTable
 
     add, rows = TickTable.add, [0]
 

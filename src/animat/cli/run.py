@@ -200,8 +200,8 @@ class Run(Stimulating):
         """The culture as it is now, presented as the policies' recordings were."""
         from animat.coding.encoder import Encoder
         from animat.coding.recording import protocol_of
+        from animat.cultures.budget import record_within
         from animat.cultures.kinds import pulse_for
-        from animat.live.recording import record_within
         from animat.progress import in_phase
         from animat.recordings.formats.nwb import write_nwb
         from animat.stimulation.protocol import CLOSED_LOOP

@@ -13,14 +13,12 @@ from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import Agent, Controller, InTurn
-from animat.closed_loop.answers import wrong_with
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.reading import read_response
 from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
 from animat.closed_loop.standing import Standing
 from animat.closed_loop.stopping import Stop, ending_of, is_there
-from animat.closed_loop.stretch import Asked, Stretch, seen_in
+from animat.closed_loop.stretch import Asked, Stretch, read_response, seen_in, wrong_with
 from animat.closed_loop.tick import Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer

@@ -23,8 +23,7 @@ from animat.closed_loop.gathering import (
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, Records, read_log
 from animat.closed_loop.outline import Episode, Outline, electrode_pulses_of
-from animat.closed_loop.tick import Ending, Tick
-from animat.closed_loop.tick_table import TickTable
+from animat.closed_loop.tick import Ending, Tick, TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.plain_file import expect_no_file
 from animat.progress import Progress

@@ -17,13 +17,12 @@ from typing import Any
 import jax
 
 from animat.cultures.base import Culture
-from animat.cultures.budget import Account
+from animat.cultures.budget import Account, record_within
 from animat.cultures.series import STATE_FILE, order_seed
 from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan
-from animat.live.recording import record_within
 from animat.live.trainers import Exchange, Trainers
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import pooled_percentiles
