@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
 from animat.cultures.replay import ReplayCulture
-from animat.errors import DeviceFailed
+from animat.cultures.safety import SIMULATED_LIMITS
+from animat.cultures.virtual import VirtualCulture
+from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.synthetic import synthetic_recording
 from cultures import small_culture
 from fake_culture import FakeCulture
@@ -64,6 +67,40 @@ def test_a_device_that_fails_while_it_is_opened_is_let_go_of() -> None:
         culture.open()
     assert not culture.is_open
     assert culture.closed == 1
+
+
+def test_a_close_that_fails_is_told_and_takes_the_place_of_no_error() -> None:
+    class Stuck(ReplayCulture):
+        def _close(self) -> None:
+            raise OSError("no route to host")
+
+    culture = Stuck([synthetic_recording(1, channels=32)]).open()
+    with pytest.raises(DeviceFailed, match="no route to host"):
+        culture.close()
+    assert not culture.is_open
+    with pytest.raises(KeyError) as raised, culture:
+        raise KeyError("of the user")
+    assert any("no route to host" in note for note in raised.value.__notes__)
+    assert not culture.is_open
+
+
+def test_limits_can_be_tightened_and_never_loosened() -> None:
+    with small_culture(limits=replace(SIMULATED_LIMITS, stimuli_per_session=1)) as culture:
+        stimulus = TestVirtualCulture().stimulus(culture)
+        culture.deliver([stimulus], 0.1)
+        with pytest.raises(UnsafeStimulus) as refused:
+            culture.deliver([stimulus], 0.1)
+        assert refused.value.limit == "stimuli_per_session"
+    with pytest.raises(InvalidArgument, match="never loosened"):
+        small_culture(limits=replace(SIMULATED_LIMITS, amplitude=2 * SIMULATED_LIMITS.amplitude + 1)).open()
+
+
+@pytest.mark.parametrize("kind", [VirtualCulture, ReplayCulture, FakeCulture])
+def test_what_is_final_cannot_be_overridden(kind: type[Culture]) -> None:
+    beside = type("Beside", (), {"deliver": lambda *_: None})
+    for bases, names in (((kind,), {"deliver": lambda *_: None}), ((kind,), {"limits": None}), ((beside, kind), {})):
+        with pytest.raises(TypeError, match="final in Culture"):
+            type("Around", bases, names)
 
 
 def test_the_contract_needs_no_pytest_and_no_compiled_tissue() -> None:

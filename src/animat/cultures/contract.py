@@ -235,37 +235,6 @@ class CultureContract(abc.ABC):
             _expect(DeviceFailed, culture.close)
             assert not culture.is_open
 
-    def test_a_close_that_fails_is_told_and_takes_the_place_of_no_error(self) -> None:
-        def fail() -> None:
-            raise OSError("no route to host")
-
-        def use(culture: Culture) -> None:
-            with culture:
-                raise KeyError("of the user")
-
-        culture = self.make_culture().open()
-        close, culture._close = culture._close, fail  # type: ignore[method-assign]
-        assert "no route to host" in str(_expect(DeviceFailed, culture.close))
-        assert not culture.is_open
-        close()
-        error = _expect(KeyError, lambda: use(culture))
-        assert any("no route to host" in note for note in error.__notes__)
-        assert not culture.is_open
-        close()
-
-    def test_limits_can_be_tightened_and_never_loosened(self) -> None:
-        culture = self.make_culture()
-        with culture:
-            device = culture.device_limits
-        culture._asked_limits = replace(device, stimuli_per_session=1)
-        with culture:
-            culture.deliver([self.stimulus(culture)], 0.1)
-            error = _expect(UnsafeStimulus, lambda: culture.deliver([self.stimulus(culture)], 0.1))
-            assert isinstance(error, UnsafeStimulus)
-            assert error.limit == "stimuli_per_session"
-        culture._asked_limits = replace(device, amplitude=2 * device.amplitude + 1)
-        _expect(InvalidArgument, culture.open)
-
     def test_a_rate_is_not_passed_by_closing_and_opening_again(self) -> None:
         culture = self.make_culture()
         with culture:
@@ -316,13 +285,6 @@ class CultureContract(abc.ABC):
             with self.make_culture() as culture:
                 recordings.append(culture.record(self.protocol, seed=1))
         assert recordings[0].equals(recordings[1])
-
-    def test_what_is_final_cannot_be_overridden(self) -> None:
-        kind = type(self.make_culture())
-        _expect(TypeError, lambda: type("Around", (kind,), {"deliver": lambda *_: None}))
-        _expect(TypeError, lambda: type("Around", (kind,), {"limits": None}))
-        beside = type("Beside", (), {"deliver": lambda *_: None})
-        _expect(TypeError, lambda: type("Around", (beside, kind), {}))
 
 
 def _expect(kind: type[Exception], act: Callable[[], object]) -> Exception:
