@@ -7,6 +7,7 @@ import subprocess
 import sys
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from inspect import ismethod
 from pathlib import Path
 
 import pytest
@@ -131,7 +132,9 @@ def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
     assert len(set(animat.__all__)) == len(animat.__all__)
     for name in animat.__all__:
         thing = getattr(animat, name)
-        assert getattr(thing, "__name__", name) == name
+        # A registry's `named` is called by what it names: robot_named, mapping_named.
+        of = f"{thing.__self__.noun}_" if ismethod(thing) else ""
+        assert of + getattr(thing, "__name__", name) == name
     # What is in the package under the same name would be there or not, by what was imported before.
     assert not set(animat.__all__) & {path.stem for path in PACKAGE.iterdir()}
     # The nouns of the story that a study is made of are not those of its specification.

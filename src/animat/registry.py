@@ -93,11 +93,11 @@ class Registry(Generic[Thing]):
         self._families[name] = family
 
     def named(self, name: str, /, **parameters: Any) -> Thing:
-        """The one of this name, with these parameters in place of its defaults.
+        """The robot or mapping of this name, with these parameters in place of its defaults, `pole_mass_kg=0.55`.
 
         Args:
-            name: of one that is registered or that an installed package announces in the entry point group
-                `entry_points`; or where to import one from, `my_package.robots:Rover`, which registers it.
+            name: of one that is registered or that an installed package announces (entry points `animat.robots`,
+                `animat.mappings`); or where to import one from, `my_package.robots:Rover`, which registers it.
             parameters: fields of its class.
 
         Raises:

@@ -130,6 +130,8 @@ REGISTRY: Registry[Mapping] = Registry(
 )
 """An installed package announces its mappings in the entry point group `animat.mappings`."""
 
+mapping_named = REGISTRY.named
+
 Kind = TypeVar("Kind", bound=type[Mapping])
 
 
@@ -144,14 +146,6 @@ def register_mapping(kind: Kind) -> Kind:
     """
     REGISTRY.register(kind)
     return kind
-
-
-def mapping_named(name: str, /, **parameters: float) -> Mapping:
-    """The mapping called `1-threshold`, `9-thresholds` or `linear`, or one of a user's own.
-
-    Args and errors: as `animat.registry.Registry.named`.
-    """
-    return REGISTRY.named(name, **parameters)
 
 
 def mapping_to_data(mapping: Mapping) -> str | dict[str, Any]:
