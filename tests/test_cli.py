@@ -612,7 +612,7 @@ def test_inspect_refuses_its_options_before_the_files(
     ("arguments", "begins"),
     [
         ("train --iterations -5", "--iterations: expected a whole number from 1 to 2000000000, got -5"),
-        ("train --duration-min -1", "--duration-min: expected positive minutes, got -1"),
+        ("train --duration-min -1", "--duration-min: expected more than 0, got -1"),
         ("train --pulse-cost -1", "--pulse-cost: expected at least 0, got -1"),
         ("train --pulse-cost 1 --mapping none", "--pulse-cost: expected 0 without neurons, got 1"),
         ("train --pulse-cost 1 --assess 3", "--pulse-cost: expected 0 with assessments"),

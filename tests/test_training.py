@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -394,6 +395,24 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
     assert (told["kind"], told["bins"], told["range_hz"], told["window_ms"]) == ("histogram", 20, None, [2.0, 10.0])
     assert told["recorded_at_min"] == [0.0, 10.0, 20.0] and len(told["burst_thresholds"]) == 3
     assert policy.provenance["versions"]["jax"] == jax.__version__
+
+
+@pytest.mark.parametrize(
+    ("named", "told"),
+    [
+        ({"duration_min": "x"}, "duration_min: expected a number, got 'x'"),
+        ({"duration_min": float("inf")}, "duration_min: expected a finite number, got inf"),
+        ({"commands": 3}, "commands: expected a list, got 3"),
+        ({"commands": ("a",)}, "commands: expected a number, got 'a'"),
+        ({"commands": ()}, "commands: expected at least 1"),
+        ({"commands": (0.5, 2.0)}, "commands: expected at most 1, got 2.0"),
+        ({"lessons": (3,)}, "lessons: expected a Lesson, got 3"),
+        ({"algorithm": 3}, "algorithm: expected a SAC, got 3"),
+    ],
+)
+def test_what_no_training_can_have_is_told(named: dict[str, Any], told: str) -> None:
+    with pytest.raises(InvalidArgument, match=re.escape(told)):
+        Training(Cartpole(), None, **named)
 
 
 def test_a_shadowing_that_there_is_not_is_told() -> None:

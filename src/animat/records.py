@@ -40,6 +40,7 @@ _EXPECTED = {
     "greater_than": "more than {gt:,}",
     "greater_than_equal": "at least {ge:,}",
     "int_type": "a whole number",
+    "is_instance_of": "a {class}",
     "less_than": "less than {lt:,}",
     "less_than_equal": "at most {le:,}",
     "list_type": "a list",

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field, InstanceOf
 
 from animat.coding.decoder import expect_one_command
 from animat.coding.electrode_pulses import expect_electrode_pulses
@@ -17,7 +17,7 @@ from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
 from animat.goals.robot import body_and_goal, without_goal
 from animat.neurons.timeline import SimulatorTimeline
-from animat.records import Whole, read_record
+from animat.records import Number, Positive, Whole, read_record
 from animat.registry import is_ours
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
@@ -54,6 +54,22 @@ class _Named(Generic[T]):
 
     def __set__(self, training: object, value: T | str) -> None:
         vars(training)[self._name] = self._named(value) if isinstance(value, str) else value
+
+
+_EXPECTED: dict[str, Any] = {
+    "duration_min": Positive | None,
+    "commands": Annotated[
+        tuple[Annotated[Number, Field(ge=-1, le=1)], ...],
+        BeforeValidator(lambda given: given.tolist() if isinstance(given, np.ndarray) else given),
+        Field(min_length=1),
+    ]
+    | None,
+    "algorithm": InstanceOf[SAC],
+    "lessons": tuple[InstanceOf[Lesson], ...],
+    "assess": Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None,
+    "pulse_cost": PulseCost,
+}
+"""What fields are checked for that hold what they are given: as a record's, numbers would be made ones with a point."""
 
 
 @dataclass(frozen=True)
@@ -113,21 +129,16 @@ class Training:
             least = 0 if name == "seed" else 1
             if not isinstance(number, int | np.integer) or isinstance(number, bool) or not least <= number <= most:
                 raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
+        for name, expected in _EXPECTED.items():
+            read_record(expected, getattr(self, name), name)
         if self.commands is not None:
             object.__setattr__(self, "commands", tuple(map(float, self.commands)))
-            if not self.commands or not all(abs(u) <= 1 for u in self.commands):
-                raise InvalidArgument(f"commands: expected numbers from -1 to 1, got {shown(self.commands)}")
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.neural_observation not in (False, self.mapping is not None):
             raise InvalidArgument(
                 f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
             )
-        if self.duration_min is not None and not (math.isfinite(self.duration_min) and self.duration_min > 0):
-            raise InvalidArgument(f"duration_min: expected positive minutes, got {self.duration_min:g}")
         expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
-        if self.assess is not None:
-            read_record(Annotated[Whole, Field(ge=1, le=MOST_EPISODES)], self.assess, "assess")  # type: ignore[arg-type]
-        read_record(PulseCost, self.pulse_cost, "pulse_cost")
         if self.pulse_cost and self.mapping is None:
             raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
         if self.pulse_cost and self.episodes_assessed:
