@@ -13,8 +13,9 @@ import pytest
 
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.report.results import ContextRow, LostRow
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
-from animat.studies.context import ContextRow, LostRow, RanContext, plan_context_study, run_context_study
+from animat.studies.context import RanContext, plan_context_study, run_context_study
 from animat.studies.context_page import in_short, write_context_page
 from animat.studies.context_tasks import ContextStudy, RecordCulture, presented_for
 

@@ -12,16 +12,17 @@ import pytest
 from animat.errors import InvalidArgument
 from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
-from animat.report.comparisons import Group, Pair, draw_comparisons
-from animat.report.controls import Controls, draw_controls
-from animat.report.headline import ArmReturns, draw_headline
+from animat.report.comparisons import Pair, draw_comparisons
+from animat.report.controls import draw_controls
+from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Course, Courses, draw_over_time
+from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arms_shown, what_parts
-from animat.studies.cultures import OverCultures, RanCultures
+from animat.studies.cultures import RanCultures
 from animat.studies.cultures_page import _in_short
 from animat.studies.differences import came_out_otherwise, decisions, explain
 from animat.studies.learned import beside_the_optimum, known_of, learned_of
@@ -30,7 +31,7 @@ from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper
-from animat.studies.results import ComparedReturns, Score, StudyOptimum, write_typed
+from animat.studies.results import write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.source import Source
 from animat.studies.specification import Arm, RobotSpec, Simulators, Study
@@ -253,6 +254,14 @@ LEARNED = Score(
 )  # fmt: skip
 
 
+def score(
+    robot: str, arm: str, middle: float, low: float | None, high: float | None, random: float | None, best: float | None
+) -> Score:
+    """That of an arm, as far as figures and sentences go by it."""
+    known = {"interquartile_mean": middle, "low_95": low, "high_95": high, "random": random, "optimum": best}
+    return replace(LEARNED, robot=robot, arm=arm, **known)
+
+
 def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
     rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, arm="1 threshold")]
     assert learned_of(paper_study(), rows) == [LEARNED]
@@ -317,15 +326,16 @@ def test_every_mapping_has_optima_of_its_own_over_time() -> None:
 
 def test_every_line_of_a_figure_is_in_its_legend() -> None:
     means = np.array([1.0, 2.0, 3.0])
-    groups = Group("control", means), Group("1 threshold", means + 5, 0.0, 9.0, 0.75)
-    figure = draw_comparisons([Pair("at 0 min", *groups, 0.1, 0.0)], "cartpole")
+    row = replace(ROW, first="control", second="1 threshold", score_first=None, optimum_first=None, score_second=0.75)
+    figure = draw_comparisons([Pair(row, means, means + 5, None)], "cartpole")
     assert legend(figure) == {"random actions", "optimal return"}
     labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
     assert labels == ["control\n", "1\nthreshold\nscore 0.75"]
-    controls = Controls(
-        "1-threshold", (("trained: a", 5.0, 0.1), ("trained: b", 4.0, 0.1), ("silent", 1.0, None)), 2, 0.0, 9.0
-    )
-    assert legend(draw_controls([controls], "cartpole")) == {
+    controls = [
+        ControlReturns("cartpole", "1-threshold", "moving", 0.0, name, 2, 5.0, error, 0.0, 9.0, None)
+        for name, error in (("trained: a", 0.1), ("trained: b", 0.1), ("silent", None))
+    ]
+    assert legend(draw_controls([("1-threshold", controls)], "cartpole")) == {
         "trained", "control", "random actions", "optimal return",
     }  # fmt: skip
 
@@ -360,8 +370,8 @@ def test_learning_curves_are_of_whole_rounds_of_episodes() -> None:
 
 def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
     rows = [
-        ArmReturns("cartpole", "a", 5.0, -500.0, 510.0, 0.0, 10.0, (4.0, 6.0)),
-        ArmReturns("cartpole", "b", 5.0, 4.0, 6.0, 0.0, 10.0, (3.0, 7.0)),
+        (score("cartpole", "a", 5.0, -500.0, 510.0, 0.0, 10.0), np.array([4.0, 6.0])),
+        (score("cartpole", "b", 5.0, 4.0, 6.0, 0.0, 10.0), np.array([3.0, 7.0])),
     ]
     figure = draw_headline(rows)
     axes = figure.axes[0]
@@ -378,7 +388,7 @@ def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
 
 def test_on_a_telephone_the_headline_fits_its_width(tmp_path: Path) -> None:
     rows = [
-        ArmReturns(robot, arm, 5.0, 4.0, 6.0, 0.0, 10.0, (3.0, 7.0))
+        (score(robot, arm, 5.0, 4.0, 6.0, 0.0, 10.0), np.array([3.0, 7.0]))
         for robot in ("cartpole", "navigation", "swing-up")
         for arm in ("1-threshold", "before training")
     ]
@@ -406,8 +416,8 @@ def test_there_is_one_kind_of_minus() -> None:
     assert with_minus("constant -1 from -0.5 to -.5, 1.5e-05") == "constant −1 from −0.5 to −.5, 1.5e−05"
     same = "2-10 ms, p0-1, --at-min 5, tables/-1.csv, Mann-Whitney, recording_0-1, 2022-11-23"
     assert with_minus(same) == same
-    low = Group("a", np.array([1.0, 2.0]), 0.0, 9.0, -0.07), Group("b", np.array([1.0, 2.0]), 0.0, 9.0, -0.001)
-    labels = [text.get_text() for text in draw_comparisons([Pair("", *low, 0.1, 0.0)], "").axes[0].get_xticklabels()]
+    low = Pair(replace(ROW, score_first=-0.07, score_second=-0.001), *np.array([[1.0, 2.0], [1.0, 2.0]]), 0.0)
+    labels = [text.get_text() for text in draw_comparisons([low], "").axes[0].get_xticklabels()]
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
-from animat.report.controls import Controls, draw_controls
-from animat.report.headline import ArmReturns, draw_headline
-from animat.report.over_cultures import Compared, draw_over_cultures
+from animat.report.controls import draw_controls
+from animat.report.headline import draw_headline
+from animat.report.over_cultures import draw_over_cultures
+from animat.report.results import ControlReturns, OverCultures
 from animat.studies.publishing import _beside
+from test_report_claims import score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,13 +27,13 @@ if TYPE_CHECKING:
     ],
 )
 def test_the_first_sentence_goes_by_the_interval(low: float, high: float, found: str) -> None:
-    told = _beside(ArmReturns("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
+    told = _beside(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
     assert told.startswith(f"policies trained as “1 threshold” {found}")
     assert "return is 50, that of random actions −10, that of the optimal controller 70." in told
 
 
 def test_without_an_interval_nothing_is_claimed() -> None:
-    told = _beside(ArmReturns("cartpole", "linear", 50.0, None, None, None, None))
+    told = _beside(score("cartpole", "linear", 50.0, None, None, None, None))
     assert told == "of the policies trained as “linear” the interquartile mean return is 50."
 
 
@@ -46,13 +49,14 @@ def left_out(figure: Figure) -> list[str]:
 
 def test_words_of_narrow_figures_are_within_them() -> None:
     rows = [
-        ArmReturns("navigation", name, 1.0, 0.0, 2.0, 0.5, 3.0, (0.5, 1.5)) for name in ("before training", "linear")
+        (score("navigation", name, 1.0, 0.0, 2.0, 0.5, 3.0), np.array([0.5, 1.5]))
+        for name in ("before training", "linear")
     ]
     assert left_out(draw_headline(rows)) == left_out(draw_headline(rows, narrow=True)) == []
-    over = [Compared("before and after training", "navigation", (0.1, 0.3), 0.2, 0.1, 0.3)]
-    assert left_out(draw_over_cultures(over)) == []
-    panels = [
-        Controls(f"9-thresholds, percentiles fixed, recording at {at} min", (("trained: without neurons", 1.0, 0.1),))
-        for at in (0, 140)
-    ]
+    over = OverCultures("before and after training", "navigation", 2, 1.0, 1.2, 0.2, 0.1, 0.3, 2, 2, 2)
+    assert left_out(draw_over_cultures([(over, (0.1, 0.3))])) == []
+    row = ControlReturns(
+        "navigation", "9-thresholds", "first", 0.0, "trained: without neurons", 2, 1.0, 0.1, None, None, None
+    )
+    panels = [(f"9-thresholds, percentiles fixed, recording at {at} min", [row]) for at in (0, 140)]
     assert left_out(draw_controls(panels, "navigation: controls")) == []

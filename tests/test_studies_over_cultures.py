@@ -22,10 +22,11 @@ from scipy.stats import bootstrap, mannwhitneyu
 from animat.cli import main
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.statistics import compare
+from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
 from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
 from animat.studies.places import results_file
-from animat.studies.results import ComparedReturns, Results, Score, write_typed
+from animat.studies.results import write_typed
 from animat.studies.run import Ran, run_study
 from animat.studies.source import Source, read_seeds
 from animat.studies.specification import Study

@@ -7,9 +7,9 @@ import pandas as pd
 from scipy.stats import mannwhitneyu
 
 from animat.evaluation.rollouts import Episodes
+from animat.report.results import Results
 from animat.studies.episodes import RANDOM, tabulated
 from animat.studies.heuristic import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, beside_heuristic, not_outperforming
-from animat.studies.results import Results
 from animat.studies.specification import Arm, RobotSpec, Study
 
 

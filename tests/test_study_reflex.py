@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from animat.report.results import BesideReflex, StudyOptimum
 from animat.studies.episodes import COUPLING, RANDOM, tabulated
 from animat.studies.reflex import beside_reflex, reflexes_told
-from animat.studies.results import BesideReflex, StudyOptimum
 from animat.studies.specification import Arm, RobotSpec, Study
 from test_study_results import episodes_of
 

@@ -22,6 +22,7 @@ from animat.neurons.simulator import fit_histogram
 from animat.neurons.timeline import fit_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
+from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, tabulated, write_episodes
@@ -29,7 +30,7 @@ from animat.studies.evaluating import Evaluate
 from animat.studies.optima import FindOptima, read_optima
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
-from animat.studies.results import ComparedReturns, Results, Score, StudyOptimum, read_typed, write_typed
+from animat.studies.results import read_typed, write_typed
 from animat.studies.shown import optima_shown
 from animat.studies.simulating import Fit
 from animat.studies.source import Source

@@ -40,9 +40,10 @@ def run_and_report(study: Study, base: Path, command: Working) -> dict[str, Any]
 
 def _run_one(study: Study, base: Path, command: Working) -> dict[str, Any]:
     from animat.lined_up import lined_up
+    from animat.report.results import Results
     from animat.studies.heuristic import not_outperforming
     from animat.studies.places import results_file
-    from animat.studies.results import Results, read_typed
+    from animat.studies.results import read_typed
     from animat.studies.run import run_study
 
     began = time.monotonic()

@@ -2,69 +2,52 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
+from animat.report.results import ADMITTED, ContextRow
 from animat.report.style import BLACK, BLUE, GREY, ORANGE, Axes, Figure, add_common_legend, new_figure, style_axes
 
 _APART = 0.11
 """Between two cultures of a row, in rows."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A value on one culture, with its interval where it has one; None where it is not known.
-
-    Attributes:
-        is_least: whether the true one is that or more.
-    """
-
-    value: float | None
-    low: float | None = None
-    high: float | None = None
-    is_least: bool = False
-
-
-def draw_context(
-    gaps: Mapping[str, Sequence[Estimate]], scores: Mapping[str, Sequence[Estimate]], admitted: float
-) -> Figure:
+def draw_context(rows: Mapping[str, Sequence[ContextRow]]) -> Figure:
     """Context gaps of tasks beside context scores of policies: a row a robot, a point a culture with its interval.
 
     Args:
-        gaps, scores: by the robot's name, of each culture.
-        admitted: the gap from which on a task needs more than a reflex.
+        rows: by the robot's name, of each culture.
     """
-    figure = new_figure(9.2, 1.7 + 0.55 * len(gaps))
+    figure = new_figure(9.2, 1.7 + 0.55 * len(rows))
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "The task: is a reflex enough?", "context gap (0: a reflex does it all, 1: it does nothing)", "")
     style_axes(right, "The policies: more than a reflex?", "context score (0: the best reflex, 1: optimal)", "")
-    left.axvline(admitted, color=ORANGE, linewidth=1, linestyle="--", label=f"from {admitted:g} on: needs context")
-    for axes, found, colour in ((left, gaps, BLUE), (right, scores, BLACK)):
+    left.axvline(ADMITTED, color=ORANGE, linewidth=1, linestyle="--", label=f"from {ADMITTED:g} on: needs context")
+    for axes, name, colour in ((left, "gap", BLUE), (right, "score", BLACK)):
         axes.axvline(0, color=GREY, linewidth=0.8)
-        _points(axes, found, colour, "not known" if axes is left else "none: no task beyond a reflex, or not known")
+        nothing = "not known" if axes is left else "none: no task beyond a reflex, or not known"
+        _points(axes, rows, name, colour, nothing)
         # An interval of two policies can be as wide as it likes; what matters is on which side of 0 it ends.
         low, high = axes.get_xlim()
-        values = [each.value for of_robot in found.values() for each in of_robot if each.value is not None]
+        values = [value for of_robot in rows.values() for row in of_robot if (value := getattr(row, name)) is not None]
         low, high = max(min(low, -0.05), -1.0), min(max(high, 1.05), 2.0)
         axes.set_xlim(min([low, *(value - 0.05 for value in values)]), max([high, *(value + 0.05 for value in values)]))
-    left.set_yticks(range(len(gaps)), list(gaps))
-    left.set_ylim(len(gaps) - 0.5, -0.5)
+    left.set_yticks(range(len(rows)), list(rows))
+    left.set_ylim(len(rows) - 0.5, -0.5)
     add_common_legend(figure, (left, right), columns=2)
     return figure
 
 
-def _points(axes: Axes, found: Mapping[str, Sequence[Estimate]], colour: str, nothing: str) -> None:
-    for row, estimates in enumerate(found.values()):
-        known = [each for each in estimates if each.value is not None]
+def _points(axes: Axes, rows: Mapping[str, Sequence[ContextRow]], name: str, colour: str, nothing: str) -> None:
+    for i, of_robot in enumerate(rows.values()):
+        known = [row for row in of_robot if getattr(row, name) is not None]
         if not known:
-            axes.text(0.02, row, nothing, fontsize=8, color=GREY, va="center")
-        for i, each in enumerate(known):
-            place = row + _APART * (i - (len(known) - 1) / 2)
-            ends = [end for end in (each.low, each.high) if end is not None]
+            axes.text(0.02, i, nothing, fontsize=8, color=GREY, va="center")
+        for j, row in enumerate(known):
+            place = i + _APART * (j - (len(known) - 1) / 2)
+            value, low, high = (getattr(row, each) for each in (name, f"{name}_low_95", f"{name}_high_95"))
+            ends = [end for end in (low, high) if end is not None]
             axes.plot(ends, [place] * len(ends), color=colour, linewidth=1.2)
-            marker, label = (">", "at least") if each.is_least else ("o", "a culture, 95 % interval")
-            value = math.nan if each.value is None else each.value
+            marker, label = (">", "at least") if row.is_least else ("o", "a culture, 95 % interval")
             axes.plot([value], [place], marker, color=colour, markersize=4, label=label)
 
 

@@ -17,6 +17,7 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.records import write_json
+from animat.report.results import ContextRow, LostRow
 from animat.robots.registry import robot_named
 from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
 from animat.studies.places import RECEIPTS
@@ -25,69 +26,6 @@ from animat.training.settings import LEARNER
 from animat.writing import exclusive_lock
 
 MANIFEST, TABLE, WHOSE_WORK = "study.json", "context.csv", "whose-work.csv"
-ADMITTED = 0.5
-"""The context gap of a task that needs more than a reflex, on every culture."""
-
-
-@dataclass(frozen=True)
-class ContextRow:
-    """A task on a culture: mean returns on the simulator and, measured, on the culture; None for what is not known.
-
-    Attributes:
-        best_known: where there is no optimal return, that of the best of the policies and the heuristic.
-        gap, score: the context gap of the task and the context score of the policies, on the simulator; the least that
-            they can be where there is no optimal return.
-        bits: goal information; None for a robot with one goal alone.
-    """
-
-    culture: int
-    robot: str
-    random: float
-    heuristic: float | None
-    coupling: float | None
-    policies: float
-    optimum: float | None
-    best_known: float | None
-    gap: float | None
-    gap_low_95: float | None
-    gap_high_95: float | None
-    score: float | None
-    score_low_95: float | None
-    score_high_95: float | None
-    bits: float | None
-    measured_random: float | None
-    measured_heuristic: float | None
-    measured_coupling: float | None
-    measured_policies: float | None
-    predicted_policies: float
-
-    @property
-    def is_least(self) -> bool:
-        """Whether gap and score are the least that they can be."""
-        return self.best_known is not None
-
-    @property
-    def needs_context(self) -> bool:
-        """Whether a reflex leaves half of the task undone."""
-        return self.gap is not None and self.gap >= ADMITTED
-
-    @property
-    def has_context(self) -> bool:
-        """Whether the policies do more than the best reflex: the whole interval of their score is above 0."""
-        return self.score_low_95 is not None and self.score_low_95 > 0
-
-
-@dataclass(frozen=True)
-class LostRow:
-    """What the policies lose by an intervention, with its 95 % interval over policies, on a culture's simulator."""
-
-    culture: int
-    robot: str
-    intervention: str
-    mean_return: float
-    lost: float
-    lost_low_95: float | None
-    lost_high_95: float | None
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from animat.report.context import Estimate, draw_context, draw_whose_work
+from animat.report.context import draw_context, draw_whose_work
 from animat.report.html import Columns, Picture, Section, Table, cell, columns_of, table_of, write_page
+from animat.report.results import ContextRow, LostRow
 from animat.report.style import FORMATS, save_figure
-from animat.studies.context import ADMITTED, TABLE, WHOSE_WORK, ContextRow, LostRow, RanContext
+from animat.studies.context import TABLE, WHOSE_WORK, RanContext
 from animat.studies.context_tasks import ContextStudy
 from animat.studies.places import REPORT
 
@@ -20,11 +21,8 @@ _GAPS, _LOST = "context", "whose-work"
 def write_context_page(study: ContextStudy, found: RanContext) -> Path:
     """Write the page and its figures beside it."""
     by_robot = {robot: [row for row in found.rows if row.robot == robot] for robot in study.robots}
-    gaps, scores = (
-        {robot: [_estimate(row, name) for row in rows] for robot, rows in by_robot.items()} for name in ("gap", "score")
-    )
     lost = _shares_lost(found.rows, found.lost)
-    figures = {_GAPS: draw_context(gaps, scores, ADMITTED)} | ({_LOST: draw_whose_work(lost)} if lost else {})
+    figures = {_GAPS: draw_context(by_robot)} | ({_LOST: draw_whose_work(lost)} if lost else {})
     for name, figure in figures.items():
         for ending in FORMATS:
             save_figure(figure, found.folder / f"{name}.{ending}")
@@ -97,11 +95,6 @@ def _range(values: Sequence[float]) -> str:
 def _hundredths(value: float) -> str:
     # Adding 0 takes the minus from a zero.
     return f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
-
-
-def _estimate(row: ContextRow, name: str) -> Estimate:
-    value, low, high = (getattr(row, each) for each in (name, f"{name}_low_95", f"{name}_high_95"))
-    return Estimate(value, low, high, row.is_least)
 
 
 def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[str, dict[str, list[float]]]:

@@ -21,16 +21,9 @@ from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.progress import Progress, Silent
+from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.studies.places import results_file
-from animat.studies.results import (
-    ComparedReturns,
-    Results,
-    Score,
-    read_typed,
-    write_named_records,
-    write_parquet,
-    write_records,
-)
+from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
 from animat.studies.run import Ran, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
@@ -43,39 +36,6 @@ MOST_AT_ONCE = 64
 COMPARISONS, SUMMARY, SCORES = "comparisons.csv", "over-cultures.csv", "scores.csv"
 MANIFEST = "cultures.json"
 """Names the folders of the cultures."""
-
-
-@dataclass(frozen=True)
-class OverCultures:
-    """A comparison on a robot, over cultures.
-
-    Attributes:
-        cultures: how many.
-        mean_first, mean_second: mean returns of the arms, each culture counting the same.
-        difference: mean of the cultures' differences, second less first.
-        low_95, high_95: of its percentile bootstrap over cultures; None of fewer than two. Of few cultures it is too
-            narrow.
-        larger_in: cultures in which the second arm's mean return is the larger one.
-        holds_in: cultures in which the second arm was found to be better.
-        tested: cultures with enough policies that a difference could be found.
-    """
-
-    comparison: str
-    robot: str
-    cultures: int
-    mean_first: float
-    mean_second: float
-    difference: float
-    low_95: float | None
-    high_95: float | None
-    larger_in: int
-    holds_in: int
-    tested: int
-
-    @property
-    def found_better(self) -> str:
-        """In how many cultures the second arm was found to be better, in words."""
-        return f"{self.holds_in} of {self.tested}" if self.tested else "too few policies"
 
 
 @dataclass(frozen=True)

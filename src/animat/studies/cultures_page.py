@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from animat.report.html import Picture, Section, cell, columns_of, table_of, write_page
-from animat.report.over_cultures import Compared, draw_over_cultures
+from animat.report.over_cultures import draw_over_cultures
+from animat.report.results import OverCultures
 from animat.report.style import FORMATS, save_figure
 from animat.studies.arms import arms_shown, many_arms, what_parts
-from animat.studies.cultures import COMPARISONS, SUMMARY, OverCultures, RanCultures
+from animat.studies.cultures import COMPARISONS, SUMMARY, RanCultures
 from animat.studies.places import REPORT
-from animat.studies.specification import Compared as Comparison
-from animat.studies.specification import Study
+from animat.studies.specification import Compared, Study
 from animat.studies.tabulating import LEVEL
 
 
@@ -19,8 +19,10 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
     """Write the page and its figure beside it."""
     sections = []
     if found.summary:
-        drawn = [_drawn(found, i, row) for i, row in enumerate(found.summary)]
-        figure = draw_over_cultures(drawn)
+        # Every culture has the same comparisons in the same order.
+        of_each = zip(*found.comparisons.values(), strict=True)
+        differences = ([row.mean_second - row.mean_first for row in rows] for rows in of_each)
+        figure = draw_over_cultures([*zip(found.summary, differences, strict=True)])
         for ending in FORMATS:
             save_figure(figure, found.folder / f"over-cultures.{ending}")
         sections.append(_in_short(study, found))
@@ -30,12 +32,6 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
     cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
     lead = f"{cultures}. {many_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
-
-
-def _drawn(found: RanCultures, i: int, row: OverCultures) -> Compared:
-    of_each = [rows[i] for rows in found.comparisons.values()]
-    differences = tuple(each.mean_second - each.mean_first for each in of_each)
-    return Compared(row.comparison, row.robot, differences, row.difference, row.low_95, row.high_95)
 
 
 def _in_short(study: Study, found: RanCultures) -> Section:
@@ -72,7 +68,7 @@ def _in_short(study: Study, found: RanCultures) -> Section:
     return Section("Results in short", (), tuple(points), (arms_shown(study), table), (picture,))
 
 
-def _told(compared: Comparison, row: OverCultures) -> str:
+def _told(compared: Compared, row: OverCultures) -> str:
     larger = (
         f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of {row.cultures} "
         "cultures"

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import LARGEST_LOSS
-from animat.studies.results import ComparedReturns
+from animat.report.results import ComparedReturns
 from animat.studies.specification import Study
 from animat.studies.tabulating import AIM, LEVEL
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 
 from animat.goals.robot import RobotWithGoal
 from animat.report.html import Table
+from animat.report.results import ObjectiveMet
 from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame
-from animat.studies.results import ObjectiveMet
 from animat.studies.specification import Study
 
 

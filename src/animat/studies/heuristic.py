@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from animat.evaluation.verdict import beside
+from animat.report.results import BesideHeuristic, Results
 from animat.studies.episodes import POLICY, DataFrame
 from animat.studies.evaluating import is_usual
-from animat.studies.results import BesideHeuristic, Results
 from animat.studies.specification import RobotSpec, Study, named_mapping
 
 HEURISTIC = "heuristic"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from animat.report.html import Table, columns_of, table_of, with_error
-from animat.studies.results import Score
+from animat.report.results import Score
 from animat.studies.specification import RobotSpec, Study
 from animat.studies.tabulating import AIM
 

@@ -10,11 +10,12 @@ from animat.environment import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
 from animat.progress import Part, Progress
+from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
 from animat.robots.grid import no_grid
 from animat.studies.evaluating import as_recorded, setting_of, span_min
 from animat.studies.places import optima_file
-from animat.studies.results import StudyOptimum, read_typed, write_typed
+from animat.studies.results import read_typed, write_typed
 from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask

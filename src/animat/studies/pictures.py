@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import final
 
@@ -16,8 +16,8 @@ from animat.recordings.reading import read_recordings
 from animat.records import read_record
 from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
-from animat.report.comparisons import Group, Pair, draw_comparisons
-from animat.report.controls import Controls, draw_controls
+from animat.report.comparisons import Pair, draw_comparisons
+from animat.report.controls import draw_controls
 from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.first_and_last import draw_first_and_last
@@ -27,6 +27,7 @@ from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.results import ComparedReturns, ControlReturns, Results
 from animat.report.style import FORMATS, Figure, save_figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
@@ -36,10 +37,10 @@ from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.optima import kinds_of
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
-from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
+from animat.studies.results import read_typed
 from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
-from animat.studies.tabulating import TRAINED, References, all_episodes, learning_of, performances
+from animat.studies.tabulating import References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 from animat.training.settings import SAC
 
@@ -105,8 +106,8 @@ class RobotPictures(StudyTask):
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(figure_tables.write_learning(folder, name, curves))
         if study.comparisons:
-            rows = [row for row in results.comparisons if row.robot == name]
-            figures["comparisons"] = draw_comparisons(_pairs(study, rows, table, known), f"{name}: comparisons")
+            pairs = [_pair(study, row, table, known) for row in results.comparisons if row.robot == name]
+            figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
         if timeline is not None and len(timeline) > 1:
             courses = _courses(study, table, known, rough, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
@@ -114,9 +115,8 @@ class RobotPictures(StudyTask):
             figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
             tables.append(figure_tables.write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
-        figures["controls"] = draw_controls(
-            _controls(study, [row for row in results.controls if row.robot == name]), f"{name}: controls"
-        )
+        controls = _controls(row for row in results.controls if row.robot == name)
+        figures["controls"] = draw_controls(controls, f"{name}: controls")
         recorded = {each.name: Paths.load(paths_file(folder, self.spec, each)) for each in study.arms}
         tables.append(
             figure_tables.write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded)
@@ -180,25 +180,10 @@ def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | N
     return [float(timeline.start_min[row]) for row in rows]
 
 
-def _pairs(study: Study, rows: list[ComparedReturns], table: DataFrame, known: References) -> list[Pair]:
-    pairs = []
-    for row in rows:
-        groups = []
-        for name, score in ((row.first, row.score_first), (row.second, row.score_second)):
-            arm = study.arm(name)
-            optimum = known.optimum(arm, row.at_min)
-            groups.append(
-                Group(
-                    name,
-                    performances(table, row.robot, arm, row.at_min, row.episodes),
-                    known.random(arm, row.at_min),
-                    None if optimum is None else optimum.best_return,
-                    score,
-                )
-            )
-        first, second = groups
-        pairs.append(Pair(f"at {row.at_min:g} min", first, second, row.p_holm, row.u))
-    return pairs
+def _pair(study: Study, row: ComparedReturns, table: DataFrame, known: References) -> Pair:
+    first, second = study.arm(row.first), study.arm(row.second)
+    a, b = (performances(table, row.robot, arm, row.at_min, row.episodes) for arm in (first, second))
+    return Pair(row, a, b, known.random(first, row.at_min))
 
 
 def _courses(
@@ -232,21 +217,10 @@ def _courses(
     return panels
 
 
-def _controls(study: Study, rows: list[ControlReturns]) -> list[Controls]:
-    trained = {f"{TRAINED}{arm.name}" for arm in study.arms}
-    of_panel: dict[tuple[str, str, float], list[ControlReturns]] = defaultdict(list)
-    for row in rows:
-        of_panel[row.mapping, row.percentiles, row.at_min].append(row)
+def _controls(rows: Iterable[ControlReturns]) -> list[tuple[str, list[ControlReturns]]]:
+    """Those of a mapping at a recording together, with a title."""
     panels = []
-    for (mapping, percentiles, at_min), same in of_panel.items():
+    for (mapping, percentiles, at_min), same in groupby(rows, lambda row: (row.mapping, row.percentiles, row.at_min)):
         at = "" if mapping == "none" else f", recording at {at_min:g} min"
-        panels.append(
-            Controls(
-                f"{named_mapping(mapping, percentiles)}{at}",
-                tuple((row.control, row.mean_return, row.standard_error) for row in same),
-                sum(row.control in trained for row in same),
-                same[0].random,
-                same[0].optimum,
-            )
-        )
+        panels.append((f"{named_mapping(mapping, percentiles)}{at}", list(same)))
     return panels

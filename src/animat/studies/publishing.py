@@ -9,11 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+import numpy as np
+from jaxtyping import Float64
+
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.progress import Progress
-from animat.report.headline import ArmReturns, draw_headline
+from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
+from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.style import FORMATS, save_figure
 from animat.stimulation.protocol import Presentation
 from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
@@ -27,7 +31,7 @@ from animat.studies.learned import beside_the_optimum, learned_of
 from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
 from animat.studies.reflex import reflexes_told
-from animat.studies.results import ComparedReturns, ControlReturns, Results, read_typed
+from animat.studies.results import read_typed
 from animat.studies.shown import (
     comparisons_shown,
     controllability_shown,
@@ -60,7 +64,7 @@ class Publish(StudyTask):
         figure = draw_headline(headline)
         drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
-        sections = [_short(study, results, headline, drawn, narrow)]
+        sections = [_short(study, results, [row for row, _ in headline], drawn, narrow)]
         for spec in study.robots:
             pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT, _facts_of_robot(study, spec))
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
@@ -96,26 +100,23 @@ def _and(parts: Sequence[str]) -> str:
     return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), *parts[-1:]])
 
 
-def _headline(study: Study, results: Results, table: DataFrame) -> list[ArmReturns]:
-    """Each arm on each robot, at the last recording that it was evaluated on."""
+def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Score, Float64[np.ndarray, " policies"]]]:
+    """Each arm on each robot, at the last recording that it was evaluated on, with the mean return of each policy."""
     last = {(row.robot, row.arm): row for row in sorted(results.scores, key=lambda row: row.at_min)}
-    told = []
-    for row in (row for row in results.scores if row is last[row.robot, row.arm]):
-        of_each = performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)
-        interval = row.interquartile_mean, row.low_95, row.high_95
-        told.append(ArmReturns(row.robot, row.arm, *interval, row.random, row.optimum, tuple(of_each.tolist())))
-    return told
+    return [
+        (row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes))
+        for row in results.scores
+        if row is last[row.robot, row.arm]
+    ]
 
 
-def _short(
-    study: Study, results: Results, headline: Sequence[ArmReturns], drawn: Sequence[Path], narrow: Path
-) -> Section:
+def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Sequence[Path], narrow: Path) -> Section:
     """How the best arm does on each robot, what comes of it without the culture, and how many comparisons hold."""
     chosen = {arm.name for arm in study.arms if arm.trained and arm.through_neurons and arm.delivery == "chosen"}
     sentences, explained = [], []
     for spec in study.robots:
         of_robot = [row for row in headline if row.robot == spec.name]
-        best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.mean, default=None)
+        best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.interquartile_mean, default=None)
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
             means = f"In “{best.arm}” {mapped(study.arm(best.arm))}"
@@ -150,22 +151,21 @@ def _short(
     return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_shown(study),))
 
 
-def _beside(row: ArmReturns) -> str:
+def _beside(row: Score) -> str:
     """What came out in a sentence, then its numbers in another."""
     beside = [("random actions", row.random), ("the optimal controller", row.optimum)]
     known = [f"that of {name} {cell(value)}" for name, value in beside if value is not None]
-    numbers = ", ".join((f"interquartile mean return is {cell(row.mean)}", *known)) + "."
-    if row.random is None or row.low is None or row.high is None:
+    numbers = ", ".join((f"interquartile mean return is {cell(row.interquartile_mean)}", *known)) + "."
+    low, high = row.low_95, row.high_95
+    if row.random is None or low is None or high is None:
         return f"of the policies trained as “{row.arm}” the {numbers}"
-    if row.low > row.random:
+    if low > row.random:
         found = "do better than random actions"
         if row.optimum is not None and row.optimum > row.random:
-            way = (row.mean - row.random) / (row.optimum - row.random)
+            way = (row.interquartile_mean - row.random) / (row.optimum - row.random)
             found += f": {100 * way:.0f} % of the way to the optimal controller"
     else:
-        found = (
-            "do worse than random actions" if row.high < row.random else "are not found to differ from random actions"
-        )
+        found = "do worse than random actions" if high < row.random else "are not found to differ from random actions"
     return f"policies trained as “{row.arm}” {found}. Their {numbers}"
 
 

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator
 from animat.evaluation.coupling import context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
+from animat.report.results import BesideReflex, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
-from animat.studies.results import BesideReflex, StudyOptimum
 from animat.studies.specification import RobotSpec, Study, named_mapping
 
 

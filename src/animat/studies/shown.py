@@ -8,10 +8,10 @@ from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
+from animat.report.results import BesideHeuristic, BesideReflex, ComparedReturns, ControlReturns, Score, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.optima import optima_of_all, rough_kinds
-from animat.studies.results import BesideHeuristic, BesideReflex, ComparedReturns, ControlReturns, Score, StudyOptimum
 from animat.studies.specification import Study, named_mapping
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 

@@ -16,6 +16,7 @@ from animat.evaluation.statistics import Comparison, compare, holm, interquartil
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
+from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
@@ -24,16 +25,7 @@ from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
 from animat.studies.reflex import beside_reflex
-from animat.studies.results import (
-    ComparedReturns,
-    ControlReturns,
-    Results,
-    Score,
-    StudyOptimum,
-    write_records,
-    write_table,
-    write_typed,
-)
+from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
 from animat.studies.task import StudyTask
@@ -50,9 +42,6 @@ AIM = 0.97
 
 LEFT_OUT = "left-out"
 """The finding that a robot cannot do something, which the study is without."""
-
-TRAINED = "trained: "
-"""In front of an arm's name among the controls."""
 
 CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 
