@@ -10,13 +10,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from animat.closed_loop.gathering import LOG_FILE, RECORDING_FILE, STOP_FILE
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, first_line
 from animat.watch.cultures import CulturesView
 from animat.watch.found import Kind, find, place_within
-from animat.watch.guard import App, Guard
 from animat.watch.picture import picture_of
 from animat.watch.plain import text
 from animat.watch.recording import RecordingView
@@ -25,6 +24,9 @@ from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
 from animat.watch.view import View
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
 
 _FILES = {
     "": ("index.html", "text/html"),
@@ -103,20 +105,22 @@ class Watched:
         return self._views[key]
 
 
-def app_for(folder: Path, token: str, port: int) -> App:
+def app_for(folder: Path, token: str, port: int) -> Starlette:
     """The page of a folder as an ASGI application, guarded."""
     from starlette.applications import Starlette
     from starlette.concurrency import run_in_threadpool
+    from starlette.middleware import Middleware
+    from starlette.middleware.base import BaseHTTPMiddleware
     from starlette.requests import Request
     from starlette.responses import Response
-    from starlette.routing import Route
+    from starlette.routing import Mount, Route
+
+    from animat.watch.guard import guard
 
     watched = Watched(folder)
     own = importlib.resources.files("animat.watch") / "page"
-    pages = {address: ((own / name).read_bytes(), kind) for address, (name, kind) in _FILES.items()}
 
-    async def file(request: Request) -> Response:
-        content, kind = pages[request.url.path.removeprefix("/")]
+    async def file(content: bytes, kind: str, request: Request) -> Response:
         return Response(content, media_type=kind)
 
     def answering(answer: Callable[[Any], Any]) -> Callable[[Request], Any]:
@@ -137,7 +141,10 @@ def app_for(folder: Path, token: str, port: int) -> App:
         watched.stop(asked.get("in", ""))
         return {"stopped": True}
 
-    routes = [Route(f"/{address}", file) for address in pages]
+    routes = [
+        Route(f"/{address}", functools.partial(file, (own / name).read_bytes(), kind))
+        for address, (name, kind) in _FILES.items()
+    ]
     routes += [
         Route("/things", answering(lambda asked: watched.things())),
         Route("/about", answering(lambda asked: watched.about(asked.get("kind", ""), asked.get("in", "")))),
@@ -152,7 +159,8 @@ def app_for(folder: Path, token: str, port: int) -> App:
         Route("/robot.png", answering(picture)),
         Route("/stop", answering(stop), methods=["POST"]),
     ]
-    return Guard(Starlette(routes=routes), token, port)
+    guarded = Middleware(BaseHTTPMiddleware, dispatch=guard(token, port))
+    return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[guarded])
 
 
 def _answered(answer: Callable[[Any], Any], asked: Any) -> tuple[int, str, bytes]:

@@ -18,7 +18,6 @@ from typing import Any
 
 from animat.errors import AnimatError, InvalidArgument
 from animat.watch.found import find
-from animat.watch.guard import App, Receive, Scope, Send
 
 _NEEDS = ("starlette", "uvicorn")
 _START_S = 60.0
@@ -61,7 +60,8 @@ def serve(folder: Path, port: int, say: Callable[[str], None], *, beside: int | 
         raise InvalidArgument(f"{expected}, got {port}: {error.strerror or error}") from error
     with listening:
         port = listening.getsockname()[1]
-        app = _Noted(app_for(folder, token, port))
+        app = app_for(folder, token, port)
+        app.state.asked_s = time.monotonic()
         settings: dict[str, Any] = {
             "log_level": "critical", "access_log": False, "lifespan": "off", "ws": "none", "proxy_headers": False,
         }  # fmt: skip
@@ -74,21 +74,9 @@ def serve(folder: Path, port: int, say: Callable[[str], None], *, beside: int | 
             server.run(sockets=[listening])
 
 
-class _Noted:
-    """An application that notes when it was last asked."""
-
-    def __init__(self, app: App) -> None:
-        self._app = app
-        self.asked_s = time.monotonic()
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self.asked_s = time.monotonic()
-        await self._app(scope, receive, send)
-
-
-def _end_after(process: int, app: _Noted, server: Any) -> None:
+def _end_after(process: int, app: Any, server: Any) -> None:
     # Whoever loses the process that started it gets another parent.
-    while os.getppid() == process or time.monotonic() - app.asked_s < _LINGER_S:
+    while os.getppid() == process or time.monotonic() - app.state.asked_s < _LINGER_S:
         time.sleep(1.0)
     server.should_exit = True
 
