@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from animat.closed_loop.session import read_session
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, Mismatch
 from animat.report.results import ContextRow, LostRow
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
 from animat.studies.context import RanContext, plan_context_study, run_context_study
@@ -83,7 +83,7 @@ def test_robots_with_more_commands_than_two_are_refused() -> None:
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(InvalidFile, match="expected an empty folder or one of this study, got one with other files"):
+    with pytest.raises(Mismatch, match="expected an empty folder or one of this study, got one with other files"):
         run_context_study(ContextStudy(), tmp_path)
     assert [each.name for each in tmp_path.iterdir()] == ["mine.txt"]
 

@@ -11,21 +11,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from animat.differences import description_in, first_difference, of_another, with_fingerprint
-from animat.errors import InvalidFile
+from animat.differences import with_fingerprint
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
-from animat.records import write_json
 from animat.report.results import ContextRow, LostRow
 from animat.robots.registry import robot_named
 from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
+from animat.studies.folder import MANIFEST, held
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
 from animat.training.settings import LEARNER
-from animat.writing import exclusive_lock
 
-MANIFEST, TABLE, WHOSE_WORK = "study.json", "context.csv", "whose-work.csv"
+TABLE, WHOSE_WORK = "context.csv", "whose-work.csv"
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def run_context_study(
         workers, executor, progress: as of `animat.studies.run.run_study`.
 
     Raises:
-        Mismatch: if the folder is another study's, or another run is at work in it.
+        Mismatch: if the folder is another study's, holds other files, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
         InvalidArgument: for fewer workers than one, or any beside an executor.
         AnimatError: if a job failed; its message names the job.
@@ -66,11 +64,8 @@ def run_context_study(
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     manifest = _describe(study)
-    # Seen before it is touched: somebody else's folder stays as it is.
-    is_ours = _is_ours(folder, manifest)
-    with exclusive_lock(folder):
-        if not is_ours:
-            write_json(folder / MANIFEST, manifest)
+    cultures = [f"culture-{culture}" for culture in study.cultures]
+    with held(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
         left = Jobs(plan_context_study(study), folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s = {}
         if left.waiting:
@@ -91,19 +86,6 @@ def _describe(study: ContextStudy) -> dict[str, Any]:
     versions = {name: importlib.metadata.version(name) for name in packages}
     versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
     return with_fingerprint({"context study": asdict(study), "versions": versions})
-
-
-def _is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
-    found = description_in(folder / MANIFEST, "study")
-    if found is None:
-        if folder.is_dir() and any(not each.name.startswith(".") for each in folder.iterdir()):
-            raise InvalidFile(
-                f"{folder}: expected an empty folder or one of this study, got one with other files in it"
-            )
-        return False
-    if found["fingerprint"] != manifest["fingerprint"]:
-        raise of_another(folder, "study", first_difference(found, manifest, ignoring=("fingerprint",)))
-    return True
 
 
 def plan_context_study(study: ContextStudy) -> list[Job]:
