@@ -19,7 +19,7 @@ from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
 from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.settings import Detection
-from animat.recordings.raw import ArrayTraces, in_microvolts
+from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.recordings.spikes_of_traces import read_traces
 from animat.stimulation.pulse import PUBLISHED_PULSE
@@ -64,12 +64,12 @@ def agreement(found: FoundSpikes, truth: list[Int64[np.ndarray, " n"]]) -> tuple
 
 
 @pytest.fixture(scope="module")
-def known() -> tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]:
+def known() -> tuple[RawTraces, list[Int64[np.ndarray, " n"]]]:
     voltage, truth = noisy(70, 6.0)
-    return ArrayTraces(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
+    return RawTraces.of_array(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
 
 
-def test_known_spikes_are_found_and_few_others(known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]) -> None:
+def test_known_spikes_are_found_and_few_others(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> None:
     traces, truth = known
     found = find_spikes(traces)
     shifted = FoundSpikes(found.time_s + 1.0, found.channel, found.noise_uv, found.findings)
@@ -83,7 +83,7 @@ def test_known_spikes_are_found_and_few_others(known: tuple[ArrayTraces, list[In
 
 @pytest.mark.parametrize(("chunk_s", "workers"), [(0.1, 1), (0.3, 3), (10.0, 2)])
 def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
-    known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]], chunk_s: float, workers: int
+    known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]], chunk_s: float, workers: int
 ) -> None:
     whole = find_spikes(known[0], workers=1)
     pieces = find_spikes(known[0], None, Detection(chunk_s=chunk_s), workers=workers)
@@ -120,14 +120,14 @@ def test_negative_peaks_are_those_of_the_definition(steps: list[int], apart: int
     assert set(row.tolist()) <= {0}
 
 
-def test_spikeinterface_finds_the_same_spikes(known: tuple[ArrayTraces, list[Int64[np.ndarray, " n"]]]) -> None:
+def test_spikeinterface_finds_the_same_spikes(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> None:
     core = pytest.importorskip("spikeinterface.core", reason="SpikeInterface is not installed (animat[raw])")
     from spikeinterface.preprocessing import bandpass_filter
     from spikeinterface.sortingcomponents.peak_detection import detect_peaks
 
     traces = known[0]
     ours = find_spikes(traces)
-    recording = core.NumpyRecording([traces.voltage_uv * np.float32(traces.uv_per_step)], RATE_HZ)
+    recording = core.NumpyRecording([traces.read_uv(0, traces.samples)], RATE_HZ)
     recording.set_dummy_probe_from_locations(np.column_stack([np.arange(70) * 1e3, np.zeros(70)]))
     peaks = detect_peaks(
         bandpass_filter(recording, freq_min=100, freq_max=3000, filter_order=3, dtype="float32"),
@@ -172,14 +172,14 @@ def test_the_noise_is_told_by_the_median(samples: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def stimulated() -> tuple[Traces, ArrayTraces]:
+def stimulated() -> tuple[Traces, RawTraces]:
     with small_culture() as culture:
         pulses = [Stimulus(0.2 + 0.1 * i, tuple(culture.patterns[i].tolist()), PUBLISHED_PULSE) for i in range(16)]
         traces = record_traces(culture, 2.0, stimuli=pulses)
         x_um, y_um = culture.selection.array.position_um(culture.selection.recording)
     n = traces.voltage_uv.shape[1]
     table = Channels(np.arange(n).astype(str), np.arange(n), x_um, y_um)
-    return traces, ArrayTraces(traces.voltage_uv, table, traces.sampling_rate_hz)
+    return traces, RawTraces.of_array(traces.voltage_uv, table, traces.sampling_rate_hz)
 
 
 def in_window(
@@ -189,7 +189,7 @@ def in_window(
     return (since_ms >= window_ms[0]) & (since_ms < window_ms[1])
 
 
-def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, ArrayTraces]) -> None:
+def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, RawTraces]) -> None:
     traces, source = stimulated
     found = find_spikes(source, traces.stimulus_time_s, Detection())
     large = (traces.amplitude_uv > 8 * 2.4) & in_window(traces.spikes.time_s, traces.stimulus_time_s, (2, 10))
@@ -221,7 +221,7 @@ def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tu
     assert "are saturated on average" in names["saturated-channels"].message
 
 
-def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, ArrayTraces]) -> None:
+def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, RawTraces]) -> None:
     traces, source = stimulated
     naive = find_spikes(source)
     removed = find_spikes(source, traces.stimulus_time_s, Detection())
@@ -231,7 +231,7 @@ def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[T
 
 def test_a_window_is_not_eaten_unasked() -> None:
     assert Detection().blank_ms[1] <= 1.5
-    traces = ArrayTraces(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
+    traces = RawTraces.of_array(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
     found = find_spikes(traces, np.array([0.5]), Detection(blank_ms=(0.5, 3.0)))
     assert {f.name: f.severity for f in found.findings}["blanked"] == "warning"
 
@@ -261,7 +261,7 @@ def test_the_negative_peak_of_a_spike_in_coarse_steps_is_no_saturation(amplitude
         for channel, ms in enumerate(of_pulse):
             at = pulse + round(ms * 20)
             voltage[at - 20 : at + 41, channel] += amplitude * SPIKE_UV
-    traces = ArrayTraces(np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv)
+    traces = RawTraces.of_array(np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv)
     found = find_spikes(traces, pulses / RATE_HZ, Detection())
     assert "saturated-channels" not in {finding.name for finding in found.findings}
     truth = [pulses + np.rint(late[:, channel] * 20).astype(np.int64) for channel in range(8)]
@@ -306,7 +306,7 @@ def test_a_decay_is_taken_away_and_spikes_on_it_are_left(tau_ms: float, size_uv:
 
 
 def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
-    traces = ArrayTraces(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
+    traces = RawTraces.of_array(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
     found = find_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), Detection())
     assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
 
@@ -315,7 +315,7 @@ def test_dead_and_noisy_channels_are_said() -> None:
     voltage, _ = noisy(30, 1.0)
     voltage[:, 3] = 7
     voltage[:, 8] *= 20
-    found = find_spikes(ArrayTraces(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
+    found = find_spikes(RawTraces.of_array(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
     said = {finding.name: finding.value for finding in found.findings}
     assert (said["dead-channels"], said["noisy-channels"]) == (1, 1)
     assert 3 not in found.channel
@@ -331,7 +331,7 @@ def test_settings_that_cannot_be_are_refused(setting: str, value: object) -> Non
 
 
 def test_a_band_beyond_the_sampling_rate_is_refused() -> None:
-    traces = ArrayTraces(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
+    traces = RawTraces.of_array(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
     with pytest.raises(InvalidArgument, match="less than half the sampling rate of 5000 Hz, got 3000 Hz"):
         find_spikes(traces)
 

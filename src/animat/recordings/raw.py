@@ -2,41 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument
 from animat.recordings.recording import Channels
-
-
-class RawTraces(Protocol):
-    """What raw traces are to whoever reads them. May be read from several threads.
-
-    Attributes:
-        channels: the table of channels, one a column.
-        samples: how many each channel has.
-        start_s: time of the first sample on the recording's clock.
-    """
-
-    @property
-    def channels(self) -> Channels: ...
-    @property
-    def samples(self) -> int: ...
-    @property
-    def sampling_rate_hz(self) -> float: ...
-    @property
-    def start_s(self) -> float: ...
-
-    def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        """The voltage of samples `start` to `stop` of all channels, in microvolts.
-
-        What is read from it channel by channel is read faster where it lies so in memory (`in_microvolts`).
-        """
-
 
 TILE_SAMPLES, TILE_CHANNELS = 256, 64
 
@@ -60,71 +34,50 @@ def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np
 
 
 @dataclass(frozen=True, eq=False)
-class ArrayTraces:
-    """Raw traces in memory.
+class RawTraces:
+    """Raw traces of a recording. May be read from several threads.
 
     Attributes:
-        voltage_uv: shape (samples, channels), any number type.
-        channels: one a column.
-        start_s: time of the first sample.
-        uv_per_step: what one step of `voltage_uv` is, 1 for microvolts.
+        read_uv: the voltage of samples `start` to `stop` of all channels, in microvolts, shape (samples, channels):
+            `read_uv(start, stop)`. What is read from it channel by channel is read faster where it lies so in memory
+            (`in_microvolts`).
+        channels: the table of channels, one a column.
+        samples: how many each channel has.
+        start_s: time of the first sample on the recording's clock.
     """
 
-    voltage_uv: np.ndarray[Any, Any]
-    channels: Channels
-    sampling_rate_hz: float
-    start_s: float = 0.0
-    uv_per_step: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.voltage_uv.ndim != 2 or self.voltage_uv.shape[1] != len(self.channels):
-            raise InvalidArgument(
-                f"voltage_uv: expected shape (samples, {len(self.channels)} channels), got {self.voltage_uv.shape}"
-            )
-
-    @property
-    def samples(self) -> int:
-        return int(self.voltage_uv.shape[0])
-
-    def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        return in_microvolts(self.voltage_uv[start:stop], self.uv_per_step)
-
-
-@dataclass(frozen=True, eq=False)
-class Hdf5Traces:
-    """Raw traces in an HDF5 dataset of whole numbers, read as they are asked for.
-
-    Attributes:
-        path, where: of the dataset; its values are checked to lie in the file itself.
-        columns: of the dataset, in the order of the channels.
-        channels_first: whether the dataset is (channels, samples) and not (samples, channels).
-        channels: one a column.
-        samples, sampling_rate_hz, start_s: as in `RawTraces`.
-    """
-
-    path: Path
-    where: str
-    columns: np.ndarray[Any, np.dtype[np.int64]]
-    channels_first: bool
+    read_uv: Callable[[int, int], Float32[np.ndarray, "samples channels"]]
     channels: Channels
     samples: int
     sampling_rate_hz: float
-    uv_per_step: float
     start_s: float = 0.0
 
-    def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        """The voltage of samples `start` to `stop`.
+    @classmethod
+    def of_array(
+        cls,
+        voltage_uv: np.ndarray[Any, Any],
+        channels: Channels,
+        sampling_rate_hz: float,
+        start_s: float = 0.0,
+        uv_per_step: float = 1.0,
+    ) -> RawTraces:
+        """Raw traces in memory.
+
+        Args:
+            voltage_uv: shape (samples, channels), any number type.
+            channels: one a column.
+            start_s: time of the first sample.
+            uv_per_step: what one step of `voltage_uv` is, 1 for microvolts.
 
         Raises:
-            InvalidFile: if the samples cannot be read.
+            InvalidArgument: for another shape.
         """
-        from animat.recordings.formats.hdf5 import hdf5_file
+        if voltage_uv.ndim != 2 or voltage_uv.shape[1] != len(channels):
+            raise InvalidArgument(
+                f"voltage_uv: expected shape (samples, {len(channels)} channels), got {voltage_uv.shape}"
+            )
 
-        with hdf5_file(self.path, "file of raw traces") as file:
-            dataset = file.dataset(self.where)
-            piece = np.asarray(dataset[:, start:stop].T if self.channels_first else dataset[start:stop])
-        if piece.shape[0] != stop - start:
-            raise InvalidFile(f"{self.path}: expected samples up to {stop:,} at /{self.where}, got {piece.shape[0]:,}")
-        if not np.array_equal(self.columns, np.arange(piece.shape[1])):
-            piece = piece[:, self.columns]
-        return in_microvolts(piece, self.uv_per_step)
+        def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
+            return in_microvolts(voltage_uv[start:stop], uv_per_step)
+
+        return cls(read_uv, channels, len(voltage_uv), sampling_rate_hz, start_s)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from jaxtyping import Float32, Int64
 
 from animat.errors import InvalidFile
 from animat.recordings.formats.cl1 import read_cl1
@@ -17,7 +19,7 @@ from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
 from animat.recordings.formats.nwb_of_others import read_other_nwb
-from animat.recordings.raw import Hdf5Traces
+from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 from animat.tables import UNKNOWN
 
@@ -27,7 +29,7 @@ OLD_LSB_V = 6.294e-6
 
 def open_traces(
     path: str | os.PathLike[str], *, part: str | None = None, stimuli: str | None = None
-) -> tuple[Hdf5Traces, Recording]:
+) -> tuple[RawTraces, Recording]:
     """Raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
     Args:
@@ -65,7 +67,7 @@ def open_traces(
     return traces, base
 
 
-def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
+def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     if is_old(file):
         lsb = _number(file.first("settings/lsb"), OLD_LSB_V)
         return _traces(file, "sig", base, 1e6 * lsb, channels_first=True, labels=np.arange(OLD_CHANNELS))
@@ -85,7 +87,7 @@ def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
     return _traces(file, where, base, 1e6 * lsb, channels_first=True, start_s=start_s, labels=labels)
 
 
-def _nwb(file: Hdf5File, part: str | None, base: Recording) -> Hdf5Traces:
+def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     path, kind = file.path, "neurodata_type"
     names = file.names("acquisition")
     series = [name for name in names if file.attribute(f"acquisition/{name}", kind) == "ElectricalSeries"]
@@ -114,7 +116,7 @@ def _traces(
     rate_hz: float | None = None,
     start_s: float = 0.0,
     labels: Any = None,
-) -> Hdf5Traces:
+) -> RawTraces:
     """Traces in a dataset, with the channels of the recording that it holds; one row or column a label."""
     path, rate_hz = file.path, base.sampling_rate_hz if rate_hz is None else rate_hz
     if not isinstance(file.node(where), h5py.Dataset):
@@ -150,7 +152,37 @@ def _traces(
         kept = np.array(rows)[used]
         table = base.channels
         channels = Channels(table.label[kept], table.electrode[kept], table.x_um[kept], table.y_um[kept])
-    return Hdf5Traces(path, where, used, channels_first, channels, int(samples), float(rate_hz), uv_per_step, start_s)
+    read_uv = partial(read_dataset_uv, path, where, used, channels_first, uv_per_step)
+    return RawTraces(read_uv, channels, int(samples), float(rate_hz), start_s)
+
+
+def read_dataset_uv(
+    path: Path,
+    where: str,
+    columns: Int64[np.ndarray, " channels"],
+    channels_first: bool,
+    uv_per_step: float,
+    start: int,
+    stop: int,
+) -> Float32[np.ndarray, "samples channels"]:
+    """The voltage of samples `start` to `stop` in an HDF5 dataset of numbers, read as they are asked for.
+
+    Args:
+        path, where: of the dataset; its values are checked to lie in the file itself.
+        columns: of the dataset, in the order of the channels.
+        channels_first: whether the dataset is (channels, samples) and not (samples, channels).
+
+    Raises:
+        InvalidFile: if the samples cannot be read.
+    """
+    with hdf5_file(path, "file of raw traces") as file:
+        dataset = file.dataset(where)
+        piece = np.asarray(dataset[:, start:stop].T if channels_first else dataset[start:stop])
+    if piece.shape[0] != stop - start:
+        raise InvalidFile(f"{path}: expected samples up to {stop:,} at /{where}, got {piece.shape[0]:,}")
+    if not np.array_equal(columns, np.arange(piece.shape[1])):
+        piece = piece[:, columns]
+    return in_microvolts(piece, uv_per_step)
 
 
 def _number(value: Any, otherwise: float) -> float:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.columns import PlainColumns
 from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
 from animat.recordings.formats.hdf5 import first_line
-from animat.recordings.raw import in_microvolts
+from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 
 MISSING = "expected the package SpikeInterface, which is not installed: pip install 'spikeinterface>=0.104'"
@@ -29,36 +28,9 @@ REFUSED = ("binary_folder", "zarr", "python", "npz_folder", "npz_sorting")
 """Readers of SpikeInterface's own saved objects."""
 
 
-@dataclass(frozen=True, eq=False)
-class SpikeInterfaceTraces:
-    """Raw traces that a SpikeInterface recording reads."""
-
-    recording: Any
-    channels: Channels
-
-    @property
-    def samples(self) -> int:
-        return int(self.recording.get_num_samples(segment_index=0))
-
-    @property
-    def sampling_rate_hz(self) -> float:
-        return float(self.recording.get_sampling_frequency())
-
-    @property
-    def start_s(self) -> float:
-        """Time of the first sample: 0, as stimuli beside such files are counted from their start."""
-        return 0.0
-
-    def read_uv(self, start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        has_scale = self.recording.has_scaleable_traces()
-        return in_microvolts(
-            self.recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale), 1.0
-        )
-
-
 def open_with_spikeinterface(
     path: str | os.PathLike[str], reader: str, *, stimuli_path: str | os.PathLike[str] | None = None
-) -> tuple[SpikeInterfaceTraces, Recording]:
+) -> tuple[RawTraces, Recording]:
     """Raw traces read by SpikeInterface, and their recording without spikes.
 
     Args:
@@ -81,10 +53,11 @@ def open_with_spikeinterface(
         labels = np.array([str(name) for name in recording.get_channel_ids()], dtype=np.str_)
         placed = recording.has_probe() if hasattr(recording, "has_probe") else False
         xy_um = np.asarray(recording.get_channel_locations())[:, :2] if placed else np.full((n, 2), np.nan)
-        traces = SpikeInterfaceTraces(
-            recording, Channels(labels, np.full(n, -1), xy_um[:, 0].astype(np.float64), xy_um[:, 1].astype(np.float64))
-        )
-        duration_s = traces.samples / traces.sampling_rate_hz
+        x_um, y_um = xy_um.astype(np.float64).T
+        channels = Channels(labels, np.full(n, -1), x_um, y_um)
+        samples = int(recording.get_num_samples(segment_index=0))
+        rate_hz = float(recording.get_sampling_frequency())
+        duration_s = samples / rate_hz
         segments = int(recording.get_num_segments())
     except Exception as error:
         # The readers of 40 formats fail in as many ways.
@@ -100,11 +73,19 @@ def open_with_spikeinterface(
         spike_channel=np.empty(0, np.int64),
         channel_label=labels,
         channel_xy_um=xy_um,
-        sampling_rate_hz=traces.sampling_rate_hz,
+        sampling_rate_hz=rate_hz,
         duration_s=max(duration_s, float(np.max(columns["stimulus_time_s"], initial=0.0))),
         **columns,
     ).to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"})
-    return traces, base
+
+    def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
+        has_scale = recording.has_scaleable_traces()
+        return in_microvolts(
+            recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale), 1.0
+        )
+
+    # From 0 s on, as stimuli beside such files are counted from their start.
+    return RawTraces(read_uv, channels, samples, rate_hz), base
 
 
 def _reader(name: str) -> Callable[..., Any]:
