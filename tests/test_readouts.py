@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.synthetic import SyntheticCulture
-from animat.responses.extraction import extract_responses, responses_of
+from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts, count_readouts, read_readouts, readouts_on
 from animat.responses.series import extract_series
 from animat.responses.windows import read_windows
@@ -90,7 +90,7 @@ def test_halves_and_quadrants_are_cut_by_position(recording: Recording, halves: 
 def test_a_table_of_responses_has_readouts_too(recording: Recording, halves: Readouts) -> None:
     values = np.random.default_rng(0).poisson(1.0, (len(recording.stimuli), len(recording.channels))).astype(float)
     table = ResponseTable(values, "count", recording.channels, recording.stimuli, window_ms=WINDOW_MS)
-    responses = responses_of(table, readouts=halves)
+    responses = extract_responses(table, readouts=halves)
     left = np.isin(recording.channels.electrode, (halves.electrodes or ())[0])
     np.testing.assert_allclose(responses.read_hz[:, 0], values[:, left].mean(axis=1) / 0.008)
     np.testing.assert_allclose(responses.rate_hz, values.mean(axis=1) / 0.008)

@@ -17,7 +17,7 @@ from animat.recordings.response_table import ResponseTable
 from animat.recordings.synthetic import synthetic_recording
 from animat.report.inspection import inspection_text
 from animat.responses.conditions import ByInterval, ByPattern, Conditions
-from animat.responses.extraction import extract_responses, responses_of_table
+from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.responses.windows import spikes_in
 from test_responses import recording as of_spikes
@@ -63,7 +63,7 @@ def test_a_table_has_the_responses_of_the_recording_that_it_was_counted_in(
         header = ["time_s", "Frequency (Hz)", "window_start_ms", "window_end_ms", "start_min", *channels]
         path.write_text("\n".join([",".join(header), *lines]) + "\n")
     table = table_of(path)
-    ours, theirs = responses_of_table(table), extract_responses(recording, window_ms=window_ms)
+    ours, theirs = extract_responses(table), extract_responses(recording, window_ms=window_ms)
     # The recording ends with its last event, so that its last window may be cut off.
     n = len(theirs)
     assert len(ours) - n in (0, 1)
@@ -96,7 +96,7 @@ def test_bursts_of_a_table_are_those_of_its_recording_where_few_ratios_occur() -
         presentation=None,
         provenance={},
     )
-    for responses in (extract_responses(recording), responses_of_table(table)):
+    for responses in (extract_responses(recording), extract_responses(table)):
         np.testing.assert_array_equal(responses.is_burst, active == 30)
 
 
@@ -104,7 +104,7 @@ def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_pattern=["a", "b", "a"])
     table = table_of(tmp_path / "a.npz")
     assert not table.has_times
-    responses = responses_of_table(table, ByPattern(), (2.0, 12.0))
+    responses = extract_responses(table, ByPattern(), (2.0, 12.0))
     # One spike on two channels in 10 ms is 50 Hz.
     assert responses.rate_hz.tolist() == [50.0, 0.0, 250.0]
     assert responses.active_ratio.tolist() == [0.5, 0.0, 1.0]
@@ -227,7 +227,7 @@ def test_a_choice_that_a_table_does_not_offer_is_refused(
 ) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]], response_window_ms=[1, 9], stimulus_pattern=[0, 1])
     with pytest.raises(AnimatError, match=message):
-        responses_of_table(table_of(tmp_path / "a.npz"), by, window_ms)
+        extract_responses(table_of(tmp_path / "a.npz"), by, window_ms)
 
 
 @pytest.fixture
@@ -238,7 +238,7 @@ def rat(real_data: Path, tmp_path: Path) -> list[str]:
     file = tmp_path / "rat.npz"
     np.savez_compressed(file, response_count=counts, stimulus_pattern=sources[:, 0] + 2 * sources[:, 1])
     np.testing.assert_allclose(
-        responses_of_table(table_of(file), ByPattern()).rate_hz, counts.sum(axis=1) / (64 * 0.008), rtol=1e-12
+        extract_responses(table_of(file), ByPattern()).rate_hz, counts.sum(axis=1) / (64 * 0.008), rtol=1e-12
     )
     return [str(file), "--conditions", "pattern", "--burst-threshold", "1"]
 
@@ -267,7 +267,7 @@ def test_rows_without_times_drift_in_their_order(tmp_path: Path) -> None:
         np.savez(tmp_path / f"{name}.npz", response_count=counts, stimulus_pattern=pattern)
         found = {
             finding.name: finding
-            for finding in responses_of_table(table_of(tmp_path / f"{name}.npz"), ByPattern()).findings
+            for finding in extract_responses(table_of(tmp_path / f"{name}.npz"), ByPattern()).findings
         }
         assert ("drift" in found) == (name == "rising")
         if name == "rising":

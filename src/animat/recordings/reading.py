@@ -74,37 +74,13 @@ def read_recording(
     path = Path(path)
     if start_min is not None and not np.isfinite(start_min):
         raise InvalidArgument(f"start_min: expected finite minutes, got {start_min:g}")
-    magic = _first_bytes(path)
-    holds_stimuli = magic.startswith((HDF5, ZIP))
-    if holds_stimuli and stimuli_path is not None:
-        raise InvalidArgument(
-            f"stimuli_path: expected only beside CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
+    source = _read(path, stimuli_path, stimuli, part)
+    if isinstance(source, ResponseTable):
+        raise InvalidFile(
+            f"{path}: expected spikes, got a table of responses, which animat inspect, train and evaluate read; "
+            "this needs the times of spikes"
         )
-    if (stimuli is not None or part is not None) and not magic.startswith(HDF5):
-        raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
-    try:
-        if magic.startswith(HDF5):
-            recording = read_hdf5_apart(path, part=part, stimuli=stimuli)
-        elif _response_reader(path, magic) is not None:
-            raise InvalidFile(
-                f"{path}: expected spikes, got a table of responses, which animat inspect, train and evaluate read; "
-                "this needs the times of spikes"
-            )
-        elif magic.startswith(ZIP):
-            recording = read_npz(path)
-        elif magic.startswith(NPY):
-            raise InvalidFile(f"{path}: expected NPZ (several arrays by name), got NPY (one array)")
-        elif kind := _other_kind(path, magic):
-            raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
-        else:
-            recording = _read_text(path, stimuli_path)
-    except (UnusableData, InvalidArgument) as error:
-        # These name the column at fault but not the file.
-        raise InvalidFile(f"{path}: {error}") from error
-    except (*DAMAGE, RecursionError, AssertionError) as error:
-        # What no reader foresaw: still a file that cannot be read, and one line.
-        raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
-    return recording if start_min is None else dataclasses.replace(recording, start_min=float(start_min))
+    return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
 
 
 def read_source(
@@ -118,14 +94,37 @@ def read_source(
     Raises:
         InvalidFile, InvalidArgument: as in `read_recording`.
     """
-    path = Path(path)
-    read = _response_reader(path, _first_bytes(path))
-    if read is None or stimuli is not None or part is not None:
-        return read_recording(path, stimuli=stimuli, part=part)
+    return _read(Path(path), None, stimuli, part)
+
+
+def _read(
+    path: Path, stimuli_path: str | os.PathLike[str] | None, stimuli: str | None, part: str | None
+) -> Recording | ResponseTable:
+    magic = _first_bytes(path)
+    if magic.startswith((HDF5, ZIP)) and stimuli_path is not None:
+        raise InvalidArgument(
+            f"stimuli_path: expected only beside CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
+        )
+    if (stimuli is not None or part is not None) and not magic.startswith(HDF5):
+        raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
-        return read(path)
+        if magic.startswith(HDF5):
+            return read_hdf5_apart(path, part=part, stimuli=stimuli)
+        if read_table := _response_reader(path, magic):
+            return read_table(path)
+        if magic.startswith(ZIP):
+            return read_npz(path)
+        if magic.startswith(NPY):
+            raise InvalidFile(f"{path}: expected NPZ (several arrays by name), got NPY (one array)")
+        if kind := _other_kind(path, magic):
+            raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
+        return _read_text(path, stimuli_path)
     except (UnusableData, InvalidArgument) as error:
+        # These name the column at fault but not the file.
         raise InvalidFile(f"{path}: {error}") from error
+    except (*DAMAGE, RecursionError, AssertionError) as error:
+        # What no reader foresaw: still a file that cannot be read, and one line.
+        raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
 
 
 def _response_reader(path: Path, magic: bytes) -> Callable[[Path], ResponseTable] | None:

@@ -13,7 +13,7 @@ from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import BurstSeparation, separate_bursts
 from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
-from animat.responses.quality.responses import findings_on, findings_without_times
+from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Presented, Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
@@ -22,21 +22,8 @@ SILENCE_S = 1.0
 """So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""
 
 
-def responses_of(
-    source: Recording | ResponseTable,
-    by: Conditions | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
-    burst_threshold: float | None = None,
-    readouts: Readouts = ALL,
-) -> Responses:
-    """The responses of a recording (`extract_responses`) or of a table (`responses_of_table`)."""
-    if isinstance(source, Recording):
-        return extract_responses(source, by, window_ms, burst_threshold, readouts)
-    return responses_of_table(source, by, window_ms, burst_threshold, readouts)
-
-
 def extract_responses(
-    recording: Recording,
+    source: Recording | ResponseTable,
     by: Conditions | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
@@ -47,72 +34,61 @@ def extract_responses(
         x = S / (T N)
 
     with S the spikes from window_ms[0] up to, not including, window_ms[1] after the pulse (see
-    `animat.responses.windows.count_spikes` for the edges), T the length of the window and N the number of channels.
+    `animat.responses.windows.count_spikes` for the edges), T the length of the window and N the number of channels. Of
+    a table, x is the mean over channels of count / T, or of the rate; active are channels with a count or rate above 0.
 
     Presentations without a condition, and ones whose window runs past the end of the recording, are left out and
     counted in `findings`, where also everything else is said that makes the responses doubtful.
 
     Args:
+        source: spikes, or what each channel did after each stimulus.
         by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
-        window_ms: start and end of the window after the pulse.
+        window_ms: start and end of the window after the pulse; of a table that does not say it, the window that was
+            counted in. One that a table says goes before the default one.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
         readouts: groups of channels whose x is read too, in the same windows; bursts are told by all channels.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
-        UnusableData: for a recording without channels.
-        Mismatch: for one whose channels do not read all electrodes of the readouts.
+        UnusableData: without channels, or for conditions by interval of a table without times.
+        Mismatch: for channels that do not read all electrodes of the readouts, or another window than the table's.
 
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
         only where it finds two groups).
     """
     check_window(window_ms)
-    if not len(recording.channels):
-        raise UnusableData("channels: expected at least one, got a recording without any; x is a mean over channels")
-    stimuli = recording.stimuli
+    if not len(source.channels):
+        what = "recording" if isinstance(source, Recording) else "table"
+        raise UnusableData(f"channels: expected at least one, got a {what} without any; x is a mean over channels")
+    if isinstance(source, ResponseTable):
+        return _of_table(source, by, window_ms, burst_threshold, readouts)
+    stimuli = source.stimuli
     # An end that is the last stimulus' or spike's own time is rounded like them.
-    inside = stimuli.time_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9
+    inside = stimuli.time_s + window_ms[1] * 1e-3 <= source.stop_s + 1e-9
     presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
     # Those without a condition are read too: they are what came before others.
-    rate_hz, active_ratio = read_windows(recording, stimuli.time_s[presented], window_ms)
-    responses, assignment, bursts = _sorted(recording, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
+    responses, assignment, bursts = _sorted(source, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
     if not readouts.are_all and responses.time_s is not None:
-        members = readouts.members(recording.channels)
-        readout_hz = readouts.read(recording, members, responses.time_s, window_ms)
+        members = readouts.members(source.channels)
+        readout_hz = readouts.read(source, members, responses.time_s, window_ms)
         responses = replace(responses, readouts=readouts, readout_hz=readout_hz)
-    return replace(responses, findings=findings_on(responses, recording, assignment, bursts, inside))
+    return replace(responses, findings=findings_on(responses, source, assignment, bursts, inside))
 
 
-def responses_of_table(
+def _of_table(
     table: ResponseTable,
-    by: Conditions | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
-    burst_threshold: float | None = None,
-    readouts: Readouts = ALL,
+    by: Conditions | None,
+    window_ms: tuple[float, float],
+    burst_threshold: float | None,
+    readouts: Readouts,
 ) -> Responses:
-    """The response to the last pulse of every presentation that has a condition, of a table of counts or rates.
-
-        x = mean over channels of count / T, or of the rate;  active: channels with a count or rate above 0
-
-    Args:
-        table: what each channel did after each stimulus.
-        window_ms: the window that was counted in, where the table does not say; one that it says goes before the
-            default one.
-        by, burst_threshold, readouts: as in `extract_responses`.
-
-    Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus.
-        Mismatch: for another window than the table's.
-        UnusableData: for a table without channels, or conditions by interval where it has no times.
-    """
-    check_window(window_ms)
+    """Those of a table, which says what its channels did, and not when."""
     if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
         raise Mismatch(
             f"window_ms: expected {table.window_ms[0]:g} to {table.window_ms[1]:g}, in which the table's spikes were "
             f"counted, got {window_ms[0]:g} to {window_ms[1]:g}; leave the window out"
         )
-    if not len(table.channels):
-        raise UnusableData("channels: expected at least one, got a table without any; x is a mean over channels")
     if isinstance(by, ByInterval) and not table.has_times:
         raise UnusableData("conditions: expected others than intervals, as the table has no times of stimuli")
     assumed = []
@@ -129,12 +105,11 @@ def responses_of_table(
     rate_hz = table.values[presented].mean(axis=1) * scale
     active_ratio = np.mean(table.values[presented] > 0, axis=1)
     responses, assignment, bursts = _sorted(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
-    found = findings_without_times(responses, table.stimuli, assignment, bursts)
     if not readouts.are_all:
         members, values = readouts.members(table.channels), table.values[presented[responses.presentations[1]]]
         readout_hz = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1) * scale
         responses = replace(responses, readouts=readouts, readout_hz=readouts.alone(readout_hz))
-    return replace(responses, findings=(*assumed, *found))
+    return replace(responses, findings=(*assumed, *findings_on(responses, table, assignment, bursts)))
 
 
 def _sorted(

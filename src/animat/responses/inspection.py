@@ -14,7 +14,7 @@ from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.records import as_json
 from animat.responses.conditions import Conditions, default_conditions
-from animat.responses.extraction import extract_responses, responses_of_table
+from animat.responses.extraction import extract_responses
 from animat.responses.network_bursts import NetworkBursts, find_network_bursts
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
@@ -176,71 +176,48 @@ def inspect_recording(
         UnusableData: for a recording without channels.
         Mismatch: for another window than the one of a table.
     """
-    if isinstance(recording, ResponseTable):
-        return _of_table(recording, by, window_ms, burst_threshold, name)
     chosen = by or default_conditions(recording.stimuli)
     responses = extract_responses(recording, chosen, window_ms, burst_threshold)
-    read = recording.stimuli.is_last_of_presentation
-    times_s = recording.stimuli.time_s[read]
-    times_s = times_s[times_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9]
-    spikes = count_spikes(recording, times_s + window_ms[0] * 1e-3, times_s + window_ms[1] * 1e-3)
-    rate_hz, _ = spontaneous_rate(recording, after_ms=window_ms[1])
-    rate_hz, bursts = rate_hz / len(recording.channels), None
-    if not len(recording.stimuli):
-        bursts = find_network_bursts(recording)
-        exposure_s = recording.duration_s * len(recording.channels)
-        rate_hz = len(recording.spike_times_s) / exposure_s if exposure_s else math.nan
+    stimuli, read = recording.stimuli, recording.stimuli.is_last_of_presentation
+    bursts = response = None
+    rate_hz = duration_s = math.nan
+    if isinstance(recording, ResponseTable):
+        # What takes times of spikes is not known.
+        kind = "table"
+        n_spikes = int(recording.values.sum()) if recording.kind == "count" else None
+        width_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3
+        spikes = recording.values[read].sum(axis=1) * (1.0 if recording.kind == "count" else width_s)
+        if recording.has_times and len(stimuli):
+            duration_s = float(np.ptp(stimuli.time_s))
+    else:
+        kind, n_spikes, duration_s = "recording", len(recording.spike_times_s), recording.duration_s
+        times_s = stimuli.time_s[read]
+        times_s = times_s[times_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9]
+        spikes = count_spikes(recording, times_s + window_ms[0] * 1e-3, times_s + window_ms[1] * 1e-3)
+        rate_hz = spontaneous_rate(recording, after_ms=window_ms[1])[0] / len(recording.channels)
+        if not len(stimuli):
+            bursts = find_network_bursts(recording)
+            exposure_s = recording.duration_s * len(recording.channels)
+            rate_hz = len(recording.spike_times_s) / exposure_s if exposure_s else math.nan
+        response = find_response(recording)
     return Inspection(
-        name=name or recording.provenance.get("source", "recording"),
-        n_spikes=len(recording.spike_times_s),
-        duration_s=recording.duration_s,
+        name=name or recording.provenance.get("source", kind),
+        n_spikes=n_spikes,
+        n_channels=len(recording.channels),
+        n_stimuli=len(stimuli),
+        n_trials=int(np.count_nonzero(read)),
+        presentation=None if recording.presentation is None else str(recording.presentation),
+        start_min=recording.start_min,
+        duration_s=duration_s,
+        by=str(chosen),
         by_default=by is None,
         mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
         spontaneous_rate_hz=rate_hz,
-        response=find_response(recording),
+        response=response,
+        responses=responses,
+        findings=_gravest_first(recording, responses),
         network_bursts=bursts,
-        **_of_any(recording, chosen, responses),
     )
-
-
-def _of_table(
-    table: ResponseTable,
-    by: Conditions | None,
-    window_ms: tuple[float, float],
-    burst_threshold: float | None,
-    name: str | None,
-) -> Inspection:
-    """The same of a table of responses; what takes times of spikes is not known."""
-    chosen = by or default_conditions(table.stimuli)
-    responses = responses_of_table(table, chosen, window_ms, burst_threshold)
-    read = table.stimuli.is_last_of_presentation
-    width_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3
-    spikes = table.values[read].sum(axis=1) * (1.0 if table.kind == "count" else width_s)
-    times_s = table.stimuli.time_s
-    return Inspection(
-        name=name or table.provenance.get("source", "table"),
-        n_spikes=int(table.values.sum()) if table.kind == "count" else None,
-        duration_s=float(np.ptp(times_s)) if table.has_times and len(times_s) else math.nan,
-        by_default=by is None,
-        mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
-        spontaneous_rate_hz=math.nan,
-        response=None,
-        **_of_any(table, chosen, responses),
-    )
-
-
-def _of_any(source: Recording | ResponseTable, by: Conditions, responses: Responses) -> dict[str, Any]:
-    """What is found alike in recordings and tables."""
-    return {
-        "n_channels": len(source.channels),
-        "n_stimuli": len(source.stimuli),
-        "n_trials": int(np.count_nonzero(source.stimuli.is_last_of_presentation)),
-        "presentation": None if source.presentation is None else str(source.presentation),
-        "start_min": source.start_min,
-        "by": str(by),
-        "responses": responses,
-        "findings": _gravest_first(source, responses),
-    }
 
 
 def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> tuple[Finding, ...]:

@@ -9,7 +9,7 @@ from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.conditions import Conditions
-from animat.responses.extraction import responses_of
+from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS
@@ -70,7 +70,7 @@ def extract_series(
     for recording in recordings:
         try:
             readouts = readouts_on(readouts, recording.channels)
-            responses = responses_of(recording, by, window_ms, burst_threshold, readouts)
+            responses = extract_responses(recording, by, window_ms, burst_threshold, readouts)
         except (UnusableData, Mismatch) as error:
             raise type(error)(f"the recording at {recording.start_min:g} min: {error}") from error
         for finding in (*noticed(recording), *responses.findings):

@@ -10,6 +10,7 @@ from jaxtyping import Bool
 
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
+from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import BurstSeparation
 from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment
@@ -34,64 +35,49 @@ _WINDOW_PARTS = 8
 
 def findings_on(
     responses: Responses,
-    recording: Recording,
+    source: Recording | ResponseTable,
     assignment: Assignment,
     bursts: BurstSeparation,
-    inside: Bool[np.ndarray, " stimuli"],
+    inside: Bool[np.ndarray, " stimuli"] | None = None,
 ) -> tuple[Finding, ...]:
     """Everything there is to say about how far responses can be trusted.
 
     Args:
-        inside: whether a pulse's window ends within the recording, shape (stimuli,).
+        source: what they are of; of a table, what takes the times of spikes cannot be told.
+        inside: whether a pulse's window ends within the recording, shape (stimuli,); None: all do.
     """
-    if not len(recording.stimuli):
+    if isinstance(source, ResponseTable):
+        message = (
+            "the table has no times of spikes, so it is not known whether its window holds the response, an artefact "
+            "or a blank, nor how the culture fires without stimuli"
+        )
+        found = [Finding("spike-times-unknown", "warning", message)]
+    elif not len(source.stimuli):
         message = (
             "the recording holds no stimuli, so there is no response to learn from: give the stimuli's times with the "
             "spikes"
         )
         return (Finding("no-stimuli", "refuse", message, 0.0),)
+    else:
+        found = [*_timing(responses, source, assignment), *artefact_findings(source, responses.window_ms)]
     return (
-        *_left_out(recording, assignment, inside),
-        *_timing(responses, recording, assignment),
-        *artefact_findings(recording, responses.window_ms),
-        *_without_times(responses, bursts),
+        *_left_out(source.stimuli, assignment, inside),
+        *found,
+        *_conditions(responses),
+        *_bursts(responses, bursts),
+        *_difference(responses),
+        *drift_findings(responses),
+        *memory_findings(responses),
     )
 
 
-def findings_without_times(
-    responses: Responses, stimuli: Stimuli, assignment: Assignment, bursts: BurstSeparation
-) -> tuple[Finding, ...]:
-    """The same of responses that came as counts or rates, without spikes: what takes their times cannot be told."""
-    message = (
-        "the table has no times of spikes, so it is not known whether its window holds the response, an artefact or a "
-        "blank, nor how the culture fires without stimuli"
-    )
-    unknown = Finding("spike-times-unknown", "warning", message)
-    return (*_without_condition(stimuli, assignment), unknown, *_without_times(responses, bursts))
-
-
-def _without_times(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
-    """What is told by the responses alone."""
-    yield from _conditions(responses)
-    yield from _bursts(responses, bursts)
-    yield from _difference(responses)
-    yield from drift_findings(responses)
-    yield from memory_findings(responses)
-
-
-def _left_out(recording: Recording, assignment: Assignment, inside: Bool[np.ndarray, " stimuli"]) -> Iterator[Finding]:
-    yield from _without_condition(recording.stimuli, assignment)
-    read = recording.stimuli.is_last_of_presentation
-    n_read = int(np.count_nonzero(read))
-    if late := int(np.count_nonzero(read & (assignment.condition != NO_CONDITION) & ~inside)):
-        message = f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out"
-        yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
-
-
-def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Finding]:
+def _left_out(
+    stimuli: Stimuli, assignment: Assignment, inside: Bool[np.ndarray, " stimuli"] | None
+) -> Iterator[Finding]:
     read = stimuli.is_last_of_presentation
     n_read = int(np.count_nonzero(read))
-    without = int(np.count_nonzero(read & (assignment.condition == NO_CONDITION)))
+    has_condition = assignment.condition != NO_CONDITION
+    without = int(np.count_nonzero(read & ~has_condition))
     if without == n_read:
         message = (
             f"none of the {n_read} stimuli belongs to a condition: choose other conditions "
@@ -101,6 +87,9 @@ def _without_condition(stimuli: Stimuli, assignment: Assignment) -> Iterator[Fin
     elif without:
         message = f"{without} of {n_read} stimuli belong to no condition and are left out"
         yield Finding("no-condition", "note", message, float(without))
+    if inside is not None and (late := int(np.count_nonzero(read & has_condition & ~inside))):
+        message = f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out"
+        yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
 
 def _timing(responses: Responses, recording: Recording, assignment: Assignment) -> Iterator[Finding]:
