@@ -193,11 +193,11 @@ NOT_PROTOCOLS = {
     '{"pause_s": Infinity}': "pause_s: expected a finite number",
     '{"setup_s": 1e6}': "setup_s: expected at most 86,400",
     '{"tail_s": -1}': "tail_s: expected at least 0",
-    '{"pulse": []}': "pulse.phases: expected at least one",
-    '{"pulse": {"duration_us": 1}}': "pulse.phases: expected a list, each with duration_us",
-    '{"pulse": [{"duration_us": 200}]}': "pulse.phase: expected either amplitude_mv or amplitude_ua",
-    '{"pulse": [{"duration_us": "200", "amplitude_ua": 1}]}': "pulse.duration_us: expected a number",
-    '{"pulse": [{"duration": 200, "amplitude_ua": 1}]}': "pulse.phases: expected a list, each with duration_us",
+    '{"pulse": []}': "pulse.phases: expected at least 1",
+    '{"pulse": {"duration_us": 1}}': "pulse.phases: expected a list, got {'duration_us': 1}",
+    '{"pulse": [{"duration_us": 200}]}': "pulse.phases.amplitude: expected either amplitude_mv or amplitude_ua",
+    '{"pulse": [{"duration_us": "200", "amplitude_ua": 1}]}': "pulse.phases.duration_us: expected a number, got '200'",
+    '{"pulse": [{"duration": 200, "amplitude_ua": 1}]}': "pulse.phases.duration_us: expected to be given",
 }
 
 

@@ -337,11 +337,11 @@ def test_limits_that_cannot_be_are_refused() -> None:
     [
         (lambda: Phase(100), "either amplitude_mv or amplitude_ua"),
         (lambda: Phase(100, amplitude_mv=1, amplitude_ua=1), "either amplitude_mv or amplitude_ua"),
-        (lambda: Phase(0, amplitude_mv=1), "above 0 us, got 0"),
+        (lambda: Phase(0, amplitude_mv=1), "duration_us: expected more than 0, got 0"),
         (lambda: Phase(100, amplitude_mv=math.inf), "finite number, got inf"),
-        (lambda: Pulse(()), "at least one, got none"),
+        (lambda: Pulse(()), "phases: expected at least 1, got"),
         (lambda: Pulse((Phase(1, amplitude_mv=1), Phase(1, amplitude_ua=1))), "got both in one pulse"),
-        (lambda: Pulse.from_list([{"duration_ms": 1}]), "phases: expected a list, each with duration_us"),
+        (lambda: Pulse.from_list([{"duration_ms": 1}]), "phases.duration_us: expected to be given"),
     ],
 )
 def test_pulses_that_cannot_be_are_refused(make: Any, words: str) -> None:

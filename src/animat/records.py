@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 Whole = Annotated[int, Strict(), BeforeValidator(_plain)]
@@ -60,7 +60,9 @@ def record(kind: type[T]) -> type[T]:
     Making one raises InvalidArgument, naming the field, what was expected and what came. What no annotation says is
     checked in `__post_init__`, which raises InvalidArgument too.
     """
-    made: Any = dataclass(frozen=True, config=ConfigDict(extra="forbid"))(kind)
+    # A record of a subclass is made anew: its attributes could change after they were checked.
+    config = ConfigDict(extra="forbid", revalidate_instances="subclass-instances")
+    made: Any = dataclass(frozen=True, config=config)(kind)
     checked = made.__init__
 
     def __init__(self: Any, /, *arguments: Any, **named: Any) -> None:

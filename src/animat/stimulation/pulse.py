@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.stimulation.plain import number
+from animat.records import Number, Positive, record
 
 Kind = Literal["voltage", "current"]
 
 
-@dataclass(frozen=True)
+@record
 class Phase:
     """A stretch of constant voltage or current: exactly one of the two amplitudes is given.
 
@@ -28,22 +29,16 @@ class Phase:
         InvalidArgument: for both amplitudes or none, a number that is not finite, or no duration.
     """
 
-    duration_us: float
-    amplitude_mv: float | None = None
-    amplitude_ua: float | None = None
+    duration_us: Positive
+    amplitude_mv: Number | None = None
+    amplitude_ua: Number | None = None
 
     def __post_init__(self) -> None:
-        for name in ("duration_us", "amplitude_mv", "amplitude_ua"):
-            if (value := getattr(self, name)) is not None or name == "duration_us":
-                object.__setattr__(self, name, number(name, value))
         if (self.amplitude_mv is None) == (self.amplitude_ua is None):
             raise InvalidArgument(
-                f"phase: expected either amplitude_mv or amplitude_ua, got {self.amplitude_mv} and {self.amplitude_ua}"
+                f"amplitude: expected either amplitude_mv or amplitude_ua, got {self.amplitude_mv} and "
+                f"{self.amplitude_ua}"
             )
-        if not (math.isfinite(self.duration_us) and self.duration_us > 0):
-            raise InvalidArgument(f"duration_us: expected a finite time above 0 us, got {self.duration_us}")
-        if not math.isfinite(self.amplitude):
-            raise InvalidArgument(f"amplitude: expected a finite number, got {self.amplitude}")
 
     @property
     def kind(self) -> Kind:
@@ -70,15 +65,7 @@ class Phase:
         return {"duration_us": self.duration_us, f"amplitude_{unit}": self.amplitude}
 
 
-def _plain_phase(phase: Any) -> Phase:
-    if type(phase) is Phase:
-        return phase
-    if not isinstance(phase, Phase):
-        raise InvalidArgument(f"phases: expected Phase, got {type(phase).__name__}")
-    return Phase(phase.duration_us, phase.amplitude_mv, phase.amplitude_ua)
-
-
-@dataclass(frozen=True)
+@record
 class Pulse:
     """Phases that follow each other without a gap, all of one kind.
 
@@ -86,16 +73,9 @@ class Pulse:
         InvalidArgument: for no phase, phases of both kinds, or what is no phase.
     """
 
-    phases: tuple[Phase, ...]
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1)]
 
     def __post_init__(self) -> None:
-        try:
-            phases = tuple(self.phases)
-        except TypeError as error:
-            raise InvalidArgument(f"phases: expected several Phase, got {type(self.phases).__name__}") from error
-        object.__setattr__(self, "phases", tuple(_plain_phase(phase) for phase in phases))
-        if not self.phases:
-            raise InvalidArgument("phases: expected at least one, got none")
         if len({phase.kind for phase in self.phases}) > 1:
             raise InvalidArgument("phases: expected all voltage or all current, got both in one pulse")
 
@@ -125,14 +105,7 @@ class Pulse:
         Raises:
             InvalidArgument: for anything else.
         """
-        if isinstance(phases, Pulse):
-            return phases
-        try:
-            return Pulse(tuple(Phase(**phase) for phase in phases))
-        except TypeError as error:
-            raise InvalidArgument(
-                f"phases: expected a list, each with duration_us and an amplitude, got {phases!r} ({error})"
-            ) from error
+        return phases if isinstance(phases, Pulse) else Pulse(phases)  # type: ignore[arg-type]
 
     def __str__(self) -> str:
         unit = "mV" if self.kind == "voltage" else "uA"
