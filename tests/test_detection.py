@@ -14,6 +14,7 @@ from scipy import signal
 
 from animat.cultures.traces import Traces, record_traces
 from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.conversion import read_traces
 from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
@@ -21,7 +22,6 @@ from animat.recordings.detection.negative_peaks import find_negative_peaks, medi
 from animat.recordings.detection.settings import Detection
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
-from animat.recordings.spikes_of_traces import read_traces
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture

@@ -12,10 +12,10 @@ import pytest
 
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
+from animat.recordings.conversion import read_traces
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.spikes_of_traces import read_traces
 from animat.stimulation.protocol import Presentation
 from rig_files import (
     BITS,

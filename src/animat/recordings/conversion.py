@@ -9,11 +9,17 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 
-from animat.errors import InvalidArgument
+import numpy as np
+
+from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
+from animat.recordings.findings import merged
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.reading import read_recording
+from animat.recordings.formats.traces import open_traces
+from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
+from animat.recordings.raw import RawTraces
+from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
 
 DURATION = re.compile(
@@ -119,14 +125,9 @@ def convert_recording(
             f"{path} holds its own stimuli"
         )
     if reader is not None:
-        from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
-        from animat.recordings.spikes_of_traces import with_spikes_of
-
         traces, base = open_with_spikeinterface(path, reader, stimuli_path=stimuli_path)
-        recording = with_spikes_of(traces, base, detection, progress=progress)
+        recording = _with_spikes_of(traces, base, detection, progress)
     elif detection is not None:
-        from animat.recordings.spikes_of_traces import read_traces
-
         recording = read_traces(path, detection, part=part, stimuli=stimuli, progress=progress)
     else:
         recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
@@ -137,3 +138,64 @@ def convert_recording(
     recording = replace(recording, provenance={**unsaid, **recording.provenance, **words}, start_min=float(start_min))
     write_nwb(recording, out)
     return recording
+
+
+def read_traces(
+    path: str | os.PathLike[str],
+    settings: Detection | None = None,
+    *,
+    part: str | None = None,
+    stimuli: str | None = None,
+    progress: Progress | None = None,
+) -> Recording:
+    """Find the spikes in a file's raw traces (MaxWell, CL1, NWB) and make a recording of them.
+
+    Args:
+        part, stimuli: as in `read_recording`.
+        progress: told after each piece.
+
+    Raises:
+        InvalidFile: if the file holds no raw traces, or they cannot be read.
+        InvalidArgument: for settings that the traces do not allow.
+    """
+    path = Path(path)
+    magic = first_bytes(path)
+    if not magic.startswith(HDF5):
+        held = "another file"
+        if magic.startswith(ZIP) or path.name.endswith(TEXT_NAMES):
+            held = f"{'NPZ' if magic.startswith(ZIP) else 'CSV'}, which holds spikes (leave out --raw to convert these)"
+        raise InvalidFile(
+            f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {held}; for traces in another format name "
+            "it with --reader, such as intan"
+        )
+    traces, base = open_traces(path, part=part, stimuli=stimuli)
+    return _with_spikes_of(traces, base, settings, progress)
+
+
+def _with_spikes_of(
+    traces: RawTraces, base: Recording, settings: Detection | None, progress: Progress | None
+) -> Recording:
+    """A recording with the spikes of its raw traces in place of its own; how they were found goes into its provenance.
+
+    Args:
+        base: channels (those of the traces), stimuli, span and provenance.
+    """
+    from animat.recordings.detection.finding_spikes import find_spikes
+
+    settings = settings or Detection()
+    found = find_spikes(traces, base.stimuli.time_s, settings, progress=progress)
+    band = "as recorded" if settings.band_hz is None else f"{settings.band_hz[0]:g}-{settings.band_hz[1]:g} Hz"
+    how = (
+        f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, blanked "
+        f"{settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli"
+    )
+    # A spike is at its sample, which rounding may put an ulp outside of the span.
+    time_s = np.clip(found.time_s, base.start_s, base.stop_s)
+    return replace(
+        base,
+        spike_times_s=time_s,
+        spike_channels=found.channel,
+        sampling_rate_hz=traces.sampling_rate_hz,
+        provenance={**base.provenance, "spikes": how},
+        findings=merged((*base.findings, *found.findings)),
+    )

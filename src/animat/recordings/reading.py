@@ -100,7 +100,7 @@ def read_source(
 def _read(
     path: Path, stimuli_path: str | os.PathLike[str] | None, stimuli: str | None, part: str | None
 ) -> Recording | ResponseTable:
-    magic = _first_bytes(path)
+    magic = first_bytes(path)
     if magic.startswith((HDF5, ZIP)) and stimuli_path is not None:
         raise InvalidArgument(
             f"stimuli_path: expected only beside CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
@@ -139,24 +139,6 @@ def _response_reader(path: Path, magic: bytes) -> Callable[[Path], ResponseTable
     except InvalidFile:
         # Whoever reads it in full says better what is wrong with it.
         return None
-
-
-def expect_traces(path: Path) -> None:
-    """Refuse a file that cannot hold raw traces, by its first bytes.
-
-    Raises:
-        InvalidFile: for anything but HDF5.
-    """
-    magic = _first_bytes(path)
-    if magic.startswith(HDF5):
-        return
-    held = "another file"
-    if magic.startswith(ZIP) or path.name.endswith(TEXT_NAMES):
-        held = f"{'NPZ' if magic.startswith(ZIP) else 'CSV'}, which holds spikes (leave out --raw to convert these)"
-    raise InvalidFile(
-        f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {held}; for traces in another format name it "
-        "with --reader, such as intan"
-    )
 
 
 def _read_text(path: Path, stimuli_path: str | os.PathLike[str] | None) -> Recording:
@@ -249,7 +231,8 @@ def _other_kind(path: Path, magic: bytes) -> str | None:
     return known or ("a file of another kind" if is_binary else None)
 
 
-def _first_bytes(path: Path) -> bytes:
+def first_bytes(path: Path) -> bytes:
+    """How a file begins, which tells its kind; raises InvalidFile for what is no file, or empty."""
     if is_folder(path):
         raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders")
     try:
