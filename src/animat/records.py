@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
@@ -12,7 +16,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, Va
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
-from animat.errors import InvalidArgument, did_you_mean, shown
+from animat.errors import InvalidArgument, InvalidFile, did_you_mean, shown
 from animat.writing import write_whole
 
 T = TypeVar("T")
@@ -87,6 +91,36 @@ def read_record(kind: type[T], data: Any, where: str = "") -> T:
         return TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
         raise InvalidArgument(_told(error, kind, where)) from error
+
+
+def json_data(text: str, what: str) -> Any:
+    """Plain data from JSON, which messages call `what`.
+
+    Raises:
+        InvalidArgument: for what is no JSON, with the line of the mistake, or a name that stands twice in an object.
+    """
+    try:
+        return json.loads(text, object_pairs_hook=_each_once)
+    except (ValueError, RecursionError) as error:
+        # Also a number of more digits than Python reads.
+        said = str(error).partition(";")[0]
+        raise InvalidArgument(f"{what}: expected JSON, got a mistake: {said}") from error
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; of a name that stands there twice, one value would be dropped in silence."""
+    if twice := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
+        raise ValueError(f"{_key(twice[0])} stands there twice")
+    return dict(pairs)
+
+
+@contextmanager
+def in_file(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Raises InvalidFile, which names the file, for an argument that is invalid within."""
+    try:
+        yield
+    except InvalidArgument as error:
+        raise InvalidFile(f"{path}: {error}") from error
 
 
 def as_json(value: Any) -> Any:

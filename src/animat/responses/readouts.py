@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from jaxtyping import Bool, Float64
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import read_plain_text
 from animat.recordings.recording import Channels
+from animat.records import in_file, json_data
 from animat.responses.windows import Spiking, spikes_in
 from animat.stimulation.places import CUT, count_places, electrodes_of
 from animat.tables import UNKNOWN
@@ -156,10 +156,8 @@ def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
         raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(CUT)}") from error
-    try:
+    with in_file(text):
         return _groups(written)
-    except InvalidArgument as error:
-        raise InvalidFile(f"{text}: {error}") from error
 
 
 def readouts_named(text: str) -> str | Readouts:
@@ -180,25 +178,13 @@ def readouts_named(text: str) -> str | Readouts:
 
 def _groups(written: str) -> Readouts:
     """Readouts from JSON."""
-    try:
-        data = json.loads(written, object_pairs_hook=_each_once)
-    except InvalidArgument:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InvalidArgument(f"readouts: expected JSON, got {error}") from error
+    data = json_data(written, "readouts")
     if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
         raise InvalidArgument(
             f'readouts: expected electrodes by the names of groups, {{"left": [1, 2], "right": [3, 4]}}, got '
             f"{shown(data)}"
         )
     return Readouts(tuple(data), tuple(map(tuple, data.values())))
-
-
-def _each_once(groups: list[tuple[str, object]]) -> dict[str, object]:
-    """JSON's own reading keeps the last of two groups of one name."""
-    if len(named := dict(groups)) < len(groups):
-        raise InvalidArgument(f"readouts: expected each name once, got {shown([name for name, _ in groups])}")
-    return named
 
 
 def count_readouts(readouts: str | Readouts) -> int:

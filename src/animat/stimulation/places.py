@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import Any, Literal
 
@@ -11,6 +10,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, InvalidFile, shown
 from animat.plain_file import read_plain_text
+from animat.records import in_file, json_data
 from animat.tables import evenly
 
 CUT = {"halves": (2, 1), "quadrants": (2, 2)}
@@ -61,15 +61,11 @@ def read_places(text: str | os.PathLike[str]) -> Places:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
         raise InvalidFile(f"{error}; places that have names are {', '.join(NAMED)}") from error
-    try:
-        places = check_places(json.loads(written))
+    with in_file(text):
+        places = check_places(json_data(written, "places"))
         if not places:
             raise InvalidArgument("places: expected groups of electrodes as [[1, 2], [3, 4]], got none")
         return places
-    except InvalidArgument as error:
-        raise InvalidFile(f"{text}: {error}") from error
-    except (ValueError, RecursionError) as error:
-        raise InvalidFile(f"{text}: places: expected JSON as [[1, 2], [3, 4]], got {error}") from error
 
 
 def count_places(places: Places) -> int:

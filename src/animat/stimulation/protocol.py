@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, SkipValidation
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument
 from animat.plain_file import read_plain_text
-from animat.records import Number, Whole, record
+from animat.records import Number, Whole, in_file, json_data, record
 from animat.stimulation.places import NONE, Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
@@ -146,19 +146,9 @@ class Protocol:
         Raises:
             InvalidArgument: for anything else, naming the key, what was expected and what came.
         """
-        strange = f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}"
-        try:
-            data = json.loads(text, object_pairs_hook=_each_once)
-        except InvalidArgument:
-            raise
-        except json.JSONDecodeError as error:
-            raise InvalidArgument(
-                f"protocol: expected JSON, got a mistake in line {error.lineno}, column {error.colno} ({error.msg})"
-            ) from error
-        except (ValueError, RecursionError) as error:
-            raise InvalidArgument(strange) from error
+        data = json_data(text, "protocol")
         if not isinstance(data, dict):
-            raise InvalidArgument(strange)
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
         if defaults is None and "pulse" not in data:
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
         if "trials" not in data:
@@ -176,20 +166,8 @@ def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
     """
-    try:
+    with in_file(path):
         return Protocol.from_json(read_plain_text(path, _MOST_BYTES), defaults or PAPER)
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error
-
-
-def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; of a key that stands there twice, one value would be dropped in silence."""
-    data: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in data:
-            raise InvalidArgument(f"{name}: expected once, got it twice")
-        data[name] = value
-    return data
 
 
 PAPER = Protocol()

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument
 from animat.plain_file import read_plain_text
-from animat.records import Number, Whole, read_record, record
+from animat.records import Number, Whole, in_file, json_data, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
@@ -147,12 +147,8 @@ class Selection:
         Raises:
             InvalidFile: if the file is missing, damaged, or something else.
         """
-        try:
-            return Selection.from_dict(json.loads(read_plain_text(path, _MOST_BYTES)))
-        except (ValueError, RecursionError) as error:
-            # Text that is no JSON and data that is no selection both raise a ValueError.
-            said = str(error).partition(";")[0]
-            raise InvalidFile(f"{path}: expected an electrode selection in JSON: {said}") from error
+        with in_file(path):
+            return Selection.from_dict(json_data(read_plain_text(path, _MOST_BYTES), "selection"))
 
 
 def select_electrodes(
