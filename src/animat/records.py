@@ -49,6 +49,8 @@ _EXPECTED = {
     "less_than_equal": "at most {le:,}",
     "list_type": "a list",
     "literal_error": "{expected}",
+    "string_too_long": "at most {max_length:,} letters",
+    "string_too_short": "at least {min_length:,} letter",
     "string_type": "text",
     "too_long": "at most {max_length:,} entries",
     "too_short": "at least {min_length:,}",

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import field, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from animat.errors import InvalidArgument, shown
+from animat.records import Flag, Number, Whole, record
 from animat.stimulation.stimulus import NOTHING
 
 _LONGEST_LABEL = 10_000
@@ -22,7 +23,7 @@ _MOST_LISTED = 5
 """Electrodes of a set that its label lists: the paper's patterns have as many."""
 
 
-@dataclass(frozen=True)
+@record
 class Condition:
     """One thing an agent can choose to do to the culture, such as stimulating at 5 Hz.
 
@@ -44,55 +45,29 @@ class Condition:
             not positive, or electrodes that are no sets of numbers from 0 on.
     """
 
-    label: str
-    value: float
-    unit: str = ""
-    frequencies_hz: tuple[float, ...] = field(default=(), compare=False)
-    electrodes: tuple[tuple[int, ...], ...] | None = field(default=None, compare=False)
-    only_last: bool = field(default=False, compare=False)
+    label: Annotated[str, Field(strict=True, min_length=1, max_length=_LONGEST_LABEL)]
+    value: Annotated[Number, Field(ge=-_LARGEST_VALUE, le=_LARGEST_VALUE)]
+    unit: Annotated[str, Field(strict=True, max_length=_LONGEST_LABEL)] = ""
+    frequencies_hz: tuple[Annotated[Number, Field(gt=0, le=_LARGEST_VALUE)], ...] = field(default=(), compare=False)
+    electrodes: tuple[tuple[Whole, ...], ...] | None = field(default=None, compare=False)
+    only_last: Flag = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
-        told: Any
-        for name, told in (("label", self.label), ("unit", self.unit)):
-            if not isinstance(told, str) or not told.isprintable() or len(told) > _LONGEST_LABEL:
-                raise InvalidArgument(f"condition.{name}: expected a line of text, got {shown(told)}")
-        if not self.label:
-            raise InvalidArgument("condition.label: expected some text, got none")
-        value: Any = self.value
-        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= _LARGEST_VALUE:
-            raise InvalidArgument(f"condition.value: expected a finite number, got {shown(value)}")
+        for name in ("label", "unit"):
+            if not (text := getattr(self, name)).isprintable():
+                raise InvalidArgument(f"{name}: expected a line of text, got {shown(text)}")
         if self.unit == "Hz":
-            object.__setattr__(self, "frequencies_hz", (float(value),))
-        self._expect_stimulus()
+            object.__setattr__(self, "frequencies_hz", (self.value,))
+        if self.electrodes != RESTING and not all(
+            one and all(0 <= e < _LARGEST_VALUE for e in one) for one in self.electrodes or ()
+        ):
+            raise InvalidArgument(f"electrodes: expected numbers of some in each set, got {shown(self.electrodes)}")
 
     @property
     def interval_s(self) -> float:
         """Mean time between its pulses; NaN where it is not known."""
         periods_s = [1 / frequency_hz for frequency_hz in self.frequencies_hz]
         return sum(periods_s) / len(periods_s) if periods_s else math.nan
-
-    def _expect_stimulus(self) -> None:
-        """Take lists, as JSON has them, and refuse what no stimulus can be."""
-        try:
-            frequencies_hz = tuple(float(each) for each in self.frequencies_hz)
-            electrodes = self.electrodes
-            if electrodes is not None:
-                electrodes = tuple(tuple(operator.index(each) for each in one) for one in electrodes)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InvalidArgument(
-                f"condition {self.label}: expected frequencies and sets of electrodes, got "
-                f"{shown((self.frequencies_hz, self.electrodes))}"
-            ) from error
-        if self.unit != "Hz" and not all(0 < each <= _LARGEST_VALUE for each in frequencies_hz):
-            raise InvalidArgument(f"condition {self.label}: expected positive frequencies, got {shown(frequencies_hz)}")
-        if electrodes != RESTING and not all(
-            one and all(0 <= e < _LARGEST_VALUE for e in one) for one in electrodes or ()
-        ):
-            raise InvalidArgument(f"condition {self.label}: expected numbers of electrodes, got {shown(electrodes)}")
-        if not isinstance(self.only_last, bool):
-            raise InvalidArgument(f"condition.only_last: expected true or false, got {shown(self.only_last)}")
-        object.__setattr__(self, "frequencies_hz", frequencies_hz)
-        object.__setattr__(self, "electrodes", electrodes)
 
 
 def listed(electrodes: Sequence[int]) -> str:

@@ -285,7 +285,7 @@ class Policy:
                 scales=arrays["scales"],
                 robot=robot_of(described),
                 mapping=None if described["mapping"] is None else mapping_from_data(described["mapping"]),
-                conditions=abbreviated([Condition(**condition) for condition in described["conditions"]]),
+                conditions=abbreviated(read_record(tuple[Condition, ...], described["conditions"], "conditions")),
                 commands=None if described["commands"] is None else tuple(described["commands"]),
                 window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
                 presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
