@@ -46,7 +46,7 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import describe_study, sums_of
+from animat.studies.folder import describe_study, held, sums_of
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file, paths_file
@@ -190,6 +190,14 @@ def test_a_folder_of_before_results_were_typed_is_refused_with_what_to_do(tmp_pa
     (tmp_path / "episodes" / "episodes.csv").write_text("at_min,actor\n")
     with pytest.raises(Mismatch, match=r"versions\.pandas: nothing there, .* now\); give another folder"):
         run_study(study, tmp_path)
+
+
+def test_a_folder_in_which_other_programs_hid_a_file_is_empty(tmp_path: Path) -> None:
+    for name in (".DS_Store", ".gitignore"):
+        (tmp_path / name).write_text("theirs")
+    with held(tmp_path, "study", {"fingerprint": "00"}, "study.json", {}):
+        assert json.loads((tmp_path / "study.json").read_text()) == {"fingerprint": "00"}
+    assert (tmp_path / ".gitignore").read_text() == "theirs"
 
 
 def test_nothing_of_another_s_folder_is_touched(tmp_path: Path) -> None:

@@ -406,13 +406,18 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
         ({"commands": ("a",)}, "commands: expected a number, got 'a'"),
         ({"commands": ()}, "commands: expected at least 1"),
         ({"commands": (0.5, 2.0)}, "commands: expected at most 1, got 2.0"),
-        ({"lessons": (3,)}, "lessons: expected a Lesson, got 3"),
-        ({"algorithm": 3}, "algorithm: expected a SAC, got 3"),
+        ({"lessons": (3,)}, "lessons: expected Lesson, got 3"),
+        ({"algorithm": 3}, "algorithm: expected SAC, got 3"),
     ],
 )
 def test_what_no_training_can_have_is_told(named: dict[str, Any], told: str) -> None:
     with pytest.raises(InvalidArgument, match=re.escape(told)):
         Training(Cartpole(), None, **named)
+
+
+def test_commands_are_taken_from_whatever_yields_them() -> None:
+    for given in ((-1, 0, 1), [-1.0, 0.0, 1.0], np.linspace(-1, 1, 3), map(float, (-1, 0, 1))):
+        assert Training(Cartpole(), None, commands=given).commands == (-1.0, 0.0, 1.0)  # type: ignore[arg-type]
 
 
 def test_a_shadowing_that_there_is_not_is_told() -> None:

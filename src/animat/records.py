@@ -44,14 +44,17 @@ _EXPECTED = {
     "greater_than": "more than {gt:,}",
     "greater_than_equal": "at least {ge:,}",
     "int_type": "a whole number",
-    "is_instance_of": "a {class}",
+    "invalid_key": "names as keys",
+    "is_instance_of": "{class}",
     "less_than": "less than {lt:,}",
     "less_than_equal": "at most {le:,}",
     "list_type": "a list",
     "literal_error": "{expected}",
-    "string_too_long": "at most {max_length:,} letters",
-    "string_too_short": "at least {min_length:,} letter",
+    "string_too_long": "at most {max_length:,} characters",
+    "string_too_short": "at least {min_length:,} character",
+    "multiple_argument_values": "it once",
     "string_type": "text",
+    "string_unicode": "text",
     "too_long": "at most {max_length:,} entries",
     "too_short": "at least {min_length:,}",
     "tuple_type": "a list",
@@ -95,24 +98,26 @@ def read_record(kind: type[T], data: Any, where: str = "") -> T:
         raise InvalidArgument(_told(error, kind, where)) from error
 
 
-def json_data(text: str, what: str) -> Any:
-    """Plain data from JSON, which messages call `what`.
+def json_data(text: str, what: str, like: str = "JSON") -> Any:
+    """Plain data from JSON, which messages call `what`, and expect to be `like`.
 
     Raises:
-        InvalidArgument: for what is no JSON, with the line of the mistake, or a name that stands twice in an object.
+        InvalidArgument: for what is not JSON, with the place of the mistake, or a name that is given twice.
     """
     try:
         return json.loads(text, object_pairs_hook=_each_once)
+    except InvalidArgument as error:
+        raise InvalidArgument(f"{what}.{error}") from error
     except (ValueError, RecursionError) as error:
-        # Also a number of more digits than Python reads.
-        said = str(error).partition(";")[0]
-        raise InvalidArgument(f"{what}: expected JSON, got a mistake: {said}") from error
+        # Also a number of more digits than Python reads, where it advises to have it read more.
+        said = str(error).partition("; use sys.")[0]
+        raise InvalidArgument(f"{what}: expected {like}, got a mistake: {said}") from error
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; of a name that stands there twice, one value would be dropped in silence."""
+    """An object of JSON; of a name that is given twice, one value would be dropped in silence."""
     if twice := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
-        raise ValueError(f"{_key(twice[0])} stands there twice")
+        raise InvalidArgument(f"{_key(twice[0])}: expected once, got it twice")
     return dict(pairs)
 
 

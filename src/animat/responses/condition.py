@@ -48,7 +48,7 @@ class Condition:
     label: Annotated[str, Field(strict=True, min_length=1, max_length=_LONGEST_LABEL)]
     value: Annotated[Number, Field(ge=-_LARGEST_VALUE, le=_LARGEST_VALUE)]
     unit: Annotated[str, Field(strict=True, max_length=_LONGEST_LABEL)] = ""
-    frequencies_hz: tuple[Annotated[Number, Field(gt=0, le=_LARGEST_VALUE)], ...] = field(default=(), compare=False)
+    frequencies_hz: tuple[Annotated[Number, Field(le=_LARGEST_VALUE)], ...] = field(default=(), compare=False)
     electrodes: tuple[tuple[Whole, ...], ...] | None = field(default=None, compare=False)
     only_last: Flag = field(default=False, compare=False)
 
@@ -58,10 +58,14 @@ class Condition:
                 raise InvalidArgument(f"{name}: expected a line of text, got {shown(text)}")
         if self.unit == "Hz":
             object.__setattr__(self, "frequencies_hz", (self.value,))
+        elif not all(frequency_hz > 0 for frequency_hz in self.frequencies_hz):
+            raise InvalidArgument(f"frequencies_hz: expected more than 0, got {shown(self.frequencies_hz)}")
         if self.electrodes != RESTING and not all(
             one and all(0 <= e < _LARGEST_VALUE for e in one) for one in self.electrodes or ()
         ):
-            raise InvalidArgument(f"electrodes: expected numbers of some in each set, got {shown(self.electrodes)}")
+            raise InvalidArgument(
+                f"electrodes: expected the numbers of one or more in each set, got {shown(self.electrodes)}"
+            )
 
     @property
     def interval_s(self) -> float:

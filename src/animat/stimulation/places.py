@@ -62,7 +62,7 @@ def read_places(text: str | os.PathLike[str]) -> Places:
     except InvalidFile as error:
         raise InvalidFile(f"{error}; places that have names are {', '.join(NAMED)}") from error
     with in_file(text):
-        places = check_places(json_data(written, "places"))
+        places = check_places(json_data(written, "places", "JSON as [[1, 2], [3, 4]]"))
         if not places:
             raise InvalidArgument("places: expected groups of electrodes as [[1, 2], [3, 4]], got none")
         return places

@@ -21,7 +21,7 @@ from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
 from animat.studies.toml import study_to_toml
 from animat.training.settings import LEARNER
-from animat.writing import LOCK, clear_away, exclusive_lock, is_unfinished, write_whole
+from animat.writing import clear_away, exclusive_lock, is_unfinished, write_whole
 
 MANIFEST = "study.json"
 SPECIFICATION = "study.toml"
@@ -171,5 +171,5 @@ def _is_ours(folder: Path, what: str, manifest: dict[str, Any], files: list[str]
 
 
 def _is_passing(path: Path) -> bool:
-    """Whether a file is nobody's: half written by a killed run, or there to be locked."""
-    return is_unfinished(path) or path.name == LOCK
+    """Whether a file is nobody's: half written by a killed run, there to be locked, or hidden by another program."""
+    return path.name.startswith(".")

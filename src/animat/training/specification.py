@@ -129,10 +129,9 @@ class Training:
             least = 0 if name == "seed" else 1
             if not isinstance(number, int | np.integer) or isinstance(number, bool) or not least <= number <= most:
                 raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
-        for name, expected in _EXPECTED.items():
-            read_record(expected, getattr(self, name), name)
-        if self.commands is not None:
-            object.__setattr__(self, "commands", tuple(map(float, self.commands)))
+        read = {name: read_record(expected, getattr(self, name), name) for name, expected in _EXPECTED.items()}
+        if read["commands"] is not None:
+            object.__setattr__(self, "commands", tuple(map(float, read["commands"])))
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.neural_observation not in (False, self.mapping is not None):
             raise InvalidArgument(
