@@ -175,7 +175,7 @@ NOT_PROTOCOLS = {
     "[" * 100_000: "protocol: expected JSON, got a mistake: maximum recursion depth exceeded",
     '{"pulse_s": 1}': "pulse_s: no such setting at the top; expected some of frequencies_hz",
     '{"self": 1}': "self: no such setting at the top",
-    '{"pulses": 1, "pulses": 2}': "protocol.pulses: expected once, got it twice",
+    '{"pulses": 1, "pulses": 2}': "protocol: expected each name once, got pulses twice",
     '{"pulses": 0}': "pulses: expected at least 1",
     '{"pulses": 2.5}': "pulses: expected a whole number, got 2.5",
     '{"pulses": true}': "pulses: expected a whole number, got True",

@@ -139,7 +139,7 @@ def test_what_does_not_go_together_is_refused_before_anything_is_recorded(
 
 @pytest.mark.parametrize("readouts", ["thirds", "[1, 2]", '{"left": []}', '{"left": [1], "left": [2]}', "{"])
 def test_readouts_that_are_none_are_refused(readouts: str) -> None:
-    with pytest.raises(InvalidArgument, match=r"readouts(\.left)?: expected"):
+    with pytest.raises(InvalidArgument, match="readouts: expected"):
         Simulators(readouts=readouts)
 
 

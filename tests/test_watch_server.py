@@ -120,7 +120,7 @@ def test_a_websocket_is_refused(app: Any) -> None:
 
     headers = [(b"host", f"127.0.0.1:{PORT}".encode()), (b"origin", OWN.encode())]
     asyncio.run(app({"type": "websocket", "path": f"/{TOKEN}/", "headers": headers}, receive, send))
-    assert [message["type"] for message in sent] == ["websocket.close"]
+    assert sent == [{"type": "websocket.close", "code": 1008}]
 
 
 @pytest.mark.parametrize("place", ["../outside", "..", "/etc", "session/../../outside", "a\0b", "linked"])

@@ -107,7 +107,7 @@ def json_data(text: str, what: str, like: str = "JSON") -> Any:
     try:
         return json.loads(text, object_pairs_hook=_each_once)
     except InvalidArgument as error:
-        raise InvalidArgument(f"{what}.{error}") from error
+        raise InvalidArgument(f"{what}: {error}") from error
     except (ValueError, RecursionError) as error:
         # Also a number of more digits than Python reads, where it advises to have it read more.
         said = str(error).partition("; use sys.")[0]
@@ -117,7 +117,7 @@ def json_data(text: str, what: str, like: str = "JSON") -> Any:
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object of JSON; of a name that is given twice, one value would be dropped in silence."""
     if twice := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
-        raise InvalidArgument(f"{_key(twice[0])}: expected once, got it twice")
+        raise InvalidArgument(f"expected each name once, got {_key(twice[0])} twice")
     return dict(pairs)
 
 

@@ -113,7 +113,8 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
     from starlette.middleware.base import BaseHTTPMiddleware
     from starlette.requests import Request
     from starlette.responses import Response
-    from starlette.routing import Mount, Route
+    from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
+    from starlette.websockets import WebSocket
 
     from animat.watch.guard import guard
 
@@ -141,7 +142,10 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
         watched.stop(asked.get("in", ""))
         return {"stopped": True}
 
-    routes = [
+    async def refuse(socket: WebSocket) -> None:
+        await socket.send({"type": "websocket.close", "code": 1008})
+
+    routes: list[BaseRoute] = [
         Route(f"/{address}", functools.partial(file, (own / name).read_bytes(), kind))
         for address, (name, kind) in _FILES.items()
     ]
@@ -158,6 +162,7 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
         ),
         Route("/robot.png", answering(picture)),
         Route("/stop", answering(stop), methods=["POST"]),
+        WebSocketRoute("/{path:path}", refuse),
     ]
     guarded = Middleware(BaseHTTPMiddleware, dispatch=guard(token, port))
     return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[guarded])
