@@ -72,7 +72,7 @@ def test_selections_made_by_hand_are_one_line(changed: dict[str, Any], words: st
     (tmp_path / "s.json").write_text("[" * 100_000)
     with pytest.raises(
         InvalidFile,
-        match="expected an electrode selection in JSON: .* maximum recursion",
+        match=r"expected an electrode selection in JSON: .* maximum recursion",
     ):
         Selection.load(tmp_path / "s.json")
 
