@@ -12,6 +12,7 @@ import threading
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,7 +35,10 @@ install_import_hook(
 
 from animat.cultures import holding  # noqa: E402
 
-SOON_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+SOON_COMPILED = "--xla_backend_optimization_level=0"
+if [int(part) for part in version("jaxlib").split(".")[:2]] < [0, 11]:
+    # Later ones have no other way, and end a process that names this one.
+    SOON_COMPILED += " --xla_cpu_use_fusion_emitters=false"
 """A sixth of the time to compile a training, which then takes three times as long, and here lasts for moments."""
 
 # The same random examples each time; others with --hypothesis-profile=default.

@@ -10,7 +10,8 @@ import numpy as np
 from scipy import stats
 
 from animat.training.networks import Network, initial_networks
-from animat.training.sac import Batch, Trained
+from animat.training.replay import Batch
+from animat.training.sac import Trained
 
 
 def drawn_networks(

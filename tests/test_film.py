@@ -97,8 +97,9 @@ def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:
     start_s, stop_s = 0.5 * whole.stop_s, 0.7 * whole.stop_s
     scene = scene_of_session(folder, (start_s, stop_s))
     assert (scene.start_s, scene.stop_s) == (start_s, stop_s)
-    shown = [m for m in scene.moments if start_s <= m.time_s < stop_s]
-    assert shown and shown == [m for m in whole.moments if start_s <= m.time_s < stop_s]
+    # As text: from Python 3.13 on no record equals another where both have NaN.
+    shown, there = ([str(m) for m in of.moments if start_s <= m.time_s < stop_s] for of in (scene, whole))
+    assert shown and shown == there
     # The body of the first episode can be moved again from its start.
     assert scene.moments[0].iteration == -1 and scene.moments[0].time_s <= start_s
 
@@ -140,7 +141,7 @@ def test_of_a_killed_session_what_is_there_is_shown(
     (tmp_path / LOG_FILE).write_bytes(log[: len(log) // 2])
     scene, whole = scene_of_session(tmp_path), scene_of_session(folder)
     assert 0 < len(scene.moments) < len(whole.moments)
-    assert scene.moments == whole.moments[: len(scene.moments)]
+    assert [*map(str, scene.moments)] == [*map(str, whole.moments[: len(scene.moments)])]
     assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0, 0.5) == 0
     (lost,) = [int(line.split()[0]) for line in capsys.readouterr().out.splitlines() if line.endswith("are lost")]
     whole_records = len(log) // 2 - lost

@@ -41,6 +41,7 @@ from animat.training.group import Group, SideBySide, train_group, train_groups
 from animat.training.lessons import Lesson
 from animat.training.memory import parts_that_fit
 from animat.training.policy import Policy
+from animat.training.replay import remember
 from animat.training.specification import CHUNKS, Training
 from test_training import SHORT, SMALL, Kept, bits, timeline_of
 from worker_tasks import Join
@@ -115,6 +116,19 @@ def test_stopped_at_a_checkpoint_all_go_on_to_the_same_bits(at_once: AtOnce, tmp
     assert [done for done, _ in told.told] == [CHUNKS - 2, CHUNKS - 1, CHUNKS]
     assert_same(chain(*again), chain(*at_once.policies))
     np.testing.assert_array_equal(rows, at_once.rows[1])
+
+
+def test_what_all_remember_is_written_in_place_and_not_scattered() -> None:
+    replays, rows = np.zeros((2, 3, 8, 2), np.float32), np.arange(24, dtype=np.float32).reshape(2, 3, 2, 2)
+    write = jax.jit(jax.vmap(jax.vmap(remember, (0, 0, None)), (0, 0, None)))
+    wanted = replays.copy()
+    wanted[:, :, 5:7] = rows
+    np.testing.assert_array_equal(write(replays, rows, 5), wanted)
+    assert "scatter" not in write.lower(replays, rows, 5).as_text()
+    as_it_comes = jax.vmap(lambda replay, new: jax.lax.dynamic_update_slice(replay, new, (5, 0)))
+    assert "scatter" in jax.jit(as_it_comes).lower(replays[0], rows[0]).as_text()
+    with pytest.raises(ValueError, match="one place for all"):
+        jax.vmap(remember)(replays[0], rows[0], np.arange(3))
 
 
 def tasks_of(training: Training, *groups: tuple[int, ...]) -> list[Trains]:

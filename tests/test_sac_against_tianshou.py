@@ -12,7 +12,8 @@ import pytest
 
 import sac_reference as reference
 from animat.training.networks import Layer, Network
-from animat.training.sac import Batch, Trained, continuous_losses, discrete_losses
+from animat.training.replay import Batch
+from animat.training.sac import Trained, continuous_losses, discrete_losses
 from animat.training.settings import SAC
 
 pytestmark = pytest.mark.oracle

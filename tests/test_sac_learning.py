@@ -21,8 +21,8 @@ from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.training.networks import Network, forward
+from animat.training.replay import Batch
 from animat.training.sac import (
-    Batch,
     Finished,
     Learner,
     Trained,

@@ -436,7 +436,8 @@ def test_numbers_of_any_type_give_the_right_charge(kind: Any) -> None:
     with Seen() as culture:
         culture.deliver([one(0.0, pulse, np.array([100, 101], np.int8))], 0.1)
         stimulus = culture.seen[0][1]
-        assert stimulus == Stimulus(0.0, (100, 101), pulse)
+        # As text: it has no frequency, and from Python 3.13 on no record equals another where both have NaN.
+        assert str(stimulus) == str(Stimulus(0.0, (100, 101), pulse))
         assert {type(electrode) for electrode in stimulus.electrodes} == {int}
 
 

@@ -17,7 +17,8 @@ from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.training.exploration import paid_for_entropy
 from animat.training.networks import forward, squashed_normal
-from animat.training.sac import Learner, batch_of, continuous_losses, discrete_losses
+from animat.training.replay import batch_of
+from animat.training.sac import Learner, continuous_losses, discrete_losses
 from animat.training.settings import SAC
 
 _TRANSITIONS = 512

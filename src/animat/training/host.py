@@ -22,6 +22,7 @@ from animat.neurons.history import AT_FIRST
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot, Standing
 from animat.training.exploration import ended_episodes
+from animat.training.replay import remember, transitions
 from animat.training.sac import (
     Finished,
     Learner,
@@ -31,7 +32,6 @@ from animat.training.sac import (
     finished_alone,
     learn,
     state_of,
-    transitions,
     uniforms_of,
 )
 from animat.training.settings import SAC
@@ -107,7 +107,7 @@ def learn_and_act(
     returns = learner.returns + reward
     finished = finished_alone(learner.exploration, ended, returns)
     learner = learner._replace(
-        replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
+        replay=remember(learner.replay, rows, written % settings.replay),
         episodes=after._replace(
             robot=begun,
             iteration=jnp.where(ended, 0, after.iteration),

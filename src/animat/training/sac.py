@@ -29,6 +29,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Robot
 from animat.training.exploration import Exploration, ended_episodes, explore, n_uniforms, nothing_held, paid_for_entropy
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
+from animat.training.replay import Batch, batch_of, remember, transitions
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit, net_return, net_reward
 
@@ -53,30 +54,6 @@ class Learner(NamedTuple):
     returns: Float[Array, " environments"]
     exploration: Exploration
     key: PRNGKeyArray
-
-
-class Batch(NamedTuple):
-    """Transitions; observations and rewards are scaled, actions and endings are floats.
-
-    The last number of a state is the time left, from 1 at the start of an episode to -1 at its limit; the actor sees
-    the others, `observation`.
-    """
-
-    state: Float[Array, "batch state"]
-    next_state: Float[Array, "batch state"]
-    action: Float[Array, "batch *commands"]
-    reward: Float[Array, " batch"]
-    ended: Float[Array, " batch"]
-
-    @property
-    def observation(self) -> Float[Array, "batch _"]:
-        """What the actor saw."""
-        return self.state[:, :-1]
-
-    @property
-    def next_observation(self) -> Float[Array, "batch _"]:
-        """What the actor saw next."""
-        return self.next_state[:, :-1]
 
 
 class Finished(NamedTuple):
@@ -258,7 +235,7 @@ def _act(
     returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
     learner = learner._replace(
-        replay=jax.lax.dynamic_update_slice(learner.replay, rows, (written % settings.replay, jnp.int32(0))),
+        replay=remember(learner.replay, rows, written % settings.replay),
         episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried),
         returns=jnp.where(ended, 0.0, returns),
         exploration=ended_episodes(exploration, ended, net_return(returns, after)),
@@ -319,20 +296,6 @@ def state_of(environment: Environment[Any], episodes: State) -> Float[Array, "en
     return jnp.concatenate([jax.vmap(environment.observe)(episodes) / environment.scales, left], axis=1)
 
 
-def transitions(
-    settings: SAC,
-    state: Float[Array, "environments state"],
-    next_state: Float[Array, "environments state"],
-    action: Array,
-    reward: Float[Array, " environments"],
-    ended: Bool[Array, " environments"],
-) -> Float[Array, "environments row"]:
-    """Rows of the replay: what `Batch` is unpacked from."""
-    of_action = action.reshape(len(state), -1).astype(jnp.float32)
-    row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
-    return jnp.concatenate([state, next_state, of_action, row], axis=1)
-
-
 def learn(
     environment: Environment[Any],
     settings: SAC,
@@ -364,19 +327,6 @@ def learn(
         update, (learner.trained, learner.targets, learner.optimiser), uniforms
     )
     return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
-
-
-def batch_of(
-    environment: Environment[Any],
-    replay: Float[Array, "transitions row"],
-    available: Int[Array, ""],
-    uniforms: Float[Array, " batch"],
-) -> Batch:
-    """Transitions drawn from the first `available` ones of a replay."""
-    n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
-    rows = replay[(uniforms * available).astype(jnp.int32)]
-    action = rows[:, 2 * n : 2 * n + n_drawn] if environment.n_actions is None else rows[:, 2 * n]
-    return Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, -2], rows[:, -1])
 
 
 def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:

@@ -1,0 +1,84 @@
+"""The replay of a policy: transitions that it remembers, a packed row each, the oldest forgotten first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from animat.environment import Environment
+from animat.training.settings import SAC
+
+
+class Batch(NamedTuple):
+    """Transitions; observations and rewards are scaled, actions and endings are floats.
+
+    The last number of a state is the time left, from 1 at the start of an episode to -1 at its limit; the actor sees
+    the others, `observation`.
+    """
+
+    state: Float[Array, "batch state"]
+    next_state: Float[Array, "batch state"]
+    action: Float[Array, "batch *commands"]
+    reward: Float[Array, " batch"]
+    ended: Float[Array, " batch"]
+
+    @property
+    def observation(self) -> Float[Array, "batch _"]:
+        """What the actor saw."""
+        return self.state[:, :-1]
+
+    @property
+    def next_observation(self) -> Float[Array, "batch _"]:
+        """What the actor saw next."""
+        return self.next_state[:, :-1]
+
+
+def transitions(
+    settings: SAC,
+    state: Float[Array, "environments state"],
+    next_state: Float[Array, "environments state"],
+    action: Array,
+    reward: Float[Array, " environments"],
+    ended: Bool[Array, " environments"],
+) -> Float[Array, "environments row"]:
+    """Rows of the replay: what `Batch` is unpacked from."""
+    of_action = action.reshape(len(state), -1).astype(jnp.float32)
+    row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
+    return jnp.concatenate([state, next_state, of_action, row], axis=1)
+
+
+@jax.custom_batching.custom_vmap
+def remember(
+    replay: Float[Array, "*policies transitions row"],
+    rows: Float[Array, "*policies environments row"],
+    at: Int[Array, ""],
+) -> Float[Array, "*policies transitions row"]:
+    """A replay with rows in it from row `at` on, which is the same for all policies that are trained side by side.
+
+    `jax.vmap` by itself would scatter them, for which XLA lays out a GPU's replays anew, all of them, in each round.
+    """
+    return jax.lax.dynamic_update_slice(replay, rows, (*[jnp.int32(0)] * (replay.ndim - 2), at, jnp.int32(0)))
+
+
+@remember.def_vmap
+def _remember_each(size: int, is_batched: Sequence[bool], *given: Array) -> tuple[Array, bool]:
+    if tuple(is_batched) != (True, True, False):
+        raise ValueError("remember: expected a replay and rows of each policy, and one place for all")
+    return remember(*given), True
+
+
+def batch_of(
+    environment: Environment[Any],
+    replay: Float[Array, "transitions row"],
+    available: Int[Array, ""],
+    uniforms: Float[Array, " batch"],
+) -> Batch:
+    """Transitions drawn from the first `available` ones of a replay."""
+    n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
+    rows = replay[(uniforms * available).astype(jnp.int32)]
+    action = rows[:, 2 * n : 2 * n + n_drawn] if environment.n_actions is None else rows[:, 2 * n]
+    return Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, -2], rows[:, -1])
