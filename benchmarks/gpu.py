@@ -1,0 +1,102 @@
+"""How fast a GPU trains many policies at once, beside one core and all cores of the same machine.
+
+    python benchmarks/gpu.py --recordings recordings/ [--policies 4 20 100 400 1000]
+
+Cartpole with nine thresholds on the first recording, as `animat train` has it. Every measurement is a process of its
+own; those of cores train five policies and are pinned before JAX is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+ITERATIONS = 400_000
+POLICIES_A_CORE = 5
+
+
+def main() -> None:
+    """Measure one number of policies after the other, then the cores, and print the table."""
+    parser = argparse.ArgumentParser(description="How fast a GPU trains many policies, beside the cores here.")
+    parser.add_argument("--recordings", required=True)
+    parser.add_argument("--policies", type=int, nargs="+", default=[4, 20, 100, 400, 1000])
+    parser.add_argument("--measure", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--core", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.measure is not None:
+        if options.core is not None:
+            os.sched_setaffinity(0, {options.core})
+        print(json.dumps(measured(options.recordings, options.measure)))
+        return
+    cores = sorted(os.sched_getaffinity(0))
+    one = ended([started(options.recordings, POLICIES_A_CORE, cores[0])])[0]
+    together = ended([started(options.recordings, POLICIES_A_CORE, core) for core in cores])
+    one_per_s, all_per_s = one["iterations_per_s"], sum(each["iterations_per_s"] for each in together)
+    print(f"one core: {one_per_s:,.0f} iterations a second; {len(cores)} cores: {all_per_s:,.0f}\n")
+    print("| policies | iterations a second | beside one core | beside all | ms a round | compiling, s | bits |")
+    print("|---" * 7 + "|")
+    for policies in options.policies:
+        at_once = ended([started(options.recordings, policies)])[0]
+        if at_once["device"] == "cpu":
+            sys.exit("gpu.py: JAX finds no GPU here")
+        per_s = at_once["iterations_per_s"]
+        row = (f"{per_s:,.0f}", f"{per_s / one_per_s:.1f}", f"{per_s / all_per_s:.1f}", f"{at_once['round_ms']:.2f}")
+        print("|", policies, "|", " | ".join((*row, f"{at_once['first_s']:.1f}", at_once["bits"])), "|", flush=True)
+    print(f"\n{at_once['device']}, {at_once['versions']}")
+
+
+def started(recordings: str, policies: int, core: int | None = None) -> subprocess.Popen[str]:
+    """A measurement in a process of its own: on a core, or on whatever JAX finds."""
+    command = [sys.executable, __file__, "--recordings", recordings, "--measure", str(policies)]
+    command += [] if core is None else ["--core", str(core)]
+    environment = os.environ | ({} if core is None else {"JAX_PLATFORMS": "cpu"})
+    return subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
+
+
+def ended(processes: list[subprocess.Popen[str]]) -> list[dict[str, Any]]:
+    """What each of them measured."""
+    told = [process.communicate()[0] for process in processes]
+    if any(process.returncode for process in processes):
+        sys.exit("gpu.py: a measurement failed")
+    return [json.loads(text.splitlines()[-1]) for text in told]
+
+
+def measured(recordings: str, policies: int) -> dict[str, Any]:
+    """Seconds of a first chunk, which compiles, and of a second one; and the bits of the networks after both."""
+    import jax
+    import numpy as np
+
+    from animat.neurons.timeline import fit_timeline
+    from animat.recordings.reading import read_sources
+    from animat.responses.series import extract_series
+    from animat.training.group import Group, SideBySide
+    from animat.training.specification import Training
+
+    timeline = fit_timeline(extract_series(read_sources([recordings])))
+    training = Training("cartpole", "9-thresholds", policies=policies, iterations=ITERATIONS)
+    together = SideBySide(Group(training, tuple(range(policies)), timeline, "", {}))
+    simulator, seconds = timeline.at(float(timeline.start_min[0])), []
+    for chunk in range(2):
+        began = time.perf_counter()
+        together.train(chunk, simulator)
+        seconds.append(time.perf_counter() - began)
+    trained = together.policies()[-1]
+    first, last = training.chunk(1)
+    return {
+        "device": jax.devices()[0].device_kind,
+        "versions": f"jax {jax.__version__}, numpy {np.__version__}",
+        "first_s": seconds[0],
+        "round_ms": 1e3 * seconds[1] / (last - first),
+        "iterations_per_s": policies * training.algorithm.environments * (last - first) / seconds[1],
+        "bits": hashlib.sha256(b"".join(weight.tobytes() for weight in trained.weights)).hexdigest()[:12],
+    }
+
+
+if __name__ == "__main__":
+    main()
