@@ -19,6 +19,7 @@ from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition, abbreviated, listed
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
+from animat.responses.inspection import inspect_recording
 from animat.stimulation.places import check_places, count_places, electrodes_of, read_places
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
@@ -160,6 +161,8 @@ def test_places_are_conditions_where_none_are_asked_for(hz: tuple[float, ...], b
         recording = culture.record(protocol)
     responses = extract_responses(recording, burst_threshold=1.0)
     assert responses.by == by and len(responses.conditions) == 2 * len(hz)
+    inspection = inspect_recording(recording, burst_threshold=1.0)
+    assert (inspection.by, inspection.by_default) == (by, True)
     assert extract_responses(recording, conditions_named("frequency"), burst_threshold=1.0).by == "frequency"
 
 

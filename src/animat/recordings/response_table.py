@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -36,6 +36,7 @@ class ResponseTable:
         presentation: how stimuli were presented, None where it is not known.
         provenance: where the table came from, words by words, for people.
         findings: what was noticed when it was read.
+        protocol: None, as none is told.
 
     Raises:
         UnusableData: for values that are negative or not finite, counts that are not whole, or tables of other lengths.
@@ -51,6 +52,7 @@ class ResponseTable:
     presentation: Presentation | None = None
     provenance: Mapping[str, str] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    protocol: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))

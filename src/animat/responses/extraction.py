@@ -123,7 +123,7 @@ def _sorted(
 ) -> tuple[Responses, Assignment, BurstSeparation]:
     """What was read after the last pulses, by condition and apart from bursts; with how it was sorted."""
     stimuli, n_channels = source.stimuli, len(source.channels)
-    by = by or default_conditions(stimuli, source.protocol if isinstance(source, Recording) else None)
+    by = by or default_conditions(stimuli, source.protocol)
     assignment = by.assign(stimuli)
     condition = assignment.condition[presented]
     chosen = condition != NO_CONDITION

@@ -166,7 +166,7 @@ def inspect_recording(
     """Look at a recording as training would use it, and say what is in it and what is wrong with it.
 
     Args:
-        by: what makes a condition; by frequency where it is known, else all stimuli in one.
+        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
         window_ms: start and end of the window that responses are read in, after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         name: what to call it; by default the source in its provenance.
@@ -176,7 +176,7 @@ def inspect_recording(
         UnusableData: for a recording without channels.
         Mismatch: for another window than the one of a table.
     """
-    chosen = by or default_conditions(recording.stimuli)
+    chosen = by or default_conditions(recording.stimuli, recording.protocol)
     responses = extract_responses(recording, chosen, window_ms, burst_threshold)
     stimuli, read = recording.stimuli, recording.stimuli.is_last_of_presentation
     bursts = response = None
