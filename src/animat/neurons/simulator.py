@@ -276,6 +276,8 @@ def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts
 
 def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *readouts"]]:
     """The non-burst responses of each condition, sorted by those of all channels together."""
+    if not responses.conditions:
+        raise UnusableData("conditions: expected one or more to fit, got none; choose what the stimuli belong to")
     order = np.argsort(responses.read_hz if responses.read_hz.ndim == 1 else responses.rate_hz, kind="stable")
     kept = order[~responses.is_burst[order]]
     values = [responses.read_hz[kept[responses.condition[kept] == c]] for c in range(len(responses.conditions))]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Float64, Int64
 
@@ -91,7 +93,7 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
         each = f"all {len(recording.channels):,} channels together"
     # The rows of each condition are named beside them.
     first = np.searchsorted(condition, drawn)
-    middle = [(a + b - 1) / 2 for a, b in zip(first, [*first[1:], len(chosen)], strict=True)]
+    middle = [(a + b - 1) / 2 for a, b in pairwise([*first, len(chosen)])]
     every = max(1, -(-len(drawn) // _MOST_LABELS))
     axes.set_yticks(middle[::every], [responses.conditions[i].label for i in drawn[::every]])
     for edge in first[1:].tolist():

@@ -126,15 +126,20 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
     text = _text(path)
     first_line = text.lstrip("\r\n").partition("\n")[0]
     separator = _separator(first_line)
-    reader = csv.reader(io.StringIO(text), delimiter=separator)
-    rows, lines = [], []
+    # Strict: else a quote that is not closed makes one cell of all that follows.
+    reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
+    rows, lines, first = [], [], 1
     try:
         for row in reader:
             if any(cell.strip() for cell in row):
                 rows.append(row)
                 lines.append(reader.line_num)
+            first = reader.line_num + 1
     except csv.Error as error:
-        raise InvalidFile(f"{path}: expected CSV (text in columns), got something else ({error})") from error
+        raise InvalidFile(
+            f"{path}, line {first}: expected CSV (text in columns), got something else ({error}): "
+            "is a quote not closed?"
+        ) from error
     if not rows:
         raise InvalidFile(f"{path}: expected a header line and a line an event, got an empty file")
     header = [name.strip() for name in rows[0]]
