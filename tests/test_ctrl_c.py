@@ -86,4 +86,9 @@ def test_an_interrupted_session_is_told_to_be_no_start_for_another(tmp_path, mon
     assert capsys.readouterr().err == "animat: interrupted; what was finished is kept\n"
     (tmp_path / "session.log").touch()
     assert animat(command) == 130
-    assert capsys.readouterr().err.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
+    told = capsys.readouterr().err
+    assert told.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
+    assert f"its recording is not written yet: animat recover {tmp_path};" in told
+    (tmp_path / "session.nwb").touch()
+    assert animat(command) == 130
+    assert "recover" not in capsys.readouterr().err

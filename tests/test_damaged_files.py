@@ -7,10 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import pytest
 
 from animat.errors import InvalidFile
 from animat.recordings import apart
+from animat.recordings.formats.nwb import read_nwb, write_nwb
+from animat.recordings.synthetic import synthetic_recording
 from damaging import KINDS
 
 
@@ -51,6 +54,19 @@ def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: P
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_thousand_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 2, 2000, tmp_path)
+
+
+@pytest.mark.parametrize("where", ["processing", "processing/ecephys/animat_recording", "units/spike_times"])
+def test_a_part_that_is_damaged_is_not_taken_for_one_that_is_missing(where: str, tmp_path: Path) -> None:
+    path = tmp_path / "recording.nwb"
+    write_nwb(synthetic_recording(0, patterns=1, channels=20), path)
+    with h5py.File(path) as file:
+        begins = h5py.h5o.get_info(file[where].id).addr
+    with path.open("r+b") as file:
+        file.seek(begins)
+        file.write(b"\xff" * 8)
+    with pytest.raises(InvalidFile, match=r"recording\.nwb: expected a whole NWB recording, but it is .*damaged"):
+        read_nwb(path)
 
 
 def test_a_reader_that_is_not_ready_in_time_does_not_blame_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import io
 import itertools
 import json
 import os
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -130,6 +131,8 @@ def _run(given: list[str]) -> int:
             if isinstance(command, Run) and (command.out / "session.log").exists()
             else ""
         )
+        if isinstance(command, Run) and again and not (command.out / "session.nwb").exists():
+            kept = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}{kept}"
         print(f"animat: interrupted{kept}{again}", file=sys.stderr)
         _say_notes(error)
         return 130

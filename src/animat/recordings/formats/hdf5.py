@@ -75,7 +75,8 @@ class Hdf5File:
                     node = self.file["/"]
                 parts.extendleft(reversed([part for part in link.path.split("/") if part]))
                 continue
-            node = node.get(name)
+            # There is such a link: what it leads to is damaged if it cannot be opened, and not missing.
+            node = node[name]
         return node if isinstance(node, h5py.Group | h5py.Dataset) else None
 
     def names(self, where: str) -> list[str]:
