@@ -131,6 +131,10 @@ def test_a_task_that_a_reflex_solves_has_no_score() -> None:
     gap = context_gap(returns, returns - 200, optimum_of(120.0))
     assert not gap.needs_context and gap.score(np.array([119.0, 118.0]), optimum_of(120.0)) is None
     assert "this task needs no more than a reflex" in gap.to_text()
+    # From 0.02 to 0.08.
+    unsure = context_gap(120 + np.linspace(-80, 60, 60), np.full(60, -80.0), optimum_of(120.0))
+    assert unsure.gap is not None and unsure.gap.low < 0.05 < unsure.gap.high
+    assert "whether this task needs more than a reflex is not known" in unsure.to_text()
     hopeless = context_gap(returns, returns, optimum_of(100.0))
     assert hopeless.gap is None and "not above that of random stimuli" in hopeless.to_text()
 

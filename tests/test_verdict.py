@@ -35,7 +35,8 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     said = str(verdict)
     assert said.startswith("the policies do not outperform like (p = ")
     # Significantly worse than a control is not better than it.
-    assert "better (p = " in said and "larger in 0 % of the pairs" in said
+    assert "better (p = " in said and "they are worse: their return is larger in 0 % of the pairs" in said
+    assert said.count("worse") == 1
     every = str(Verdict.of(policies, {"worse": policies - 9}))
     assert every.startswith("the policies outperform every control (p < 0.01; ")
     assert every.endswith("larger in 100 % of the pairs of episodes or more)")

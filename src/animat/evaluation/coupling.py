@@ -219,9 +219,12 @@ class ContextGap:
         gap = f"context gap {least}{self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
         if self.best_known is not None:
             gap += f", as the best agent known returns {self.best_known:.1f}"
-        needs = "" if self.needs_context else ": this task needs no more than a reflex"
-        if self.is_least and not self.needs_context:
+        if self.needs_context:
+            needs = ""
+        elif self.is_least or self.gap.high > REFLEX_GAP:
             needs = ": whether this task needs more than a reflex is not known"
+        else:
+            needs = ": this task needs no more than a reflex"
         scored = ""
         if score is not None:
             scored = f"; context score {least}{score.value:.2f} ({score.low:.2f} to {score.high:.2f})"

@@ -35,6 +35,11 @@ class Beside(NamedTuple):
         return self.p < OUTPERFORMED_P and self.wins > 0.5
 
     @property
+    def is_worse(self) -> bool:
+        """Whether they are smaller."""
+        return self.p < OUTPERFORMED_P and self.wins < 0.5
+
+    @property
     def can_tell(self) -> bool:
         """Whether so many episodes could come to a small p at all: if each of the policies' were the larger one."""
         return p_of_u(0.0, self.policies, self.control) < OUTPERFORMED_P
@@ -79,7 +84,8 @@ class Verdict:
     def __str__(self) -> str:
         few = {name: each for name, each in self.controls.items() if not each.can_tell}
         reported = [
-            f"{name} (p = {each.p:.2g}; their return is larger in {100 * each.wins:.0f} % of the pairs of episodes)"
+            f"{name} (p = {each.p:.2g}; {'they are worse: ' if each.is_worse else ''}their return is larger in "
+            f"{100 * each.wins:.0f} % of the pairs of episodes)"
             for name, each in self.controls.items()
             if not each.is_outperformed and each.can_tell
         ]
