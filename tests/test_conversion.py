@@ -119,6 +119,13 @@ def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pyte
     assert not (tmp_path / "out.nwb").exists()
     assert main(["inspect", str(path), "--part", "well7"]) == 1
     assert "expected one of well000/rec0000; got well7" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path), "--out", str(tmp_path / "out.nwb")]) == 1
+    assert "expected one recording, got a folder; convert its files one by one" in capsys.readouterr().err
+    state = tmp_path / "culture.state"
+    with state.open("wb") as file:
+        np.savez(file, head=np.zeros(1), state_last_spike=np.zeros(1))
+    assert main(["inspect", str(state)]) == 1
+    assert "expected a recording, got the state of a virtual culture" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("age", ["P42D", "P6W", "P1Y2M3DT4H", "P2.5W", "PT36H", "P20D/P22D", "P90Y/"])

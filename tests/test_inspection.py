@@ -212,6 +212,15 @@ def test_where_every_response_is_kept_no_separability_is_told_and_no_panel_of_bu
         assert titles[1:] == ["response against active channels", "no response is set apart as a burst"]
 
 
+def test_bursts_that_are_too_few_are_told_from_none() -> None:
+    # Of 103 stimuli three make every channel fire.
+    spikes = [(t, c) for t in range(1, 104) for c in range(40) if t > 100 or c < 4]
+    at = [(t + 0.005, c) for t, c in spikes]
+    found = extract_responses(recording(at, list(range(1, 104)), 40, 105.0)).findings
+    (said,) = (f.message for f in found if f.name == "bursts-not-separable")
+    assert "set apart as a burst, as fewer than 5 would be: Otsu's threshold" in said and "part 3 of 103" in said
+
+
 def test_many_clear_bursts_may_be_the_responses() -> None:
     # Half of all stimuli fail altogether, the others make most channels fire.
     found = names(extract_responses(answering({5: 0.0, 10: 60.0}, n=100)))

@@ -258,6 +258,10 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
         {"stimulus_electrodes": np.zeros((3, 2))},
         r"stimulus_electrodes: .* got \(3, 2\)",
     ),
+    "an electrode below 0": (
+        {"stimulus_electrodes": np.array([[3, -1], [-7, -1]])},
+        "stimulus_electrodes: expected numbers of electrodes, .* got -7",
+    ),
     "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: expected, to know which 5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -65,6 +67,12 @@ def test_a_task_that_a_reflex_does_has_no_score() -> None:
     (row,) = found(np.array([[109.0, 111.0, 110.0]]), optimum())
     assert not row.needs_context and row.score is None
     assert row.gap == pytest.approx(0.0)
+    returned = row.coupling
+    assert reflexes_told([row]) == [
+        f"cartpole, taught, at 0 min: the best reflex returns {returned:.1f}; the task needs no more than that."
+    ]
+    (unsure,) = reflexes_told([replace(row, gap_high_95=0.06)])
+    assert unsure.endswith("; whether the task needs more is not known.")
 
 
 @pytest.mark.parametrize("known", [[], [optimum(left_out="5 Hz: 3")], [optimum(best_return=None)]])

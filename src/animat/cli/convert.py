@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from animat.errors import InvalidFile
 from animat.writing import expect_writable
 
 
@@ -71,6 +72,8 @@ class Convert:
         from animat.recordings.detection.settings import Detection
         from animat.recordings.noticed import noticed
 
+        if self.recording.is_dir():
+            raise InvalidFile(f"{self.recording}: expected one recording, got a folder; convert its files one by one")
         expect_writable(self.out.parent)
         detection = Detection(
             band_hz=None if self.band_hz == (0, 0) else self.band_hz,
@@ -80,7 +83,7 @@ class Convert:
             recovery_ms=max(20.0, self.blank_ms[1]),
         )
         origin = Origin(**{each.name: getattr(self, each.name) for each in fields(Origin)})
-        with Bar("finding spikes") as progress:
+        with Bar("converting") as progress:
             recording = convert_recording(
                 self.recording,
                 self.out,

@@ -13,7 +13,7 @@ from animat.errors import UnusableData
 from animat.recordings.findings import Finding, merged
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Order, Presentation
-from animat.stimulation.stimulus import Stimuli
+from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN, expect_times
 
 Column = np.ndarray[Any, Any]
@@ -172,7 +172,13 @@ class PlainColumns:
             raise UnusableData(
                 f"stimulus_electrodes: expected shape ({n}, electrodes), padded with -1, got {electrodes.shape}"
             )
-        return _whole("stimulus_electrodes", electrodes)
+        whole = _whole("stimulus_electrodes", electrodes)
+        if whole.min(initial=UNKNOWN) < NOTHING:
+            raise UnusableData(
+                f"stimulus_electrodes: expected numbers of electrodes, with {UNKNOWN} for none known and {NOTHING} for "
+                f"nothing delivered, got {whole.min()}"
+            )
+        return whole
 
     def _presentations(self, n: int, in_time: Int64[np.ndarray, " stimuli"]) -> Int64[np.ndarray, " stimuli"]:
         if self.stimulus_presentation is not None:

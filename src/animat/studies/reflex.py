@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from animat.evaluation.coupling import context_gap
+from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
 from animat.report.results import BesideReflex, StudyOptimum
@@ -59,7 +59,9 @@ def reflexes_told(rows: Iterable[BesideReflex]) -> list[str]:
             continue
         where = f"{row.robot}, {row.arm}, at {row.at_min:g} min: the best reflex returns {row.coupling:.1f}"
         if not row.needs_context:
-            told.append(f"{where}; the task needs no more than that.")
+            is_known = row.gap_high_95 is not None and row.gap_high_95 <= REFLEX_GAP
+            more = "the task needs no more than that" if is_known else "whether the task needs more is not known"
+            told.append(f"{where}; {more}.")
         else:
             score = "" if row.score is None else f"; the policies' context score is {row.score:.2f}"
             told.append(f"{where}; the task needs more{score}.")

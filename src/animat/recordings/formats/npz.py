@@ -58,6 +58,8 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     missing = [key for key in REQUIRED if key not in columns]
     if missing:
         keys = [*columns, *routing, *left_out]
+        if any(key.startswith("state_") for key in keys):
+            raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture beside its recordings")
         counts = [key for key in keys if "spike" in key and key not in KEYS]
         if counts and "spike_time_s" in missing and "stimulus_time_s" in missing:
             raise InvalidFile(

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
-from animat.responses.bursts import BurstSeparation
+from animat.responses.bursts import LEAST_RESPONSES, BurstSeparation
 from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment
 from animat.responses.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
@@ -208,10 +208,15 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
     if not n_bursts:
         if not math.isnan(bursts.rejected):
             above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
+            fewest = min(above, len(responses) - above)
+            why = (
+                f"as fewer than {LEAST_RESPONSES} would be"
+                if 0 < fewest < LEAST_RESPONSES
+                else "as the ratios of active channels do not form two groups"
+            )
             message = (
-                f"no response is set apart as a burst, as the ratios of active channels do not form two groups: Otsu's "
-                f"threshold, {bursts.rejected:.3f}, would part {above} of {len(responses)} responses from the others "
-                f"({values})"
+                f"no response is set apart as a burst, {why}: Otsu's threshold, {bursts.rejected:.3f}, would part "
+                f"{above} of {len(responses)} responses from the others ({values})"
             )
             yield Finding("bursts-not-separable", "note", message, bursts.separability)
         return
@@ -258,7 +263,8 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     elif spread < LITTLE_DIFFERENCE:
         message = (
             f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
-            "a robot can hardly be steered: --optimum cartpole computes how far; stimulate in ways that differ more"
+            "a robot can hardly be steered: `animat inspect --optimum` computes how far; stimulate in ways that differ "
+            "more"
         )
         yield Finding("little-difference", "warning", message, spread)
     else:
