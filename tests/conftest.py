@@ -41,8 +41,9 @@ if [int(part) for part in version("jaxlib").split(".")[:2]] < [0, 11]:
     SOON_COMPILED += " --xla_cpu_use_fusion_emitters=false"
 """A sixth of the time to compile a training, which then takes three times as long, and here lasts for moments."""
 
-# The same random examples each time; others with --hypothesis-profile=default.
-settings.register_profile("the same", derandomize=True)
+# The same random examples each time; others with --hypothesis-profile=default. However long one takes: on a machine
+# busy with other work it took more than Hypothesis allows.
+settings.register_profile("the same", derandomize=True, deadline=None)
 settings.load_profile("the same")
 
 
