@@ -89,8 +89,8 @@ class Training:
             as the recordings that it is trained on (`SimulatorTimeline.span_min`).
         percentiles: `"moving"` with the simulator in use, or fixed by the `"first"` recording.
         delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random whatever it chose.
-        neural_observation: whether policies see what the neurons remember, too (`animat.wrappers.NeuralObservation`);
-            no closed loop runs such policies; they are evaluated on simulators.
+        neural_observation: whether policies see what the neurons remember, too (`animat.wrappers.NeuralObservation`).
+            A closed loop makes it of the culture's responses and shows it to them; a live run refuses such policies.
         commands: without neurons, the commands to pick from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
         lessons: ranges that episodes are drawn from, in turn; after a last one that goes on comes the task itself.
