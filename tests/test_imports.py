@@ -23,6 +23,7 @@ GROUND = (
     "extras",
     "late",
     "lined_up",
+    "marks",
     "plain_file",
     "progress",
     "records",

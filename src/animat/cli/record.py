@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument, Mismatch
+from animat.marks import expect_no_other
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
@@ -184,9 +185,10 @@ class Record:
 
 
 def _expect_no_others(folder: Path) -> None:
-    """Raise for recordings in a folder that are of no series: they would be read as if they were of this one."""
+    """Raise for recordings of no series, which would be read as if they were of this one, and for other work."""
     if not folder.is_dir():
         return
+    expect_no_other(folder, "recording")
     others = sorted(file.name for file in folder.glob("[!.]*.nwb") if not file.name.startswith("recording_"))
     if others:
         shown = f"{', '.join(others[:3])}{' ...' if len(others) > 3 else ''}"

@@ -83,7 +83,7 @@ def run_session(
         InvalidArgument: for a culture that is closed or stopped, no agents, one that sees the history state in a loop
             that does not remember, or a session or a file `STOP` that is in the folder already.
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
-            read.
+            read, or a folder of other work.
         InvalidFile: if a file is in the folder's place, or the log cannot be begun.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)

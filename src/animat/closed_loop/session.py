@@ -25,6 +25,7 @@ from animat.closed_loop.log import Log, Records, read_log
 from animat.closed_loop.outline import Episode, Outline, electrode_pulses_of
 from animat.closed_loop.tick import Ending, Tick, TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.marks import expect_no_other
 from animat.plain_file import expect_no_file
 from animat.progress import Progress
 from animat.recordings.formats.nwb import write_nwb
@@ -213,6 +214,7 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
 
     Raises:
         InvalidArgument: if a session is there.
+        Mismatch: if work of another kind is there, such as recordings.
         InvalidFile: if a file is in the folder's place, or the folder cannot be made or written to.
     """
     folder = Path(folder)
@@ -221,6 +223,7 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
         told = f" that was killed or still runs: its recording was not written, `animat recover {folder}` does it"
         told = "" if (folder / RECORDING_FILE).exists() else told
         raise InvalidArgument(f"{folder / LOG_FILE}: a session is there already{told}; choose another folder")
+    expect_no_other(folder, "session")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -84,7 +84,7 @@ def train(
     Raises:
         InvalidArgument: if neurons are missing for a mapping or given without one, for readouts that are not as many as
             the robot's commands, for fewer workers than one or any beside an executor, or as `expect_trainable` does.
-        Mismatch: if the folder holds another training, or another run is at work in it.
+        Mismatch: if the folder holds another training or work of another kind, or another run is at work in it.
         InvalidFile: if a file cannot be read or written.
         UnusableData: if what was learned is no longer a finite number; nothing of it is left in the folder.
         AnimatError: if a process that trains ends before its time.

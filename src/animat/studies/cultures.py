@@ -20,6 +20,7 @@ from animat.execution.cluster import Cluster
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.marks import expect_no_other
 from animat.progress import Progress, Silent
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.studies.places import results_file
@@ -101,12 +102,14 @@ def run_over_cultures(
 
     Raises:
         AnimatError: if the study of every culture failed, with what each failed of.
-        Mismatch: if another run is at work in the folder.
+        Mismatch: if the folder holds work of another kind, or another run is at work in it.
         InvalidArgument: for fewer workers than one, or any beside an executor.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
+    # Seen before it is touched: somebody else's folder stays as it is.
+    expect_no_other(folder, "cultures")
     with exclusive_lock(folder):
         _name_cultures(folder, studies, {})
         with _room(workers, executor) as (room, at_once):

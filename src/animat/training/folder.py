@@ -18,6 +18,7 @@ from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.differences import description_in, fingerprint_of, first_difference, of_another
 from animat.errors import InvalidArgument, Mismatch
 from animat.goals.robot import without_goal
+from animat.marks import expect_no_other
 from animat.neurons.timeline import SimulatorTimeline
 from animat.plain_file import expect_no_file
 from animat.robots.checking import check_robot
@@ -169,7 +170,7 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     """Whether the training is already in the folder; not if it is free for it.
 
     Raises:
-        Mismatch: if it is another training's, or holds policies that no description tells of.
+        Mismatch: if it is another training's, holds policies that no description tells of, or work of another kind.
         InvalidFile: if its description cannot be read, or it is a file.
     """
     found = _description_in(folder)
@@ -186,6 +187,7 @@ def _description_in(folder: Path) -> dict[str, Any] | None:
     expect_no_file(folder, "the policies")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
+    expect_no_other(folder, "training")
     return None
 
 

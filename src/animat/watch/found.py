@@ -11,17 +11,13 @@ from typing import Literal
 from animat.closed_loop.gathering import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
+from animat.marks import MARKS
 
 Kind = Literal["session", "training", "study", "cultures", "tuning", "recording"]
 
-_MARKS: tuple[tuple[Kind, str], ...] = (
-    ("session", LOG_FILE),
-    ("training", "training.json"),
-    ("tuning", "tune.json"),
-    ("study", "study.json"),
-    ("cultures", "cultures.json"),
-)
-"""By which file each is known; the modules that write them import JAX, which a page has no need of."""
+_MARKED: tuple[Kind, ...] = ("session", "training", "tuning", "study", "cultures")
+_MARKS = tuple((kind, MARKS[kind][0]) for kind in _MARKED)
+"""By which file each is known."""
 _DEPTH, _MOST_FOLDERS, _MOST_FOUND = 4, 4000, 2000
 _PASSED_OVER = ("jobs", "figures", "tables", "checkpoints")
 
