@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,10 @@ import pytest
 from animat.cultures.same_culture import other_culture
 from animat.cultures.series import STATE_FILE, record_virtual_series
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnsafeStimulus
 from animat.recordings.reading import read_recording, read_recordings
 from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import Phase, Pulse
 from animat.stimulation.selection import Selection
 from animat.writing import exclusive_lock
 from cultures import small_culture
@@ -260,6 +262,13 @@ def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match="sessions: expected at least 1"):
         record_virtual_series(lambda: small_culture(), SHORT, tmp_path, sessions=0)
     assert not list(tmp_path.glob("*.nwb"))
+
+
+def test_a_pulse_beyond_the_limits_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    strong = Pulse((Phase(200, amplitude_mv=-2000), Phase(200, amplitude_mv=2000)))
+    with pytest.raises(UnsafeStimulus, match="amplitude: expected -400 to 400 mV, got -2000"):
+        record(tmp_path / "recordings", protocol=replace(SHORT, pulse=strong))
+    assert not (tmp_path / "recordings").exists()
 
 
 @pytest.mark.long

@@ -180,7 +180,7 @@ class Guard:
             )
         net_charge = self._safe_pulses.get(stimulus.pulse)
         if net_charge is None:
-            net_charge = self._check_pulse(stimulus.pulse)
+            net_charge = self.check_pulse(stimulus.pulse)
             if len(self._safe_pulses) >= _REMEMBERED_PULSES:
                 self._safe_pulses.clear()
             self._safe_pulses[stimulus.pulse] = net_charge
@@ -200,8 +200,11 @@ class Guard:
                     "after a rest",
                 )
 
-    def _check_pulse(self, pulse: Pulse) -> float:
-        """The limits on a pulse, as it is asked for and as the device rounds it; returns what it leaves over."""
+    def check_pulse(self, pulse: Pulse) -> float:
+        """The charge that a pulse leaves over; raises UnsafeStimulus unless it is within the limits.
+
+        Both as it is asked for and as the device rounds it.
+        """
         limits = self.limits
         if pulse.kind != limits.kind:
             raise UnsafeStimulus("kind", f"expected {limits.kind} pulses, got a {pulse.kind} pulse ({pulse})")

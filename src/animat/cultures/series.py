@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from animat.cultures.base import Culture
+from animat.cultures.safety import Guard
 from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
@@ -61,12 +62,14 @@ def record_virtual_series(
 
     Raises:
         InvalidArgument: for no sessions, an interval shorter than a recording, or more patterns than the culture has.
+        UnsafeStimulus: for a pulse that the culture's limits do not allow.
         Mismatch: if a file of the series is there but from another culture, protocol or version, or another run is at
             work in the folder.
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
     """
     fresh = make_culture()
     check_interval(protocol, sessions, interval_min, fresh.n_patterns)
+    Guard(fresh.limits, ()).check_pulse(protocol.pulse)
     folder, progress = Path(folder), progress or Silent()
     files = series_files(folder, sessions, interval_min)
     # Seen before it is touched: somebody else's folder stays as it is.
