@@ -205,6 +205,9 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
         ({"kind": "empirical"}, "kind: expected only with recordings"),
         ({"name": 3.0}, "cartpole: expected parameters among .*, got 'name'"),
+        ({"simulator": "memory"}, "simulator: expected a simulator, and `kind` for the name of one, got 'memory'"),
+        ({"recordings": 3}, "recordings: expected a path or several, got 3"),
+        ({"recordings": ["r", None]}, "recordings: expected a path or several, got None"),
         ({"delivery": "late"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
     ],
 )

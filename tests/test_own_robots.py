@@ -65,6 +65,19 @@ class Slider(Robot[At]):
         return jnp.stack([state.x_m])
 
 
+KEPT: list[Any] = []
+
+
+def keeping(self: Any, uniforms: Any, state: At, u: Any) -> tuple[At, Any, Any]:
+    """An iteration that begins where the first that was ever traced began."""
+    KEPT.append(state.x_m)
+    return At(KEPT[0] + u), u, u > 2
+
+
+def raising(*_: Any) -> Any:
+    return 1 / 0
+
+
 def slider(**changed: Any) -> Robot[Any]:
     """A slider with other methods or attributes."""
     return type("Changed", (Slider,), changed)()  # type: ignore[no-any-return]
@@ -158,6 +171,17 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"advance": lambda self, uniforms, state, u: (state, float(u), u > 2)}, "advance: expected it to run"),
         ({"heuristic": lambda self, seen: seen}, r"heuristic: expected a command, shape \(\), got shape \(1,\)"),
         ({"heuristic": lambda self, seen: seen.x}, "heuristic: expected it to run .* AttributeError"),
+        ({"observe": lambda self, state: [state.x_m]}, "observe: expected an array, as jnp.stack makes, got a list"),
+        ({"advance": keeping}, "Changed: expected methods that keep nothing of a call for a later one"),
+        ({"succeeded": lambda self, state: state.x_m}, "succeeded: expected true or false, got float32"),
+        ({"succeeded": raising}, "succeeded: expected it to run under jax.jit, got ZeroDivisionError"),
+        ({"potential": lambda self, state: jnp.stack([state.x_m])}, r"potential: expected a number, .*shape \(1,\)"),
+        ({"potential": lambda self, state: state.x_m / 0}, "NaN or infinite ones in a potential"),
+        ({"potential": raising}, "potential: expected it to run under jax.jit, got ZeroDivisionError"),
+        ({"value_grid": lambda self: 3}, "Changed.value_grid: expected a Grid, got 3"),
+        ({"value_grid": raising}, "Changed.value_grid: expected a Grid, got ZeroDivisionError"),
+        ({"observation_spec": property(raising)}, "observation_spec: expected a tuple of Quantity, got ZeroDivision"),
+        ({"observation_spec": (Quantity("x", "m", 1.0),) * 2}, "observation_spec: expected each name once, got 'x'"),
         ({"noise_size": None}, "noise_size: expected a whole number"),
         ({"noise_size": -1}, "noise_size: expected a whole number"),
         ({"episode_limit": 0}, "episode_limit: expected a whole number"),
@@ -177,6 +201,32 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
     with pytest.raises(InvalidArgument, match=words) as raised:
         train(training(robot, "1-threshold"), timeline_of(), None)
     assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("x", "m", "big"), "x: scale of a Quantity: expected a number, got 'big'"),
+        (("x", "m", None), "x: scale of a Quantity: expected a number, got None"),
+        (("x", "m", np.ones(2)), r"x: scale of a Quantity: expected a number, got array\("),
+        (("x", "m", 1.0, "low"), "x: low of a Quantity: expected a number, got 'low'"),
+        (("x", "m", 1.0, 0.0, ()), r"x: high of a Quantity: expected a number, got \(\)"),
+        ((1.0, "m", 1.0), "name of a Quantity: expected a text, got 1.0"),
+        (("x", 1.0, 1.0), "unit of a Quantity: expected a text, got 1.0"),
+    ],
+)
+def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"^{words}"):
+        Quantity(*given)
+
+
+def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:
+    def without(self: Any) -> Any:
+        raise InvalidArgument("gain_m: expected 0.1 or less for an optimal return")
+
+    robot = slider(value_grid=without)
+    check_robot(robot)
+    assert no_grid(robot) == "gain_m: expected 0.1 or less for an optimal return"
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12, *(pytest.param(x, marks=pytest.mark.oracle) for x in (1e-7, 1e7))])

@@ -115,6 +115,21 @@ def test_actions_are_drawn_as_often_as_their_probabilities_say() -> None:
     assert policy.act_greedily(observation) == int(np.argmax(expected))
 
 
+@pytest.mark.parametrize("make", [through_neurons, two_forces, continuous])
+@pytest.mark.parametrize("shape", [(), (1,), (1, -1), (6, -1), (9,)])
+def test_an_observation_of_another_shape_is_refused(make: Callable[[], Policy], shape: tuple[int, ...]) -> None:
+    policy = make()
+    n = len(policy.scales)
+    shape = tuple(n if size == -1 else size for size in shape)
+    for act in (policy.act_greedily, lambda seen: policy.act(seen, np.random.default_rng(0)), policy.outputs):
+        with pytest.raises(InvalidArgument) as raised:
+            act(np.zeros(shape))
+        told = f"observation: expected one of {policy.robot.name}, shape ({n},), got shape {shape}"
+        assert str(raised.value) == told
+        # A list is as good as an array.
+        np.testing.assert_array_equal(act([0.0] * n), act(np.zeros(n)))  # type: ignore[arg-type]
+
+
 def test_a_decided_policy_always_acts_the_same() -> None:
     policy = through_neurons()
     biases = (*policy.biases[:-1], np.array([-1e4, -1e4, 1e4, -1e4, -1e4], np.float32))

@@ -293,12 +293,21 @@ def test_a_bad_robot_ends_in_a_line_before_anything_is_read_or_recorded(
     change: tuple[str, str], words: str, package: Path, capsys: Any
 ) -> None:
     at = written(package, change)
-    assert main(["train", at, "--recordings", "no-such-folder"]) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and re.search(words, said[0])
+    for command in (["robots", at], ["train", at, "--recordings", "no-such-folder"]):
+        assert main(command) == 1
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 1 and re.search(words, said[0])
     with pytest.raises(InvalidArgument, match=words):
         run_study(Study(robots=(RobotSpec("rover", kind=at),)), package / "study")
     assert not list((package / "study").glob("recordings/*"))
+
+
+def test_an_observation_spec_that_raises_ends_in_a_line(package: Path, capsys: Any) -> None:
+    at = written(package, ("return (animat.Quantity", "return 1 / 0, (animat.Quantity"))
+    for command in (["robots", at], ["train", at, "--recordings", "no-such-folder"]):
+        assert main(command) == 1
+        said = "animat: Rover.observation_spec: expected a tuple of Quantity, got ZeroDivisionError: division by zero"
+        assert capsys.readouterr().err.splitlines() == [said]
 
 
 def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Path) -> None:

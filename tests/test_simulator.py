@@ -16,6 +16,7 @@ from animat.neurons.simulator import fit_empirical, fit_histogram, silenced
 from animat.neurons.timeline import fit_timeline
 from animat.responses.condition import Condition
 from animat.responses.responses import Responses
+from animat.responses.series import extract_series
 from animat.stimulation.protocol import Presentation
 
 FREQUENCIES = (5.0, 10.0, 20.0, 40.0, 80.0)
@@ -213,6 +214,19 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
         (lambda: fit_histogram(responses_of([1.0]), range_hz=float("nan")), InvalidArgument, "range_hz"),
         (lambda: fit_empirical(responses_of([1.0, 2.0]), room=1), InvalidArgument, "room"),
         (lambda: fit_timeline([]), InvalidArgument, "series"),
+        (
+            lambda: fit_timeline("recordings"),  # type: ignore[arg-type]
+            InvalidArgument,
+            "series: expected a list of responses, as animat.extract_series makes, got 'recordings'",
+        ),
+        (lambda: fit_timeline(responses_of([1.0])), InvalidArgument, "series: expected a list of responses"),  # type: ignore[arg-type]
+        (lambda: fit_timeline([3]), InvalidArgument, "series: expected a list of responses, .* got 3"),  # type: ignore[list-item]
+        (
+            lambda: extract_series("recordings"),  # type: ignore[arg-type]
+            InvalidArgument,
+            "recordings: expected a list of recordings, as animat.read_recordings makes, got 'recordings'",
+        ),
+        (lambda: extract_series(["recordings"]), InvalidArgument, "recordings: expected .* got 'recordings'"),  # type: ignore[list-item]
         (lambda: fit_timeline([responses_of([1.0])], kind="gamma"), InvalidArgument, "kind"),  # type: ignore[arg-type]
         (lambda: fit_timeline([responses_of([1.0]), responses_of([1.0])]), Mismatch, "start_min"),
         (

@@ -405,6 +405,8 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
         ({"commands": 3}, "commands: expected a list, got 3"),
         ({"commands": ("a",)}, "commands: expected a number, got 'a'"),
         ({"commands": ()}, "commands: expected at least 1"),
+        ({"commands": ()}, "commands: expected at least 1 command to pick from, or None for any, got none"),
+        ({"mapping": "none"}, "mapping: expected None without neurons, mapping=None in Python, got 'none'"),
         ({"commands": (0.5, 2.0)}, "commands: expected at most 1, got 2.0"),
         ({"lessons": (3,)}, "lessons: expected Lesson, got 3"),
         ({"algorithm": 3}, "algorithm: expected SAC, got 3"),
@@ -412,7 +414,29 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
 )
 def test_what_no_training_can_have_is_told(named: dict[str, Any], told: str) -> None:
     with pytest.raises(InvalidArgument, match=re.escape(told)):
-        Training(Cartpole(), None, **named)
+        Training(**{"robot": Cartpole(), "mapping": None, **named})
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        (
+            {"training": "cartpole"},
+            "training: expected a Training, such as animat.Training('cartpole', '9-thresholds')",
+        ),
+        ({"timeline": "recordings/"}, "timeline: expected simulators, as animat.fit_timeline makes, or None, got 'rec"),
+        ({"folder": 3}, "folder: expected a path, or None, got 3"),
+        (
+            {"callbacks": print},
+            "callbacks: expected a list of functions, each of a row of a learning curve, got <built",
+        ),
+        ({"callbacks": [None]}, "callbacks: expected a list of functions, each of a row of a learning curve, got None"),
+    ],
+)
+def test_what_stands_in_the_place_of_something_else_is_told(changed: dict[str, Any], told: str) -> None:
+    arguments: dict[str, Any] = {"training": replace(SHORT, mapping=None), "timeline": None, "folder": None} | changed
+    with pytest.raises(InvalidArgument, match=re.escape(told)):
+        train(**arguments)
 
 
 def test_commands_are_taken_from_whatever_yields_them() -> None:

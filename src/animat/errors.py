@@ -5,7 +5,7 @@ from __future__ import annotations
 import copyreg
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -77,6 +77,23 @@ def shown(value: object) -> str:
         # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
         text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"
     return text if len(text) <= 80 else f"{text[:80]}... ({len(text):,} characters)"
+
+
+def expect_kind(what: str, given: object, kind: Any, words: str) -> None:
+    """Refuse what is of another kind than an argument should be, such as a path in the place of what is read from it.
+
+    Raises:
+        InvalidArgument: naming the argument, what was expected, in `words`, and what came.
+    """
+    if not isinstance(given, kind):
+        raise InvalidArgument(f"{what}: expected {words}, got {shown(given)}")
+
+
+def expect_several(what: str, given: object, kind: Any, words: str) -> None:
+    """The same of a sequence, all of it of one kind."""
+    expect_kind(what, given, Sequence, words)
+    if wrong := [each for each in given if not isinstance(each, kind)]:  # type: ignore[attr-defined]
+        raise InvalidArgument(f"{what}: expected {words}, got {shown(given if isinstance(given, str) else wrong[0])}")
 
 
 def did_you_mean(word: str, among: Iterable[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +13,7 @@ from typing import final
 
 from animat.coding.decoder import expect_fit
 from animat.devices import gpu_here
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, UnusableData, expect_kind, expect_several
 from animat.execution.curves import CurveFile, Curves
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
@@ -89,6 +89,10 @@ def train(
         UnusableData: if what was learned is no longer a finite number; nothing of it is left in the folder.
         AnimatError: if a process that trains ends before its time.
     """
+    expect_kind("training", training, Training, "a Training, such as animat.Training('cartpole', '9-thresholds')")
+    expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators, as animat.fit_timeline makes, or None")
+    expect_kind("folder", folder, str | os.PathLike | None, "a path, or None")
+    expect_several("callbacks", callbacks, Callable, "a list of functions, each of a row of a learning curve")
     if (timeline is None) != (training.mapping is None):
         raise InvalidArgument(
             "timeline: expected the culture's simulators with a mapping, and None without, got "

@@ -15,7 +15,7 @@ from animat.coding.checking import check_mapping
 from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
 from animat.environment import Animat
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_kind, expect_several
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.synthetic import LABELS, synthetic_simulator
@@ -105,6 +105,11 @@ def set_up(
         )
     for caveat in body.caveats():
         warnings.warn(caveat, stacklevel=2)
+    expect_kind("simulator", simulator, NeuronSimulator | None, "a simulator, and `kind` for the name of one")
+    if recordings is not None and not isinstance(recordings, str | os.PathLike):
+        expect_kind("recordings", recordings, Iterable, "a path or several")
+        recordings = tuple(recordings)
+        expect_several("recordings", recordings, str | os.PathLike, "a path or several")
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     if recordings is None:

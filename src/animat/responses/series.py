@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_several
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -57,6 +57,8 @@ def extract_series(
         InvalidArgument: for a name in `allow` of no finding that refuses, or readouts that the channels cannot have.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
+    kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings makes"
+    expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
     # A replay has a seed too, and it is no culture's.
     told = [each.provenance for each in recordings if each.provenance.get("source", "").startswith(_SIMULATED)]

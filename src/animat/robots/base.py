@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Generic, TypeVar, final
 from jaxtyping import Bool, Float
 from pydantic import BeforeValidator, Field
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.late import Array, jax
 from animat.records import Number, Whole
 
@@ -50,6 +50,9 @@ class Quantity:
         low, high: bounds in that unit that no observation of an episode passes, the last one included.
         of_goal: whether it tells of the goal, and not of the body and its surroundings: a reflex does not know it
             (`animat.evaluation.coupling`).
+
+    Raises:
+        InvalidArgument: for a name or a unit that is no text, and for a scale or a bound that is no number.
     """
 
     name: str
@@ -58,6 +61,16 @@ class Quantity:
     low: float = -math.inf
     high: float = math.inf
     of_goal: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("name", "unit"):
+            if not isinstance(text := getattr(self, name), str):
+                raise InvalidArgument(f"{name} of a Quantity: expected a text, got {shown(text)}")
+        for name in ("scale", "low", "high"):
+            number: Any = getattr(self, name)
+            # Also what JAX traces, of a robot whose parameters are drawn.
+            if not hasattr(number, "__float__") or getattr(number, "ndim", 0) != 0:
+                raise InvalidArgument(f"{self.name}: {name} of a Quantity: expected a number, got {shown(number)}")
 
 
 class Robot(abc.ABC, Generic[State]):

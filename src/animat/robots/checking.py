@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from animat.errors import AnimatError, InvalidArgument, first_line, shown
 from animat.late import jax, jnp
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
+from animat.robots.grid import Grid
 from animat.robots.host import Bodies, HostRobot
 
 _STEPS = 3
@@ -30,6 +32,8 @@ def check_robot(robot: Robot[Any]) -> None:
         _check_on_host(robot)
     else:
         _check_compiled(robot)
+    if hasattr(robot, "value_grid"):
+        _expect_grid(f"{type(robot).__name__}.value_grid", robot.value_grid)
 
 
 @lru_cache(maxsize=64)
@@ -39,11 +43,21 @@ def _check_compiled(robot: Robot[Any]) -> None:
     one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)
 
+    def told_of(state: Any, reward: Any) -> tuple[Any, ...]:
+        seen = _tried(f"{name}.observe", robot.observe, state)
+        if isinstance(seen, list | tuple):
+            raise InvalidArgument(f"{name}.observe: expected an array, as jnp.stack makes, got a {type(seen).__name__}")
+        _expect_shape(f"{name}.observe", seen, (observations,), "one number for each of `observation_spec`")
+        judged = {}
+        for method, words, kind in (("succeeded", "true or false", bool), ("potential", "a number", float)):
+            if hasattr(robot, method):
+                judged[method] = _tried(f"{name}.{method}", getattr(robot, method), state)
+                _expect_shape(f"{name}.{method}", judged[method], (), words, kind)
+        return state, seen, jnp.asarray(reward, jnp.float32), judged.get("potential", 0.0)
+
     def episode(key: Any) -> Any:
         state = _tried(f"{name}.reset", robot.reset, key)
-        seen = _tried(f"{name}.observe", robot.observe, state)
-        _expect_shape(f"{name}.observe", seen, (observations,), "one number for each of `observation_spec`")
-        told, wanted = [(state, seen, jnp.float32(0.0))], []
+        told, wanted = [told_of(state, 0.0)], []
         # Commands at both ends and in the middle.
         for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
             uniforms = jnp.full(noise, 0.5, jnp.float32)
@@ -54,27 +68,43 @@ def _check_compiled(robot: Robot[Any]) -> None:
             _expect_alike(f"{name}.advance", after, state)
             _expect_shape(f"{name}.advance: reward", reward, (), "a number")
             _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
-            seen = _tried(f"{name}.observe", robot.observe, after)
-            told.append((after, seen, jnp.asarray(reward, jnp.float32)))
+            told.append(told_of(after, reward))
             if heuristic is not None:
-                command = _tried(f"{name}.heuristic", heuristic, seen)
+                command = _tried(f"{name}.heuristic", heuristic, told[-1][1])
                 _expect_shape(f"{name}.heuristic", command, one_command, "a command")
                 wanted.append(jnp.asarray(command, jnp.float32))
         return told, wanted
 
-    # Under jit: what a step may not do there is seen here, and it is compiled once.
+    def run(key: Any) -> Any:
+        # Traced twice, by functions that JAX takes for different ones: what was kept of the first time fails in the
+        # second. Under jit: what a step may not do there is seen here, and it is compiled once.
+        jax.eval_shape(lambda key: episode(key), key)
+        return jax.device_get(jax.jit(episode)(key))
+
     try:
-        told, commands = jax.device_get(jax.jit(episode)(jax.random.key(0)))
+        told, commands = _tried(name, run, jax.random.key(0))
     except InvalidArgument as error:
         # JAX has put a note of its own to it.
         raise InvalidArgument(str(error)) from error.__cause__
     if not np.all(np.abs(commands) <= 1):
         got = ", ".join(f"{command:g}" for command in np.ravel(commands))
         raise InvalidArgument(f"{name}.heuristic: expected commands from -1 to 1, got {got}")
-    for state, seen, reward in told:
-        for what, values in (("a state", jax.tree.leaves(state)), ("an observation", [seen]), ("a reward", [reward])):
-            if not all(np.all(np.isfinite(value)) for value in values):
+    for values in told:
+        for what, value in zip(("a state", "an observation", "a reward", "a potential"), values, strict=True):
+            if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(value)):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
+
+
+def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
+    try:
+        grid = value_grid()
+    except AnimatError:
+        # With these parameters it has none, and says why where one is asked for.
+        return
+    except Exception as error:
+        raise InvalidArgument(f"{what}: expected a Grid, got {first_line(error)}") from error
+    if not isinstance(grid, Grid):
+        raise InvalidArgument(f"{what}: expected a Grid, got {shown(grid)}")
 
 
 def _check_on_host(robot: HostRobot) -> None:
@@ -99,9 +129,12 @@ def _expect_attributes(robot: Any) -> None:
             raise InvalidArgument(f"{kind}.{name}: expected a whole number from {least} to {most}, got {shown(value)}")
     if not isinstance(getattr(robot, "name", None), str):
         raise InvalidArgument(f"{kind}.name: expected a text, got {shown(getattr(robot, 'name', None))}")
-    spec = robot.observation_spec
+    wanted = "a tuple of Quantity"
+    spec = _tried(f"{kind}.observation_spec", lambda: robot.observation_spec, words=wanted)
     if not isinstance(spec, tuple) or not spec or not all(isinstance(q, Quantity) for q in spec):
-        raise InvalidArgument(f"{kind}.observation_spec: expected a tuple of Quantity, got {shown(spec)}")
+        raise InvalidArgument(f"{kind}.observation_spec: expected {wanted}, got {shown(spec)}")
+    if twice := [name for name, times in Counter(quantity.name for quantity in spec).items() if times > 1]:
+        raise InvalidArgument(f"{kind}.observation_spec: expected each name once, got {shown(twice[0])} twice")
     for quantity in spec:
         if not LEAST_SCALE <= quantity.scale <= LARGEST_SCALE:
             raise InvalidArgument(
@@ -115,14 +148,19 @@ def _expect_attributes(robot: Any) -> None:
         raise InvalidArgument(f"{kind}: expected a frozen dataclass of plain parameters ({error})") from error
 
 
-def _tried(what: str, call: Callable[..., Any], *arguments: Any) -> Any:
+def _tried(what: str, call: Callable[..., Any], *arguments: Any, words: str = "it to run under jax.jit") -> Any:
     try:
         return call(*arguments)
     except AnimatError:
         raise
     except Exception as error:
         # Anything may go wrong in somebody else's robot.
-        raise InvalidArgument(f"{what}: expected it to run under jax.jit, got {first_line(error)}") from error
+        if isinstance(error, jax.errors.UnexpectedTracerError):
+            raise InvalidArgument(
+                f"{what}: expected methods that keep nothing of a call for a later one, got a traced value that was "
+                "kept; put it into the state"
+            ) from error
+        raise InvalidArgument(f"{what}: expected {words}, got {first_line(error)}") from error
 
 
 def _expect_shape(what: str, value: Any, shape: tuple[int, ...], words: str, kind: type = float) -> None:

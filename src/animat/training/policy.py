@@ -193,7 +193,17 @@ class Policy:
         return first_min + float(trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"])
 
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
-        """The network's outputs for an observation in its own units."""
+        """The network's outputs for an observation in its own units.
+
+        Raises:
+            InvalidArgument: for an observation of another shape; NaN is not looked for.
+        """
+        shape = self.scales.shape
+        # An array is looked at first: that takes a hundredth of a decision.
+        if getattr(observation, "shape", None) != shape and np.shape(observation) != shape:
+            raise InvalidArgument(
+                f"observation: expected one of {self.robot.name}, shape {shape}, got shape {np.shape(observation)}"
+            )
         hidden = observation / self.scales
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = hidden @ weight

@@ -56,12 +56,17 @@ class _Named(Generic[T]):
         vars(training)[self._name] = self._named(value) if isinstance(value, str) else value
 
 
+def _mapping_named(name: str) -> Mapping:
+    if name == "none":
+        raise InvalidArgument("mapping: expected None without neurons, mapping=None in Python, got 'none'")
+    return mapping_named(name)
+
+
 _EXPECTED: dict[str, Any] = {
     "duration_min": Positive | None,
     "commands": Annotated[
         tuple[Annotated[Number, Field(ge=-1, le=1)], ...],
         BeforeValidator(lambda given: given.tolist() if isinstance(given, np.ndarray) else given),
-        Field(min_length=1),
     ]
     | None,
     "algorithm": InstanceOf[SAC],
@@ -104,7 +109,7 @@ class Training:
     """
 
     robot: _Named[Robot[Any]] = _Named(robot_named)
-    mapping: _Named[Mapping | None] = _Named(mapping_named)
+    mapping: _Named[Mapping | None] = _Named(_mapping_named)
     policies: int = 10
     iterations: int = 800_000
     seed: int = 1
@@ -131,6 +136,8 @@ class Training:
                 raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
         read = {name: read_record(expected, getattr(self, name), name) for name, expected in _EXPECTED.items()}
         if read["commands"] is not None:
+            if not read["commands"]:
+                raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
             object.__setattr__(self, "commands", tuple(map(float, read["commands"])))
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.neural_observation not in (False, self.mapping is not None):
