@@ -19,6 +19,8 @@ from typing import Any
 
 ITERATIONS = 400_000
 POLICIES_A_CORE = 5
+CHUNKS = 8
+"""Sixtieths of a training that are timed: seconds, in which all cores are at work at once."""
 
 
 def main() -> None:
@@ -34,6 +36,8 @@ def main() -> None:
             os.sched_setaffinity(0, {options.core})
         print(json.dumps(measured(options.recordings, options.measure)))
         return
+    if ended([started(options.recordings, 1)])[0]["device"] == "cpu":
+        sys.exit("gpu.py: JAX finds no GPU here")
     cores = sorted(os.sched_getaffinity(0))
     one = ended([started(options.recordings, POLICIES_A_CORE, cores[0])])[0]
     together = ended([started(options.recordings, POLICIES_A_CORE, core) for core in cores])
@@ -43,8 +47,6 @@ def main() -> None:
     print("|---" * 7 + "|")
     for policies in options.policies:
         at_once = ended([started(options.recordings, policies)])[0]
-        if at_once["device"] == "cpu":
-            sys.exit("gpu.py: JAX finds no GPU here")
         per_s = at_once["iterations_per_s"]
         row = (f"{per_s:,.0f}", f"{per_s / one_per_s:.1f}", f"{per_s / all_per_s:.1f}", f"{at_once['round_ms']:.2f}")
         print("|", policies, "|", " | ".join((*row, f"{at_once['first_s']:.1f}", at_once["bits"])), "|", flush=True)
@@ -68,7 +70,7 @@ def ended(processes: list[subprocess.Popen[str]]) -> list[dict[str, Any]]:
 
 
 def measured(recordings: str, policies: int) -> dict[str, Any]:
-    """Seconds of a first chunk, which compiles, and of a second one; and the bits of the networks after both."""
+    """Seconds of a first chunk, which compiles, and of those after it; and the bits of all networks at the end."""
     import jax
     import numpy as np
 
@@ -81,20 +83,19 @@ def measured(recordings: str, policies: int) -> dict[str, Any]:
     timeline = fit_timeline(extract_series(read_sources([recordings])))
     training = Training("cartpole", "9-thresholds", policies=policies, iterations=ITERATIONS)
     together = SideBySide(Group(training, tuple(range(policies)), timeline, "", {}))
-    simulator, seconds = timeline.at(float(timeline.start_min[0])), []
-    for chunk in range(2):
-        began = time.perf_counter()
+    simulator, times = timeline.at(float(timeline.start_min[0])), [time.perf_counter()]
+    for chunk in range(1 + CHUNKS):
         together.train(chunk, simulator)
-        seconds.append(time.perf_counter() - began)
-    trained = together.policies()[-1]
-    first, last = training.chunk(1)
+        times.append(time.perf_counter())
+    networks = [each for policy in together.policies() for each in (*policy.weights, *policy.biases)]
+    rounds, seconds = training.chunk(CHUNKS)[1] - training.chunk(0)[1], times[-1] - times[1]
     return {
         "device": jax.devices()[0].device_kind,
         "versions": f"jax {jax.__version__}, numpy {np.__version__}",
-        "first_s": seconds[0],
-        "round_ms": 1e3 * seconds[1] / (last - first),
-        "iterations_per_s": policies * training.algorithm.environments * (last - first) / seconds[1],
-        "bits": hashlib.sha256(b"".join(weight.tobytes() for weight in trained.weights)).hexdigest()[:12],
+        "first_s": times[1] - times[0],
+        "round_ms": 1e3 * seconds / rounds,
+        "iterations_per_s": policies * training.algorithm.environments * rounds / seconds,
+        "bits": hashlib.sha256(b"".join(each.tobytes() for each in networks)).hexdigest()[:12],
     }
 
 

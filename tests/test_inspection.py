@@ -218,7 +218,10 @@ def test_bursts_that_are_too_few_are_told_from_none() -> None:
     at = [(t + 0.005, c) for t, c in spikes]
     found = extract_responses(recording(at, list(range(1, 104)), 40, 105.0)).findings
     (said,) = (f.message for f in found if f.name == "bursts-not-separable")
-    assert "set apart as a burst, as fewer than 5 would be: Otsu's threshold" in said and "part 3 of 103" in said
+    assert (
+        "set apart as a burst, as one of two groups would have fewer than 5: Otsu's threshold" in said
+        and "part 3 of 103" in said
+    )
 
 
 def test_many_clear_bursts_may_be_the_responses() -> None:

@@ -324,7 +324,8 @@ def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Pat
     def drawing(returned: str) -> Callable[[], Any]:
         draw = f"\n    def draw(self, observation, command, earlier, height_px):\n        return {returned}\n"
         forget()
-        at = written(package, ('    name = "rover"\n', f'    name = "rover"\n{draw}'))
+        needed = ("import jax.numpy as jnp\n", "import jax.numpy as jnp\nimport numpy as np\n")
+        at = written(package, needed, ('    name = "rover"\n', f'    name = "rover"\n{draw}'))
         env = gymnasium.make("animat:Animat/Robot-v0", robot=at, render_mode="rgb_array")
         env.reset(seed=1)
         return env.render  # type: ignore[return-value]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copyreg
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 
@@ -89,11 +89,14 @@ def expect_kind(what: str, given: object, kind: Any, words: str) -> None:
         raise InvalidArgument(f"{what}: expected {words}, got {shown(given)}")
 
 
-def expect_several(what: str, given: object, kind: Any, words: str) -> None:
-    """The same of a sequence, all of it of one kind."""
-    expect_kind(what, given, Sequence, words)
-    if wrong := [each for each in given if not isinstance(each, kind)]:  # type: ignore[attr-defined]
-        raise InvalidArgument(f"{what}: expected {words}, got {shown(given if isinstance(given, str) else wrong[0])}")
+def expect_several(what: str, given: Any, kind: Any, words: str) -> tuple[Any, ...]:
+    """The same of several, all of one kind, which are returned; a text and a table of names are none."""
+    expect_kind(what, given, Iterable, words)
+    several = () if isinstance(given, str | bytes | Mapping) else tuple(given)
+    if isinstance(given, str | bytes | Mapping) or not all(isinstance(each, kind) for each in several):
+        wrong = next((each for each in several if not isinstance(each, kind)), given)
+        raise InvalidArgument(f"{what}: expected {words}, got {shown(wrong)}")
+    return several
 
 
 def did_you_mean(word: str, among: Iterable[str]) -> str:

@@ -40,4 +40,4 @@ def expect_no_other(folder: Path, kind: Kind) -> None:
     # Where some of it is there already it goes on, whatever came beside.
     if others and not found[kind]:
         there = ", ".join(others)
-        raise Mismatch(f"{folder}: expected a folder for {_TOLD[kind]}, got one of {there}; choose another --out")
+        raise Mismatch(f"{folder}: expected a folder for {_TOLD[kind]}, got one of {there}; choose another folder")

@@ -92,7 +92,9 @@ def train(
     expect_kind("training", training, Training, "a Training, such as animat.Training('cartpole', '9-thresholds')")
     expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators, as animat.fit_timeline makes, or None")
     expect_kind("folder", folder, str | os.PathLike | None, "a path, or None")
-    expect_several("callbacks", callbacks, Callable, "a list of functions, each of a row of a learning curve")
+    callbacks = expect_several(
+        "callbacks", callbacks or (), Callable, "a list of functions, each of a row of a learning curve"
+    )
     if (timeline is None) != (training.mapping is None):
         raise InvalidArgument(
             "timeline: expected the culture's simulators with a mapping, and None without, got "

@@ -107,9 +107,7 @@ def set_up(
         warnings.warn(caveat, stacklevel=2)
     expect_kind("simulator", simulator, NeuronSimulator | None, "a simulator, and `kind` for the name of one")
     if recordings is not None and not isinstance(recordings, str | os.PathLike):
-        expect_kind("recordings", recordings, Iterable, "a path or several")
-        recordings = tuple(recordings)
-        expect_several("recordings", recordings, str | os.PathLike, "a path or several")
+        recordings = expect_several("recordings", recordings, str | os.PathLike, "a path or several")
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     if recordings is None:

@@ -139,7 +139,7 @@ def fit_timeline(
         Mismatch: if the recordings differ in conditions, window, presentation or readouts, or two share a minute.
         UnusableData: if a condition of a recording has no non-burst response.
     """
-    expect_several("series", series, Responses, "a list of responses, as animat.extract_series makes")
+    series = expect_several("series", series, Responses, "a list of responses, as animat.extract_series makes")
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)

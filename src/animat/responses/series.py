@@ -58,7 +58,7 @@ def extract_series(
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings makes"
-    expect_several("recordings", recordings, kinds, words)
+    recordings = expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
     # A replay has a seed too, and it is no culture's.
     told = [each.provenance for each in recordings if each.provenance.get("source", "").startswith(_SIMULATED)]

@@ -126,20 +126,24 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
     text = _text(path)
     first_line = text.lstrip("\r\n").partition("\n")[0]
     separator = _separator(first_line)
-    # Strict: else a quote that is not closed makes one cell of all that follows.
-    reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
-    rows, lines, first = [], [], 1
+    reader = csv.reader(io.StringIO(text), delimiter=separator)
+    rows, lines, begins = [], [], [1]
     try:
         for row in reader:
             if any(cell.strip() for cell in row):
                 rows.append(row)
                 lines.append(reader.line_num)
-            first = reader.line_num + 1
+            begins.append(reader.line_num + 1)
     except csv.Error as error:
-        raise InvalidFile(
-            f"{path}, line {first}: expected CSV (text in columns), got something else ({error}): "
-            "is a quote not closed?"
-        ) from error
+        raise InvalidFile(f"{path}: expected CSV (text in columns), got something else ({error})") from error
+    if len(begins) > 1 and begins[-1] - begins[-2] > 1:
+        # One cell of all the lines from a quote on, which a reader that is strict tells from one that is closed.
+        last = io.StringIO("".join(text.splitlines(keepends=True)[begins[-2] - 1 :]))
+        try:
+            list(csv.reader(last, delimiter=separator, strict=True))
+        except csv.Error as error:
+            if "end of data" in str(error):
+                raise InvalidFile(f"{path}, line {begins[-2]}: expected a quote to be closed, got none") from error
     if not rows:
         raise InvalidFile(f"{path}: expected a header line and a line an event, got an empty file")
     header = [name.strip() for name in rows[0]]

@@ -210,7 +210,7 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
             above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
             fewest = min(above, len(responses) - above)
             why = (
-                f"as fewer than {LEAST_RESPONSES} would be"
+                f"as one of two groups would have fewer than {LEAST_RESPONSES}"
                 if 0 < fewest < LEAST_RESPONSES
                 else "as the ratios of active channels do not form two groups"
             )
