@@ -56,7 +56,7 @@ def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
     (out / mark).write_bytes(b"somebody's")
     expected, words = COMMANDS[kind]
     assert main([*(word.format(beside=tmp_path) for word in words), "--out", str(out)]) == 1
-    said = f"{out}: expected a folder for {expected}, got one of {told} ({mark}); choose another --out\n"
+    said = f"{out}: expected a folder for {expected}, got one of {told} ({mark}); choose another folder\n"
     assert capsys.readouterr().err.endswith(said)
     assert {file.name: file.read_bytes() for file in out.iterdir()} == {mark: b"somebody's"}
 
