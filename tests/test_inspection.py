@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnusableData
+from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.recordings.synthetic import SyntheticCulture
@@ -210,6 +211,15 @@ def test_where_every_response_is_kept_no_separability_is_told_and_no_panel_of_bu
         assert (inspection.to_dict()["burst_separability"] is not None) == is_known
         titles = [axes.get_title(loc="left") for axes in draw_burst_separation(inspection.responses).axes]
         assert titles[1:] == ["response against active channels", "no response is set apart as a burst"]
+
+
+def test_stimuli_of_no_condition_are_drawn_and_nothing_is_fitted_to_them() -> None:
+    source = answering({5: 20.0}, n=60)
+    none = extract_responses(source, ByPattern())
+    assert not none.conditions
+    draw_raster(source, none)
+    with pytest.raises(UnusableData, match="conditions: expected one or more to fit, got none"):
+        fit_empirical(none)
 
 
 def test_bursts_that_are_too_few_are_told_from_none() -> None:

@@ -443,6 +443,11 @@ BAD_CSV = {
     "the answer of a server": ("<html><body>404 not found</body></html>\n", None, "it is a web page, perhaps"),
     "blanks between columns": ("time channel\n1 2\n", None, "separate the columns by commas, semicolons or tabs"),
     "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "take this first line out"),
+    "a quote that is not closed": (
+        'time_s,channel\n0.1,a\n0.2,"b\n0.3,c\n',
+        None,
+        "line 3: expected a quote to be closed",
+    ),
     "times in milliseconds by name": ("time_ms,channel\n1,5\n", None, "bring the times of time_ms in seconds"),
     "blank": ("\n\n", None, "expected a header line"),
     "stimuli without times": (
