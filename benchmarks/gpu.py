@@ -17,6 +17,8 @@ import sys
 import time
 from typing import Any
 
+from training import finish
+
 ITERATIONS = 400_000
 POLICIES_A_CORE = 5
 CHUNKS = 8
@@ -24,7 +26,7 @@ CHUNKS = 8
 
 
 def main() -> None:
-    """Measure one number of policies after the other, then the cores, and print the table."""
+    """Measure the cores, then one number of policies after the other, and print the table."""
     parser = argparse.ArgumentParser(description="How fast a GPU trains many policies, beside the cores here.")
     parser.add_argument("--recordings", required=True)
     parser.add_argument("--policies", type=int, nargs="+", default=[4, 20, 100, 400, 1000])
@@ -36,17 +38,18 @@ def main() -> None:
             os.sched_setaffinity(0, {options.core})
         print(json.dumps(measured(options.recordings, options.measure)))
         return
-    if ended([started(options.recordings, 1)])[0]["device"] == "cpu":
+    if finish(started(options.recordings, 1))["device"] == "cpu":
         sys.exit("gpu.py: JAX finds no GPU here")
     cores = sorted(os.sched_getaffinity(0))
-    one = ended([started(options.recordings, POLICIES_A_CORE, cores[0])])[0]
-    together = ended([started(options.recordings, POLICIES_A_CORE, core) for core in cores])
+    one = finish(started(options.recordings, POLICIES_A_CORE, cores[0]))
+    running = [started(options.recordings, POLICIES_A_CORE, core) for core in cores]
+    together = [finish(each) for each in running]
     one_per_s, all_per_s = one["iterations_per_s"], sum(each["iterations_per_s"] for each in together)
     print(f"one core: {one_per_s:,.0f} iterations a second; {len(cores)} cores: {all_per_s:,.0f}\n")
     print("| policies | iterations a second | beside one core | beside all | ms a round | compiling, s | bits |")
     print("|---" * 7 + "|")
     for policies in options.policies:
-        at_once = ended([started(options.recordings, policies)])[0]
+        at_once = finish(started(options.recordings, policies))
         per_s = at_once["iterations_per_s"]
         row = (f"{per_s:,.0f}", f"{per_s / one_per_s:.1f}", f"{per_s / all_per_s:.1f}", f"{at_once['round_ms']:.2f}")
         print("|", policies, "|", " | ".join((*row, f"{at_once['first_s']:.1f}", at_once["bits"])), "|", flush=True)
@@ -59,14 +62,6 @@ def started(recordings: str, policies: int, core: int | None = None) -> subproce
     command += [] if core is None else ["--core", str(core)]
     environment = os.environ | ({} if core is None else {"JAX_PLATFORMS": "cpu"})
     return subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
-
-
-def ended(processes: list[subprocess.Popen[str]]) -> list[dict[str, Any]]:
-    """What each of them measured."""
-    told = [process.communicate()[0] for process in processes]
-    if any(process.returncode for process in processes):
-        sys.exit("gpu.py: a measurement failed")
-    return [json.loads(text.splitlines()[-1]) for text in told]
 
 
 def measured(recordings: str, policies: int) -> dict[str, Any]:

@@ -92,10 +92,9 @@ def expect_kind(what: str, given: object, kind: Any, words: str) -> None:
 def expect_several(what: str, given: Any, kind: Any, words: str) -> tuple[Any, ...]:
     """The same of several, all of one kind, which are returned; a text and a table of names are none."""
     expect_kind(what, given, Iterable, words)
-    several = () if isinstance(given, str | bytes | Mapping) else tuple(given)
-    if isinstance(given, str | bytes | Mapping) or not all(isinstance(each, kind) for each in several):
-        wrong = next((each for each in several if not isinstance(each, kind)), given)
-        raise InvalidArgument(f"{what}: expected {words}, got {shown(wrong)}")
+    several = (given,) if isinstance(given, str | bytes | Mapping) else tuple(given)
+    for each in several:
+        expect_kind(what, each, kind, words)
     return several
 
 

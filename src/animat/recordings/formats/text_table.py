@@ -127,23 +127,22 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
     first_line = text.lstrip("\r\n").partition("\n")[0]
     separator = _separator(first_line)
     reader = csv.reader(io.StringIO(text), delimiter=separator)
-    rows, lines, begins = [], [], [1]
+    rows, lines, first, after = [], [], 1, 1
     try:
         for row in reader:
             if any(cell.strip() for cell in row):
                 rows.append(row)
                 lines.append(reader.line_num)
-            begins.append(reader.line_num + 1)
+            first, after = after, reader.line_num + 1
     except csv.Error as error:
         raise InvalidFile(f"{path}: expected CSV (text in columns), got something else ({error})") from error
-    if len(begins) > 1 and begins[-1] - begins[-2] > 1:
-        # One cell of all the lines from a quote on, which a reader that is strict tells from one that is closed.
-        last = io.StringIO("".join(text.splitlines(keepends=True)[begins[-2] - 1 :]))
+    if after - first > 1:
+        # A last row of several lines: a reader that is strict tells a quote that is not closed from one that is.
         try:
-            list(csv.reader(last, delimiter=separator, strict=True))
+            list(csv.reader([*io.StringIO(text)][first - 1 :], delimiter=separator, strict=True))
         except csv.Error as error:
             if "end of data" in str(error):
-                raise InvalidFile(f"{path}, line {begins[-2]}: expected a quote to be closed, got none") from error
+                raise InvalidFile(f"{path}, line {first}: expected a quote to be closed, got none") from error
     if not rows:
         raise InvalidFile(f"{path}: expected a header line and a line an event, got an empty file")
     header = [name.strip() for name in rows[0]]
