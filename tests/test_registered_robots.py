@@ -299,7 +299,7 @@ def test_a_bad_robot_ends_in_a_line_before_anything_is_read_or_recorded(
         assert len(said) == 1 and re.search(words, said[0])
     with pytest.raises(InvalidArgument, match=words):
         run_study(Study(robots=(RobotSpec("rover", kind=at),)), package / "study")
-    assert not list((package / "study").glob("recordings/*"))
+    assert not (package / "study").exists()
 
 
 def test_an_observation_spec_that_raises_ends_in_a_line(package: Path, capsys: Any) -> None:
@@ -308,6 +308,9 @@ def test_an_observation_spec_that_raises_ends_in_a_line(package: Path, capsys: A
         assert main(command) == 1
         said = "animat: Rover.observation_spec: expected a tuple of Quantity, got ZeroDivisionError: division by zero"
         assert capsys.readouterr().err.splitlines() == [said]
+    with pytest.raises(InvalidArgument, match="observation_spec: expected a tuple of Quantity"):
+        run_study(Study(robots=(RobotSpec("rover", kind=at),)), package / "study")
+    assert not (package / "study").exists()
 
 
 def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Path) -> None:

@@ -70,6 +70,7 @@ def run_study(
     expect_workers(workers, executor)
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None
+    check_own(study.robots, [arm.mapping for arm in study.arms])
     manifest = describe_study(study, sums_of(source_files(study, base), base), gpu)
     with held(folder, "study", manifest, MANIFEST, described_beside(study)):
         jobs = plan_study(study, base)
@@ -80,7 +81,6 @@ def run_study(
                 raise InvalidFile(
                     f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
                 )
-            check_own(study.robots, [arm.mapping for arm in study.arms])
             took_s = left.run(
                 workers=workers, executor=executor, progress=progress or Silent(), has_gpu=gpu is not None
             )
