@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 
 from animat.errors import AnimatError
-from animat.recordings.apart import _reader
+from animat.recordings.apart import end_reader
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.synthetic import synthetic_recording
@@ -213,7 +213,7 @@ def main(kind: str, seed: int, count: int, folder: Path) -> None:
         if mark.exists():
             raise RuntimeError("code of the file ran")
     # The process that reads HDF5 files counts once it has ended.
-    _reader.end()
+    end_reader()
     # This process's own peak: ru_maxrss would also count what the process that started it held before.
     own = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:"))
     peak = 1024 * max(int(own.split()[1]), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)

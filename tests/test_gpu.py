@@ -416,7 +416,7 @@ def test_arms_trained_at_once_are_those_of_a_study_on_cores_where_none_shares_a_
 
 GPU_PROCESS = """
 import os, sys
-from animat.execution.worker import pin_worker
+from animat.process import pin_worker
 cores = os.sched_getaffinity(0)
 pin_worker(None)
 assert os.sched_getaffinity(0) == cores

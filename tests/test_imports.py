@@ -25,6 +25,7 @@ GROUND = (
     "lined_up",
     "marks",
     "plain_file",
+    "process",
     "progress",
     "records",
     "registry",

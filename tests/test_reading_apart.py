@@ -44,8 +44,8 @@ def test_errors_come_through_as_they_are(path: Path) -> None:
 
 def test_a_process_that_died_is_started_anew(path: Path) -> None:
     before = read_recording(path)
-    process = apart._reader._process
-    assert process is not None
+    assert apart._reader is not None
+    process = apart._reader._popen
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert read_recording(path).equals(before)
@@ -53,8 +53,8 @@ def test_a_process_that_died_is_started_anew(path: Path) -> None:
 
 def test_a_file_that_the_library_crashes_on_is_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read_recording(path)
-    process = apart._reader._process
-    assert process is not None
+    assert apart._reader is not None
+    process = apart._reader._popen
     os.kill(process.pid, signal.SIGSTOP)
     monkeypatch.setattr(apart, "WAIT_S", 0.2)
     with pytest.raises(InvalidFile, match=r"a\.nwb: .*the HDF5 library crashed on it, or took more time or memory"):
@@ -66,8 +66,8 @@ def test_a_file_that_the_library_crashes_on_is_damaged(path: Path, monkeypatch: 
 
 def test_memory_and_processor_time_are_limited(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read_recording(path)
-    process = apart._reader._process
-    assert process is not None
+    assert apart._reader is not None
+    process = apart._reader._popen
     limits = {line[:25].strip(): line.split() for line in Path(f"/proc/{process.pid}/limits").read_text().splitlines()}
     assert int(limits["Max address space"][3]) < 4 * 2**30
     assert int(limits["Max cpu time"][3]) < 60

@@ -168,7 +168,7 @@ class Interrupting:
             for child in of.read_text().split()
         ]
         # Not one that is just being forked.
-        workers = [child.name for child in begun if b"animat.execution.worker" in (child / "cmdline").read_bytes()]
+        workers = [child.name for child in begun if b"animat.process" in (child / "cmdline").read_bytes()]
         if not workers:
             return
         print(*(os.getpgid(int(worker)) == os.getpgrp() for worker in workers), flush=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,12 @@ def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> No
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
+
+
+def made_anew(record: Any) -> tuple[Any, ...]:
+    """A dataclass whose arrays are read-only, to be its `__reduce__`: they are so too where it is unpickled."""
+    values = (getattr(record, field.name) for field in fields(record))
+    return type(record), tuple(dict(value) if isinstance(value, MappingProxyType) else value for value in values)
 
 
 def briefly(record: Any) -> str:

@@ -18,7 +18,7 @@ from animat.execution.dask_worker import work
 _PATIENCE_S = 10.0
 _RUN = """
 import runpy, sys
-from animat.execution.worker import end_with_parent
+from animat.process import end_with_parent
 end_with_parent()
 runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 """

@@ -80,7 +80,8 @@ def digest_of(path: Path) -> str:
     """
     if path.suffix != ".nwb":
         return sha256(path)
-    from animat.recordings.apart import packed, read_hdf5_apart
+    from animat.recordings.apart import read_hdf5_apart
+    from animat.recordings.told import packed
 
     return hashlib.sha256(packed(read_hdf5_apart(path))).hexdigest()
 
