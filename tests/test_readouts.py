@@ -144,8 +144,10 @@ def test_names_of_readouts_are_known_or_refused(recording: Recording) -> None:
     assert readouts_on("all", recording.channels) == ALL
     with pytest.raises(InvalidArgument, match="expected all, halves, quadrants or groups of electrodes, got 'thirds'"):
         readouts_on("thirds", recording.channels)
-    with pytest.raises(InvalidArgument, match=r"^readouts: expected the numbers of some electrodes"):
+    with pytest.raises(InvalidArgument, match=r"^electrodes: expected a list, got 1$"):
         Readouts(("a", "b"), (1, 2))  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match=r"^names: expected one .*of 0 groups of .*, got \('a',\)$"):
+        Readouts(("a",))
 
 
 def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
@@ -161,21 +163,38 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["[[1], [2]]", "{}", "null", '{"a": []}', '{"a": [1.5]}', '{"": [1]}', "{", '{"a": 1}', '{"a": [1], "a": [2]}'],
+    ("text", "told"),
+    [
+        ("[[1], [2]]", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
+        ("null", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
+        ("{", ": expected JSON, got a mistake"),
+        ("{}", ".names: expected at least 1, got"),
+        ('{"a": []}', ".a: expected at least 1, got"),
+        ('{"a": [1], "b": [1.5]}', ".b: expected a whole number, got 1.5"),
+        ('{"a": 1}', ".a: expected a list, got 1"),
+        ('{"": [1]}', ".names: expected at least 1 character, got ''"),
+        ('{"a": [1], "a": [2]}', ": expected each name once, got a twice"),
+        ('{"\\n": [1]}', ".names: expected one in letters"),
+    ],
 )
-def test_a_file_of_no_readouts_is_named(text: str, tmp_path: Path) -> None:
+def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) -> None:
     (tmp_path / "groups.json").write_text(text)
-    with pytest.raises(InvalidFile, match=r"groups.json: readouts: expected ") as raised:
+    with pytest.raises(InvalidFile) as raised:
         read_readouts(tmp_path / "groups.json")
-    assert "\n" not in str(raised.value)
+    assert f"groups.json: readouts{told}" in str(raised.value) and "\n" not in str(raised.value)
     with pytest.raises(InvalidFile, match="names are all, halves and quadrants"):
         read_readouts("thirds")
 
 
 @pytest.mark.parametrize(
-    "data", [5, {"names": ["a"]}, {"names": "ab", "electrodes": [[1], [2]]}, {"names": ["a"], "electrodes": [1]}]
+    ("data", "told"),
+    [
+        (5, ": expected a table, got 5"),
+        ({"names": ["a"]}, ".names: expected one in letters for each of 0 groups"),
+        ({"names": "ab", "electrodes": [[1], [2]]}, ".names: expected a list, got 'ab'"),
+        ({"names": ["a"], "electrodes": [1]}, ".electrodes: expected a list, got 1"),
+    ],
 )
-def test_data_of_no_readouts_are_refused(data: object) -> None:
-    with pytest.raises(InvalidArgument, match=r"^readouts: expected "):
+def test_data_of_no_readouts_are_refused(data: object, told: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"^readouts{told}"):
         Readouts.from_dict(data)

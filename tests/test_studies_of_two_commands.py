@@ -137,10 +137,12 @@ def test_what_does_not_go_together_is_refused_before_anything_is_recorded(
         replace(STUDY, **changed)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("readouts", ["thirds", "[1, 2]", '{"left": []}', '{"left": [1], "left": [2]}', "{"])
+@pytest.mark.parametrize("readouts", ["thirds", "[1, 2]", '{"left": [1], "left": [2]}', "{"])
 def test_readouts_that_are_none_are_refused(readouts: str) -> None:
     with pytest.raises(InvalidArgument, match="readouts: expected"):
         Simulators(readouts=readouts)
+    with pytest.raises(InvalidArgument, match=r"readouts\.left: expected at least 1, got"):
+        Simulators(readouts='{"left": []}')
 
 
 def test_a_virtual_culture_is_stimulated_at_places() -> None:

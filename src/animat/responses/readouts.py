@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from pydantic import Field
 
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.plain_file import read_plain_text
 from animat.recordings.recording import Channels
-from animat.records import in_file, json_data
+from animat.records import in_file, json_data, read_record, record
 from animat.responses.windows import Spiking, spikes_in
 from animat.stimulation.places import CUT, count_places, electrodes_of
+from animat.stimulation.selection import Electrode
 from animat.tables import UNKNOWN
 
 _NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
@@ -25,8 +25,11 @@ MOST_READOUTS = 64
 USUAL_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
 """By how many commands a robot takes."""
 
+Group = Annotated[tuple[Electrode, ...], Field(min_length=1)]
+Name = Annotated[str, Field(min_length=1, max_length=40)]
 
-@dataclass(frozen=True)
+
+@record
 class Readouts:
     """Named groups of channels; by default one of all channels (the paper).
 
@@ -39,27 +42,19 @@ class Readouts:
         InvalidArgument: for names or electrodes that are none, or names without electrodes.
     """
 
-    names: tuple[str, ...] = ("all",)
-    electrodes: tuple[tuple[int, ...], ...] | None = None
+    names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_READOUTS)] = ("all",)
+    electrodes: tuple[Group, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.electrodes is None:
-            if self.names != ("all",):
-                raise InvalidArgument(f"readouts: expected electrodes of each of {shown(self.names)}, got none")
+        if self.electrodes is None and self.names == ("all",):
             return
-        is_named = all(isinstance(name, str) and 0 < len(name) <= 40 and name.isprintable() for name in self.names)
-        if not is_named or len(set(self.names)) < len(self.names) or not 0 < len(self.names) <= MOST_READOUTS:
+        groups = [tuple(sorted(set(group))) for group in self.electrodes or ()]
+        if not len(set(self.names)) == len(self.names) == len(groups) or not all(map(str.isprintable, self.names)):
             raise InvalidArgument(
-                f"readouts: expected 1 to {MOST_READOUTS} names, each once, of 1 to 40 letters, got {shown(self.names)}"
+                f"names: expected one in letters for each of {len(groups)} groups of electrodes, each once, got "
+                f"{shown(self.names)}"
             )
-        groups = [tuple(group) if isinstance(group, list | tuple) else () for group in self.electrodes]
-        are_electrodes = all(group and all(type(e) is int and 0 <= e < 2**63 for e in group) for group in groups)
-        if len(groups) != len(self.names) or not are_electrodes:
-            raise InvalidArgument(
-                f"readouts: expected the numbers of some electrodes for each of {len(self.names)} groups, got "
-                f"{shown(self.electrodes)}"
-            )
-        object.__setattr__(self, "electrodes", tuple(tuple(sorted(set(group))) for group in groups))
+        object.__setattr__(self, "electrodes", tuple(groups))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -130,38 +125,15 @@ class Readouts:
         Raises:
             InvalidArgument: for anything else.
         """
-        if data is None:
-            return cls()
-        if not (isinstance(data, Mapping) and set(data) == {"names", "electrodes"}):
-            raise InvalidArgument(f"readouts: expected names and electrodes, got {shown(data)}")
-        names, groups = data["names"], data["electrodes"]
-        if not (isinstance(names, list) and isinstance(groups, list) and all(isinstance(g, list) for g in groups)):
-            raise InvalidArgument(f"readouts: expected lists of names and of electrodes, got {shown(data)}")
-        return cls(tuple(names), tuple(map(tuple, groups)))
+        return cls() if data is None else read_record(cls, data, "readouts")
 
 
 ALL = Readouts()
 """One readout of all channels: the paper's."""
 
 
-def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
-    """The name of readouts (`all`, `halves`, `quadrants`), or groups as JSON, also in a file: `{"left": [1, 2]}`.
-
-    Raises:
-        InvalidFile: naming the file, what was expected and what came.
-    """
-    if text == "all" or text in CUT or str(text).lstrip().startswith("{"):
-        return readouts_named(str(text))
-    try:
-        written = read_plain_text(text, _MOST_BYTES)
-    except InvalidFile as error:
-        raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(CUT)}") from error
-    with in_file(text):
-        return _groups(written)
-
-
 def readouts_named(text: str) -> str | Readouts:
-    """The same by a name, or by the groups themselves as JSON: what a study's file says of them.
+    """The name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`.
 
     Raises:
         InvalidArgument: for anything else.
@@ -173,18 +145,24 @@ def readouts_named(text: str) -> str | Readouts:
             f"readouts: expected all, {', '.join(CUT)}, or groups of electrodes as JSON, "
             f'{{"left": [1, 2], "right": [3, 4]}}, got {shown(text)}'
         )
-    return _groups(text)
+    groups = read_record(dict[str, Group], json_data(text, "readouts"), "readouts")
+    return read_record(Readouts, {"names": list(groups), "electrodes": list(groups.values())}, "readouts")
 
 
-def _groups(written: str) -> Readouts:
-    """Readouts from JSON."""
-    data = json_data(written, "readouts")
-    if not (isinstance(data, dict) and data and all(isinstance(group, list) for group in data.values())):
-        raise InvalidArgument(
-            f'readouts: expected electrodes by the names of groups, {{"left": [1, 2], "right": [3, 4]}}, got '
-            f"{shown(data)}"
-        )
-    return Readouts(tuple(data), tuple(map(tuple, data.values())))
+def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
+    """The same, also in a file.
+
+    Raises:
+        InvalidFile: naming the file, what was expected and what came.
+    """
+    if text == "all" or text in CUT or str(text).lstrip().startswith("{"):
+        return readouts_named(str(text))
+    try:
+        written = read_plain_text(text, _MOST_BYTES)
+    except InvalidFile as error:
+        raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(CUT)}") from error
+    with in_file(text):
+        return readouts_named(written)
 
 
 def count_readouts(readouts: str | Readouts) -> int:
