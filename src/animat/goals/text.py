@@ -18,8 +18,13 @@ from animat.goals.goal import KINDS, Goal, Objective
 from animat.goals.region import Ball, Range
 
 _TOKEN = re.compile(r"\.\.|,|[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?|[^\W\d][^\s,;]*|\S")
-_RELATIONS = ("in", "outside", "above", "below", "around")
-_AFTER = ("and", "within", "weight")
+_N = r"[-+]?\.?\d\S*"
+_QUANTITY = r"(?!(?:in|outside|above|below|around|and|within|weight) )[^\W\d]\S*"
+_UNIT = r"(?: (?!(?:and|within|weight)$)(\S+))?"
+_BETWEEN = re.compile(rf"({_QUANTITY}) (in|outside) ({_N}) \.\. ({_N}){_UNIT}")
+_BEYOND = re.compile(rf"({_QUANTITY}) (above|below) ({_N}){_UNIT}")
+_AROUND = re.compile(rf"({_QUANTITY}(?: , {_QUANTITY})*) around ({_N}(?: , {_N})*) radius ({_N}){_UNIT}")
+"""The forms of a region's part, in words, numbers and signs with a space between each."""
 _EXAMPLE = "avoid pole_angle outside -12..12 deg"
 
 
@@ -37,7 +42,7 @@ def read_goal(text: Any) -> Goal:
     objectives = []
     for clause in clauses:
         try:
-            objectives.append(_Clause(clause).objective())
+            objectives.append(_objective(" ".join(_TOKEN.findall(clause))))
         except InvalidArgument as error:
             raise InvalidArgument(f"goal: {clause[:200]!r}: {error}") from error
     try:
@@ -46,76 +51,35 @@ def read_goal(text: Any) -> Goal:
         raise InvalidArgument(f"goal: {error}") from error
 
 
-class _Clause:
-    """The words of an objective, taken one after the other."""
+def _objective(text: str) -> Objective:
+    kind, _, rest = text.partition(" ")
+    if kind not in KINDS:
+        raise InvalidArgument(f"expected {' or '.join(KINDS)}, got {shown(kind)}{did_you_mean(kind, KINDS)}")
+    region, *after = re.split(" (within|weight) ", rest)
+    parts = tuple(map(_part, region.split(" and ")))
+    options: dict[str, Any] = {}
+    for name, value in zip(after[::2], after[1::2], strict=True):
+        if name in options or not re.fullmatch(_N, value):
+            raise InvalidArgument(
+                f"expected within and weight once, each with a number, got {shown(f'{name} {value}')}"
+            )
+        number = float(value)
+        options[name] = int(number) if name == "within" and number.is_integer() else number
+    return Objective(kind, parts, **options)  # type: ignore[arg-type]
 
-    def __init__(self, clause: str) -> None:
-        self._left: list[str] = _TOKEN.findall(clause)[::-1]
 
-    def objective(self) -> Objective:
-        kind = self._one_of(KINDS)
-        region = [self._part()]
-        while self._follows("and"):
-            region.append(self._part())
-        options: dict[str, Any] = {}
-        while self._left:
-            name = self._one_of([each for each in _AFTER if each not in options])
-            if name == "and":
-                raise InvalidArgument("expected parts of a region before within and weight, got 'and' after them")
-            value = self._number()
-            options[name] = int(value) if name == "within" and value.is_integer() else value
-        return Objective(kind, tuple(region), **options)  # type: ignore[arg-type]
-
-    def _part(self) -> Range | Ball:
-        names = [self._word("a quantity")]
-        while self._follows(","):
-            names.append(self._word("a quantity"))
-        relation = self._one_of(_RELATIONS if len(names) == 1 else ("around",))
-        if relation == "around":
-            centre = [self._number()]
-            while self._follows(","):
-                centre.append(self._number())
-            self._one_of(("radius",))
-            return Ball(tuple(names), tuple(centre), self._number(), self._unit())
-        first = self._number()
-        if relation == "above":
-            return Range(names[0], first, None, self._unit())
-        if relation == "below":
-            return Range(names[0], None, first, self._unit())
-        self._one_of(("..",))
-        return Range(names[0], first, self._number(), self._unit(), relation == "outside")
-
-    def _take(self, expected: str) -> str:
-        if not self._left:
-            raise InvalidArgument(f"expected {expected}, got nothing more")
-        return self._left.pop()
-
-    def _one_of(self, known: tuple[str, ...] | list[str]) -> str:
-        word = self._take(" or ".join(known))
-        if word not in known:
-            raise InvalidArgument(f"expected {' or '.join(known)}, got {shown(word)}{did_you_mean(word, known)}")
-        return word
-
-    def _follows(self, word: str) -> bool:
-        if self._left[-1:] != [word]:
-            return False
-        self._left.pop()
-        return True
-
-    def _word(self, expected: str) -> str:
-        word = self._take(expected)
-        if not (word[0].isalpha() or word[0] == "_") or word in (*_RELATIONS, *_AFTER):
-            raise InvalidArgument(f"expected {expected}, got {shown(word)}")
-        return word
-
-    def _number(self) -> float:
-        word = self._take("a number")
-        try:
-            return float(word)
-        except ValueError:
-            raise InvalidArgument(f"expected a number, got {shown(word)}") from None
-
-    def _unit(self) -> str:
-        if not self._left or self._left[-1] in _AFTER:
-            return ""
-        return self._take("a unit")
+def _part(text: str) -> Range | Ball:
+    if found := _BETWEEN.fullmatch(text):
+        name, relation, low, high, unit = found.groups("")
+        return Range(name, float(low), float(high), unit, relation == "outside")
+    if found := _BEYOND.fullmatch(text):
+        name, relation, end, unit = found.groups("")
+        is_above = relation == "above"
+        return Range(name, float(end) if is_above else None, None if is_above else float(end), unit)
+    if found := _AROUND.fullmatch(text):
+        names, centre, radius, unit = found.groups("")
+        return Ball(tuple(names.split(" , ")), tuple(map(float, centre.split(" , "))), float(radius), unit)
+    raise InvalidArgument(
+        f"expected a region: QUANTITY in LOW..HIGH UNIT, or outside; QUANTITY above NUMBER UNIT, or below; QUANTITY, "
+        f"QUANTITY around NUMBER, NUMBER radius NUMBER UNIT; several joined by and; got {shown(text)}"
+    )
