@@ -61,16 +61,16 @@ def test_who_drives_straight_to_the_goal_bumps_and_never_gets_there() -> None:
     assert np.mean(np.asarray(last) == -2) > 0.95 and np.mean(np.asarray(arrived)) < 0.05
 
 
-def test_ways_are_as_near_to_things_as_the_nearest_of_many_places_on_them() -> None:
-    around = Surroundings(((0.0, 0.0, 0.5, 0.2), (0.3, 0.7, 0.3, 0.7), (0.1, 0.9, 0.1, 0.4)), ((0.8, 0.8, 0.1),))
-    ends, start = np.random.default_rng(3).uniform(-0.2, 1.2, (300, 2)), (0.35, 0.3)
-    along = np.linspace(0, 1, 4001)[:, None]
-    near = around.clearance_m(*(start[axis] + along * (ends[:, axis] - start[axis]) for axis in (0, 1))).min(axis=0)
-    found = around.on_ways_m(start, ends)
-    met = near < 1e-3
-    np.testing.assert_allclose(found[~met], near[~met], atol=1e-4)
-    assert met.sum() > 50 and (found[met] < 1e-3).all()
-    assert around.on_ways_m(start, np.array([start])) == pytest.approx(around.clearance_m(*np.array(start)[:, None]))
+def test_goals_in_oblique_surroundings_are_where_a_body_touches_something_at_one_of_many_places_on_the_way() -> None:
+    walls = (*ROBOT.walls[:4], (0.1, 0.15, 0.6, 0.35), (0.3, 0.7, 0.3, 0.7), (0.9, 0.3, 0.7, 0.55))
+    robot = Detour(walls=walls, obstacles=((0.8, 0.8, 0.1),), start_x_m=0.45)
+    places, start, along = Wheels(**vars(robot))._goals_m, (0.45, 0.5), np.linspace(0, 1, 2001)[:, None]
+    ways = (start[axis] + along * (places[:, axis] - start[axis]) for axis in (0, 1))
+    near = Surroundings(robot.walls, robot.obstacles).clearance_m(*ways).min(axis=0)
+    drawn = set(map(tuple, robot._goals_m.tolist()))
+    told = np.abs(near - 0.035) > 1e-4
+    assert [tuple(place) in drawn for place in places[told].tolist()] == (near[told] < 0.035).tolist()
+    assert 0.2 * len(places) < len(drawn) < 0.8 * len(places) and told.mean() > 0.99
 
 
 def test_its_body_is_that_of_wheels() -> None:

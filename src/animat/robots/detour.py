@@ -10,7 +10,7 @@ from jaxtyping import Float
 from animat.errors import InvalidArgument
 from animat.records import record
 from animat.robots.registry import register_robot
-from animat.robots.surroundings import Obstacles, Walls
+from animat.robots.surroundings import Obstacles, Surroundings, Walls
 from animat.robots.wheeled import ARENA, Wheeled
 
 _NEAR_M, _FAR_M, _LEFT_M, _RIGHT_M = 0.29, 0.71, 0.42, 0.58
@@ -69,6 +69,19 @@ class Detour(Wheeled):
 
     @property
     def _goals_m(self) -> Float[np.ndarray, "goals 2"]:
-        """Of the places within reach, those that the robot cannot drive straight to."""
-        places = super()._goals_m
-        return places[self._around.on_ways_m((self.start_x_m, self.start_y_m), places) < self.body_radius_m]
+        """Of the places within reach, those that the robot cannot drive straight to.
+
+        Both ends of a way are free. So where its body touches a wall, its centre crosses that, or a disc of the body's
+        radius around an end of it.
+        """
+        places, radius_m = super()._goals_m, self.body_radius_m
+        discs = [(x_m, y_m, r_m + radius_m) for x_m, y_m, r_m in self.obstacles]
+        discs += [(x_m, y_m, radius_m) for wall in self.walls for x_m, y_m in (wall[:2], wall[2:])]
+        touching, start_m = Surroundings(self.walls, tuple(discs)), np.array([self.start_x_m, self.start_y_m])
+        are_blocked = []
+        # A few at once: of a million places and 200 walls there would be no room for all.
+        for ends_m in np.array_split(places, 1 + len(places) // 10_000):
+            x_m, y_m = (ends_m - start_m).T
+            free_m = touching.along_rays_m(start_m[0], start_m[1], np.arctan2(y_m, x_m))
+            are_blocked.append(free_m < np.hypot(x_m, y_m))
+        return np.asarray(places[np.concatenate(are_blocked)])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from animat.late import Array, jnp
+from animat.late import Array
 from animat.records import Number
 from animat.robots.base import Size
 
@@ -49,39 +49,6 @@ class Surroundings(NamedTuple):
             apart = xp.minimum(apart, xp.hypot(x_m - x, y_m - y) - radius)
         return apart
 
-    def on_ways_m(
-        self, start_m: tuple[float, float], ends_m: Float[np.ndarray, "ways 2"]
-    ) -> Float[np.ndarray, " ways"]:
-        """How near straight ways from a place come to a wall or an obstacle; 0 or less where one is met.
-
-        A way and a wall that do not cross are nearest at an end of one of them.
-
-        Args:
-            start_m: where all ways begin.
-            ends_m: where each one ends.
-        """
-        start, along = np.array(start_m), ends_m - start_m
-        squared = np.maximum((along**2).sum(axis=1), 1e-18)
-
-        def apart_m(point: tuple[float, float]) -> Float[np.ndarray, " ways"]:
-            nearest = np.clip((point - start) @ along.T / squared, 0.0, 1.0)
-            x_m, y_m = (start + nearest[:, None] * along - point).T
-            return np.hypot(x_m, y_m)  # type: ignore[no-any-return]
-
-        def side(of: Float[np.ndarray, "*any 2"], way: Float[np.ndarray, "*any 2"]) -> Float[np.ndarray, " *any"]:
-            return np.sign(way[..., 0] * of[..., 1] - way[..., 1] * of[..., 0])  # type: ignore[no-any-return]
-
-        near = np.minimum(self.clearance_m(*ends_m.T), self.clearance_m(*start[:, None]))
-        for wall in self.walls:
-            a, b = np.array(wall[:2]), np.array(wall[2:])
-            near = np.minimum(near, np.minimum(apart_m(wall[:2]), apart_m(wall[2:])))
-            crossed = side(a - start, along) * side(b - start, along) < 0
-            crossed &= side(start - a, b - a) * side(ends_m - a, b - a) < 0
-            near = np.where(crossed, 0.0, near)
-        for x, y, radius in self.obstacles:
-            near = np.minimum(near, apart_m((x, y)) - radius)
-        return near
-
     def along_rays_m(
         self, x_m: Float[Array, ""], y_m: Float[Array, ""], directions_rad: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
@@ -89,28 +56,29 @@ class Surroundings(NamedTuple):
 
         A ray from p along the unit vector d meets the wall from a to b at t = (a - p) x (b - a) / d x (b - a), where
         that is at least 0 and s = (a - p) x d / d x (b - a) lies in [0, 1]; and the circle about c with radius r at
-        t = h - sqrt(h^2 - |c - p|^2 + r^2) with h = (c - p) . d, at 0 from within.
+        t = h - sqrt(h^2 - |c - p|^2 + r^2) with h = (c - p) . d, at 0 from within. All are of numpy, or all of JAX.
         """
-        dx, dy = jnp.cos(directions_rad), jnp.sin(directions_rad)
-        nearest = jnp.full(directions_rad.shape, math.inf, dx.dtype)
+        xp = directions_rad.__array_namespace__()
+        dx, dy = xp.cos(directions_rad), xp.sin(directions_rad)
+        nearest: Array = xp.full_like(dx, math.inf)
         if self.walls:
-            x1, y1, x2, y2 = (jnp.asarray(of, dx.dtype)[:, None] for of in zip(*self.walls, strict=True))
+            x1, y1, x2, y2 = (xp.asarray(of, dtype=dx.dtype)[:, None] for of in zip(*self.walls, strict=True))
             cross = dx * (y2 - y1) - dy * (x2 - x1)
-            met = jnp.abs(cross) > 1e-9
-            cross = jnp.where(met, cross, 1.0)
+            met = xp.abs(cross) > 1e-9
+            cross = xp.where(met, cross, 1.0)
             t = ((x1 - x_m) * (y2 - y1) - (y1 - y_m) * (x2 - x1)) / cross
             s = ((x1 - x_m) * dy - (y1 - y_m) * dx) / cross
             # A ray into a corner must not slip between two walls.
             met &= (t >= 0) & (s >= -1e-6) & (s <= 1 + 1e-6)
-            nearest = jnp.minimum(nearest, jnp.min(jnp.where(met, t, math.inf), axis=0))
+            nearest = xp.minimum(nearest, xp.min(xp.where(met, t, math.inf), axis=0))
         if self.obstacles:
-            x, y, radius = (jnp.asarray(of, dx.dtype)[:, None] for of in zip(*self.obstacles, strict=True))
+            x, y, radius = (xp.asarray(of, dtype=dx.dtype)[:, None] for of in zip(*self.obstacles, strict=True))
             ahead = (x - x_m) * dx + (y - y_m) * dy
             outside = (x - x_m) ** 2 + (y - y_m) ** 2 - radius**2
             under = ahead**2 - outside
             met = (under >= 0) & (ahead >= 0) & (outside > 0)
-            t = jnp.where(met, ahead - jnp.sqrt(jnp.maximum(under, 0.0)), math.inf)
-            nearest = jnp.minimum(nearest, jnp.min(jnp.where(outside <= 0, 0.0, t), axis=0))
+            t = xp.where(met, ahead - xp.sqrt(xp.maximum(under, 0.0)), math.inf)
+            nearest = xp.minimum(nearest, xp.min(xp.where(outside <= 0, 0.0, t), axis=0))
         return nearest
 
     def box_m(self) -> tuple[float, float, float, float]:
