@@ -197,7 +197,7 @@ tell(window=float(np.mean(window)), rest=rest, stimuli=len(window))
 
 def test_a_closed_loop_runs_on_it_and_the_sdks_own_file_has_the_same_pulses(tmp_path: Path) -> None:
     script = """
-from animat.closed_loop.agents import controls
+from animat.closed_loop.agents import random_control
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import mapping_named
@@ -208,7 +208,7 @@ pulse = Pulse((Phase(160, amplitude_ua=-2.0), Phase(160, amplitude_ua=2.0)))
 frequencies = tuple(Condition(f"{f} Hz", float(f), "Hz") for f in (20, 40, 80))
 percentiles = np.linspace(0, 100, 11)
 loop = Loop(robot_named("cartpole"), mapping_named("1-threshold"), frequencies, percentiles, pulses=5, pulse=pulse)
-agents = controls(loop.robot, [c.label for c in frequencies], means=None)[:1]
+agents = [random_control(len(frequencies))]
 with CL1Culture(record_to="rig") as culture:
     session = run_session(culture, loop, agents, "session", episodes=2)
 if session.ending.by != "plan":

@@ -2,29 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.agents import Agent, AnyCondition, OneCondition, interventions
+from animat.closed_loop.agents import ActorController, Agent, AnyCondition, InTurn, agent_of
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.closed_loop.tick import Tick
+from animat.coding.mapping import Thresholds
+from animat.environment import Animat
 from animat.errors import InvalidArgument
-from animat.robots import Cartpole, Shuttle
-from fake_culture import FakeCulture
+from animat.evaluation.controls import controls_of, interventions_of
+from animat.evaluation.rollouts import Actor
+from animat.neurons.synthetic import synthetic_simulator
+from animat.robots import Cartpole, Robot, Shuttle
+from fake_culture import FakeCulture, OneCondition
 from test_closed_loop import loop_of
+from test_whose_work import linear_networks
 
 POOL_HZ = np.array([1.5, 2.5, 3.5, 60.0])
 POLICIES = {"p0": AnyCondition(5), "p1": OneCondition(3)}
 ROBOT = Shuttle(episode_limit=12)
+SIMULATOR = synthetic_simulator()
+
+
+def changed(robot: Robot[Any]) -> list[Agent]:
+    """The interventions that a culture has a part in, as agents."""
+    environment, networks = Animat(robot, Thresholds(1), 5), linear_networks(np.zeros((len(robot.observation_spec), 5)))
+    found = interventions_of(environment, SIMULATOR, networks, 1, switch_at=5)
+    asked = ("random spikes", "yoked", "turned round", "goal switched")
+    return [agent_of(each, environment, POLICIES, POOL_HZ) for each in found if each.name in asked]
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     agents = [Agent(name, "as trained", who) for name, who in POLICIES.items()]
-    agents += interventions(ROBOT, POLICIES, POOL_HZ, switch_at=5)
+    agents += changed(ROBOT)
     with FakeCulture() as culture:
         return run_session(culture, loop_of(robot=ROBOT), agents, tmp_path_factory.mktemp("loop"), episodes=6, seed=2)
 
@@ -75,10 +94,48 @@ def test_a_goal_is_switched_once_to_that_of_another_start(session: Session) -> N
 
 
 def test_a_robot_with_one_goal_has_none_switched_and_yoked_ones_need_a_source(tmp_path: Path) -> None:
-    agents = interventions(Cartpole(), POLICIES, POOL_HZ, switch_at=5)
+    agents = changed(Cartpole())
     assert [agent.name for agent in agents] == ["random spikes", "yoked", "turned round"]
     with (
         FakeCulture() as culture,
         pytest.raises(InvalidArgument, match="expected episodes that 'yoked' could repeat, got none"),
     ):
         run_session(culture, loop_of(), agents, tmp_path, episodes=1)
+
+
+def test_controls_of_a_simulator_are_agents_of_a_loop() -> None:
+    environment = Animat(Cartpole(), Thresholds(1), 5)
+    networks = linear_networks(np.zeros((4, 5)))
+    found = controls_of(environment, SIMULATOR, list("abcde"), networks, 1)
+    agents = {each.name: agent_of(each, environment, POLICIES, POOL_HZ) for each in found}
+    assert [*agents] == ["random", *(f"constant {x}" for x in "abcde"), "heuristic", "silent", "shuffled"]
+    rng = np.random.default_rng(1)
+    seen = np.array([0.0, 0.0, 0.05, 0.0])
+    assert [agents[f"constant {x}"].controller.act(seen, rng) for x in "abcde"] == [0, 1, 2, 3, 4]
+    assert [agents["heuristic"].controller.act(sign * seen, rng) for sign in (1, -1)] == [4, 0]
+    for name in ("silent", "shuffled"):
+        assert isinstance(who := agents[name].controller, InTurn) and who.by_name == POLICIES
+        assert agents[name].delivery == name
+    assert [name for name, agent in agents.items() if not agent.calibrates] == [f"constant {x}" for x in "abcde"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Drawing(Actor):
+    """Condition 4 in so many cases, else condition 1."""
+
+    share: Any
+
+    def act(self, environment: Any, observation: Any, uniforms: Any) -> Any:
+        return jnp.where(uniforms[:, 0] < self.share, 4, 1)
+
+
+def test_an_actor_s_draws_leave_the_other_draws_of_a_loop_as_they_are() -> None:
+    acts = ActorController(Drawing(jnp.array([0.25])), Animat(Cartpole(), Thresholds(1), 5))
+    rng, alone = np.random.default_rng(1), np.random.default_rng(1)
+    chosen = np.array([acts.act(np.zeros(4), rng) for _ in range(2000)])
+    assert set(chosen) == {1, 4} and abs(np.mean(chosen == 4) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 2000)
+    assert rng.random() == alone.random()
+    # The same seed draws the same.
+    again = np.random.default_rng(1)
+    assert [acts.act(np.zeros(4), again) for _ in range(50)] == chosen[:50].tolist()

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.agents import HeuristicController
+from animat.closed_loop.agents import ActorController
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
@@ -292,9 +292,10 @@ def test_a_heuristic_s_command_is_one(wanted: float) -> None:
 def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: float, nearest: int) -> None:
     robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
     means = (-0.4, 0.1, 0.4)
-    assert HeuristicController(robot, means).act(np.zeros(1), np.random.default_rng()) == nearest
     environment = Animat(robot, Thresholds(1), 3)
     rule = HeuristicPolicy(jnp.arange(3), jnp.asarray(means, jnp.float32))
+    one = jax.tree.map(lambda x: x[None], rule)
+    assert ActorController(one, environment).act(np.zeros(1), np.random.default_rng()) == nearest
     assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros((1, 1))).tolist() == [nearest]
 
 

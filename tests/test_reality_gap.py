@@ -19,7 +19,7 @@ from scipy.stats import mannwhitneyu
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import CouplingController, HeuristicController
+from animat.closed_loop.agents import ActorController
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.cultures.budget import Account, Budget
@@ -519,9 +519,10 @@ def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[
         rule = heuristic_policy(environment, simulator)
         assert int(np.argmax(rule.means)) == 4
         observed = rng.uniform(low, high, (500, len(low)))
-        rule = jax.tree.map(lambda x: x[0], rule)
-        predicted = rule.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
-        chosen = [HeuristicController(robot, tuple(np.ravel(rule.means).tolist())).act(o, rng) for o in observed]
+        one = jax.tree.map(lambda x: x[0], rule)
+        predicted = one.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))
+        acts = ActorController(rule, environment)
+        chosen = [acts.act(o, rng) for o in observed]
         np.testing.assert_array_equal(np.asarray(predicted), chosen)
 
 
@@ -532,7 +533,7 @@ def test_a_coupling_is_the_same_on_simulator_and_culture(kind: Literal["graded",
     weights, means = rng.normal(size=(1, 1, 3)), np.linspace(-0.8, 0.8, 5)[None]
     floats = (jnp.asarray(each, jnp.float32) for each in (weights, means))
     coupling = Coupling(next(floats), jnp.arange(5)[None], next(floats), kind, (0, 1))
-    acts = CouplingController(coupling, environment.scales)
+    acts = ActorController(coupling, environment)
     observed = rng.uniform(-0.5, 0.5, (500, 3))
     one = jax.tree.map(lambda x: x[0], coupling)
     predicted = one.act(environment, jnp.asarray(observed / environment.scales, jnp.float32), jnp.zeros((500, 1)))

@@ -20,15 +20,15 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import Agent, HeuristicController, OneCondition, random_control
+from animat.closed_loop.agents import ActorController, Agent, random_control
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
-from animat.environment import WithoutNeurons
+from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.evaluation.heuristic import Heuristic
+from animat.evaluation.heuristic import Heuristic, HeuristicPolicy
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -45,7 +45,7 @@ from animat.robots.registry import REGISTRY
 from animat.stimulation.protocol import Protocol
 from animat.training.policy import Policy
 from animat.training.specification import Training
-from fake_culture import CHANNELS, FakeCulture
+from fake_culture import CHANNELS, FakeCulture, OneCondition
 from test_training import SMALL
 from two_wheels import FILE, Wheels
 
@@ -92,11 +92,12 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         warm_up=1,
         readouts=timeline.readouts,
     )
-    means = tuple((0.2 * i - 0.4, 0.4 - 0.2 * i) for i in range(5))
+    means = jnp.array([[(0.2 * i - 0.4, 0.4 - 0.2 * i) for i in range(5)]])
+    rule = ActorController(HeuristicPolicy(jnp.arange(5)[None], means), Animat(loop.robot, loop.mapping, 5))
     agents = [
         random_control(5),
         Agent("constant", "", OneCondition(3), calibrates=False),
-        Agent("heuristic", "", HeuristicController(loop.robot, means)),
+        Agent("heuristic", "", rule),
         Agent("silent", "", OneCondition(0), "silent"),
     ]
     with FakeCulture(3) as culture:
@@ -282,7 +283,9 @@ def test_the_heuristic_policy_takes_the_nearest_in_the_plane() -> None:
     means = ((-1.0, -1.0), (0.9, -0.2), (1.0, 1.0))
     for wanted, nearest in (((0.2, -0.9), 1), ((0.3, 0.9), 2), ((-1.0, -0.1), 0)):
         robot = changed(heuristic=lambda self, seen, wanted=wanted: np.array(wanted))
-        assert HeuristicController(robot, means).act(np.zeros(3), np.random.default_rng()) == nearest
+        rule = HeuristicPolicy(jnp.arange(3)[None], jnp.asarray(means, jnp.float32)[None])
+        acts = ActorController(rule, Animat(robot, Thresholds(1), 3))
+        assert acts.act(np.zeros(3), np.random.default_rng()) == nearest
 
 
 def test_thresholds_adapt_to_every_readout_on_its_own() -> None:

@@ -81,7 +81,7 @@ def episodes_of(environment: Any, simulator: Any = SIMULATOR, actor: Actor = BES
 def test_each_intervention_does_what_it_says() -> None:
     usual = episodes_of(ENVIRONMENT)
     found = {each.name: each for each in interventions_of(ENVIRONMENT, SIMULATOR, BEST, 1, switch_at=4)}  # type: ignore[arg-type]
-    returns = {name: episodes_of(each.environment, each.simulator) for name, each in found.items()}
+    returns = {name: episodes_of(*each.within(ENVIRONMENT, SIMULATOR)) for name, each in found.items()}
     assert [*found] == [
         "ideal actuator", "random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched"
     ]  # fmt: skip

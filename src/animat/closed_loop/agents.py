@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from functools import partial
+from typing import Any, Protocol
 
+import jax
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Array, Float, Float32, Float64
 
-from animat.robots.base import Robot, capability
-
-LoopDelivery = Literal["chosen", "shuffled", "silent", "yoked"]
-"""What the culture is given; a training (`animat.wrappers.Delivery`) has the first two alone."""
+from animat.environment import Environment
+from animat.evaluation.controls import RANDOM, Control, Delivered
+from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 
 class Controller(Protocol):
@@ -34,17 +35,6 @@ class AnyCondition:
 
 
 @dataclass(frozen=True)
-class OneCondition:
-    """One condition always: the constant control."""
-
-    condition: int
-
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The same as ever."""
-        return self.condition
-
-
-@dataclass(frozen=True)
 class Greedy:
     """A policy's most probable condition, where the policy itself would draw one."""
 
@@ -55,52 +45,35 @@ class Greedy:
         return self.policy.act_greedily(observation)
 
 
-@dataclass(frozen=True)
-class HeuristicController:
-    """The condition whose mean command is the nearest to the one that the robot's `heuristic` gives.
+class ActorController:
+    """Whoever acts on a simulator (`animat.evaluation.rollouts.Actor`), for one observation at a time.
 
-    Attributes:
-        robot: one with a `heuristic`.
-        means: the mean command of each condition; of several commands, one of each.
+    Args:
+        actor: one, its arrays with a leading axis of actors, as for `roll_out`.
+        environment: that it acts in on the simulator, without what policies see of the neurons.
     """
 
-    robot: Robot[Any]
-    means: tuple[Any, ...]
-
-    def __post_init__(self) -> None:
+    def __init__(self, actor: Actor, environment: Environment[Any]) -> None:
+        self._actor: Actor = jax.tree.map(lambda x: x[0], actor)
+        self._environment = environment
         # Now: what JAX compiles for a first call would come late in a loop.
-        self.act(np.zeros(len(self.robot.observation_spec)), np.random.default_rng())
+        self.act(np.zeros(len(environment.observation_spec)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The nearest."""
-        return _nearest(self.means, np.asarray(capability(self.robot, "heuristic")(observation), np.float32))
+        """As on the simulator."""
+        # Drawn apart: most actors draw nothing, and whatever else the loop draws is the same beside them.
+        uniforms = rng.spawn(1)[0].random(self._environment.n_drawn, np.float32)
+        return int(_decided(self._environment, self._actor, np.asarray(observation, np.float32), uniforms))
 
 
-@dataclass(frozen=True, eq=False)
-class CouplingController:
-    """The best coupling (`animat.evaluation.coupling`), which was found on a simulator.
-
-    Attributes:
-        coupling: as it acts there; one actor.
-        scales: what the numbers of an observation are divided by.
-    """
-
-    coupling: Any
-    scales: Float[np.ndarray, " observations"]
-
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The condition whose mean command is the nearest to the one that the coupling wants."""
-        weights = np.asarray(self.coupling.weights)[0]
-        seen = (np.asarray(observation, np.float32) / np.asarray(self.scales, np.float32))[list(self.coupling.seen)]
-        drive = weights[:, :-1] @ seen + weights[:, -1]
-        wanted = np.tanh(drive) if self.coupling.kind == "graded" else np.sign(drive)
-        return _nearest(np.asarray(self.coupling.means)[0], wanted if len(wanted) > 1 else wanted[0])
-
-
-def _nearest(means: Any, wanted: Any) -> int:
-    """The condition whose mean command is the nearest; of several commands by the straight line."""
-    apart = np.asarray(means, np.float32) - wanted
-    return int(np.argmin(np.abs(apart) if apart.ndim == 1 else np.linalg.norm(apart, axis=1)))
+@partial(jax.jit, static_argnums=0)
+def _decided(
+    environment: Environment[Any],
+    actor: Actor,
+    observation: Float32[Array, " observations"],
+    uniforms: Float32[Array, " drawn"],
+) -> Array:
+    return actor.act(environment, (observation / environment.scales)[None], uniforms[None])[0]
 
 
 @dataclass(frozen=True)
@@ -131,9 +104,9 @@ class Agent:
         name: unique in its session.
         meaning: what it is, in a few words.
         controller: who chooses.
-        delivery: `"chosen"`: the culture gets what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
-            `"silent"`: no pulse, and what the culture fires by itself is read where the response would be; `"yoked"`:
-            what was given in the last whole episode of those who take turns here, over and over.
+        delivery: as of a control (`animat.evaluation.controls.Control`). `"silent"`: what the culture fires by itself
+            is read where the response would be; `"yoked"`: what was given in the last whole episode of those who take
+            turns here, over and over.
         calibrates: whether its responses count for adaptive thresholds; one condition presented over and over is
             answered otherwise than between others. The warm-up of its episodes always counts.
         drawn_from: responses that one is drawn from in place of the culture's; None: the culture's own is read.
@@ -144,7 +117,7 @@ class Agent:
     name: str
     meaning: str
     controller: Controller
-    delivery: LoopDelivery = "chosen"
+    delivery: Delivered = "chosen"
     calibrates: bool = True
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
     is_turned_round: bool = False
@@ -163,65 +136,41 @@ class Agent:
 
 def random_control(n_conditions: int) -> Agent:
     """The control that chooses any condition."""
-    return Agent("random", "any condition, equally likely", AnyCondition(n_conditions))
+    return Agent(RANDOM.name, RANDOM.meaning, AnyCondition(n_conditions))
 
 
-def controls(
-    robot: Robot[Any],
-    labels: Sequence[str],
-    *,
-    means: Sequence[Any] | None,
-    policies: Mapping[str, Controller] | None = None,
-) -> list[Agent]:
-    """The controls of the study.
-
-    Args:
-        robot: that is driven.
-        labels: of the conditions, in the order of their index.
-        means: the mean command (or commands) of each condition, for the heuristic policy; None: without that control.
-        policies: by name, who act in turn under the silent and the shuffled control; without any these two are left
-            out.
-    """
-    found = [random_control(len(labels))]
-    for i, label in enumerate(labels):
-        found.append(Agent(f"constant {label}", "this one always", OneCondition(i), calibrates=False))
-    if policies:
-        who = InTurn(dict(policies))
-        found.append(Agent("silent", "no pulse; the culture's own activity is read", who, "silent"))
-        found.append(Agent("shuffled", "the delivered condition is drawn anew", who, "shuffled"))
-    if means is not None:
-        nearest = HeuristicController(robot, tuple(means))
-        meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
-        found.append(Agent("heuristic", meaning, nearest))
-    return found
-
-
-def interventions(
-    robot: Robot[Any],
+def agent_of(
+    control: Control,
+    environment: Environment[Any],
     policies: Mapping[str, Controller],
     responses_hz: Float64[np.ndarray, "responses *readouts"],
-    switch_at: int,
-) -> list[Agent]:
-    """The same policies, in turn, in what is changed in one way each (`animat.evaluation.controls.interventions_of`).
-
-    Only a culture's own part is changed here: who is replaced by an ideal actuator needs none, and silent and shuffled
-    ones are among the controls.
+) -> Agent:
+    """A control of the simulator as an agent of a closed loop, where policies take turns in what is done with them.
 
     Args:
-        robot: that is driven.
+        environment: robot and mapping.
         policies: by name.
         responses_hz: non-burst responses of all conditions, for random spikes.
-        switch_at: after how many iterations the goal is switched, where the robot can be given another one.
     """
-    who = InTurn(dict(policies))
-    found = [
-        Agent("random spikes", "no pulse; any recorded response", who, "silent", drawn_from=responses_hz),
-        Agent("yoked", "the stimuli of another episode", who, "yoked", calibrates=False),
-        Agent("turned round", "the opposite of every command", who, is_turned_round=True),
-    ]
-    if hasattr(robot, "with_goal_of"):
-        found.append(Agent("goal switched", f"another goal after {switch_at} actions", who, switch_at=switch_at))
-    return found
+    actor = control.actor
+    controller: Controller
+    if isinstance(actor, Networks):
+        controller = InTurn(dict(policies))
+    elif isinstance(actor, Uniform):
+        controller = AnyCondition(environment.n_actions or 0)
+    else:
+        controller = ActorController(actor, environment)
+    return Agent(
+        control.name,
+        control.meaning,
+        controller,
+        control.delivery,
+        # The same stimuli over and over are answered otherwise than among others.
+        calibrates=control.delivery != "yoked" and not isinstance(actor, Constant),
+        drawn_from=responses_hz if control.is_drawn else None,
+        is_turned_round=control.is_turned_round,
+        switch_at=control.switch_at,
+    )
 
 
 def interleaved(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:

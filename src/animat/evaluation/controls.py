@@ -1,16 +1,21 @@
-"""Controls that ask whether it is the culture that does the work: what is run beside trained policies."""
+"""Controls that ask whether it is the culture that does the work: what is run beside trained policies.
+
+Each is defined once: a simulator runs it as it is here, and a closed loop makes its agents of it
+(`animat.closed_loop.agents.agent_of`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
 from animat.environment import Animat, Environment
 from animat.evaluation.commands import mean_commands
+from animat.evaluation.coupling import best_coupling
 from animat.evaluation.heuristic import Heuristic, heuristic_policy
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
@@ -25,24 +30,60 @@ from animat.wrappers import (
     with_inmost,
 )
 
+Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
+"""What neurons are given; a training (`animat.wrappers.Delivery`) has the first two alone."""
+
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """Somebody who acts in place of the policies, or the policies in a changed environment.
+    """Somebody who acts in place of the policies, or the policies with one thing changed.
 
     Attributes:
-        name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`.
+        name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or an intervention's.
         meaning: what it does, in a few words.
-        is_stimulated: whether any pulse is delivered.
+        actor: who chooses: one, or the policies side by side.
+        n_actors: how many they are.
+        delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
+            `"silent"`: nothing; `"yoked"`: the stimuli of another episode.
+        is_drawn: whether any recorded response is drawn in place of the neurons' own.
+        is_turned_round: whether every command is turned into its opposite.
+        switch_at: after how many iterations the robot is given another goal; None: never.
+        commands: of each condition, by which the robot is moved in place of the response; None: by the response.
     """
 
     name: str
     meaning: str
-    environment: Environment[Any]
-    simulator: NeuronSimulator | None
     actor: Actor
     n_actors: int = 1
-    is_stimulated: bool = True
+    delivery: Delivered = "chosen"
+    is_drawn: bool = False
+    is_turned_round: bool = False
+    switch_at: int | None = None
+    commands: tuple[Any, ...] | None = None
+
+    def within(
+        self, environment: Environment[Any], simulator: NeuronSimulator | None
+    ) -> tuple[Environment[Any], NeuronSimulator | None]:
+        """What it is run in on a simulator, of what the policies are run in; the very same where nothing is changed."""
+        if self.is_turned_round or self.commands is not None:
+            animat = unwrapped(environment)
+            assert isinstance(animat, Animat)
+            through = animat.robot, animat.mapping, animat.n_conditions
+            changed = TurnedRound(*through) if self.commands is None else IdealActuator(*through, self.commands)
+            environment = with_inmost(environment, lambda _: changed)
+        if self.delivery == "shuffled":
+            environment = ShuffledDelivery(environment)
+        elif self.delivery == "yoked":
+            environment = YokedDelivery(environment)
+        elif self.delivery == "silent" and simulator is not None:
+            # Whatever reaches neurons whose responses are drawn makes no difference.
+            simulator = indifferent(simulator) if self.is_drawn else silenced(simulator)
+        if self.switch_at is not None:
+            environment = GoalSwitch(environment, self.switch_at)
+        return environment, simulator
+
+
+RANDOM = Control("random", "any action, equally likely", Uniform())
 
 
 def controls_of(
@@ -52,10 +93,10 @@ def controls_of(
     policies: Networks | None = None,
     n_policies: int = 0,
 ) -> list[Control]:
-    """The controls of an environment, each with what it is run in.
+    """The controls of an environment.
 
     *random*, an action drawn at random; *constant*, one action always, for each of them; *heuristic*, the robot's
-    `heuristic`, where it has one; and through neurons, with policies: *silent*, on a culture that always answers 0;
+    `heuristic`, where it has one; and through neurons, with policies: *silent*, on a culture without stimuli;
     *shuffled*, with the delivered condition drawn anew at each iteration, whatever they chose.
 
     Args:
@@ -63,20 +104,25 @@ def controls_of(
         labels: of discrete actions.
         policies: several side by side; None leaves out what needs them.
     """
-    controls = [Control("random", "any action, equally likely", environment, simulator, Uniform())]
+    controls = [RANDOM]
     for i, label in enumerate(labels):
-        constant = Constant(jnp.array([i]))
-        controls.append(Control(f"constant {label}", "this one always", environment, simulator, constant))
+        controls.append(Control(f"constant {label}", "this one always", Constant(jnp.array([i]))))
     if hasattr(environment.robot, "heuristic"):
         rule: Actor = Heuristic()
         meaning = "no learning: the command of the robot's heuristic"
         if environment.n_actions is not None:
             rule = heuristic_policy(environment, simulator)
             meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
-        controls.append(Control("heuristic", meaning, environment, simulator, rule))
+        controls.append(Control("heuristic", meaning, rule))
     if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
-        controls += _without_effect(environment, simulator, policies, n_policies)
+        controls += _without_effect(policies, n_policies)
     return controls
+
+
+def coupling_of(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int) -> Control:
+    """The best coupling as a control; arguments and errors as of `best_coupling`, whose search takes seconds."""
+    reflex = best_coupling(environment, simulator, seed=seed)
+    return Control("coupling", "the best reflex: no memory, no goal", reflex)
 
 
 def interventions_of(
@@ -87,60 +133,46 @@ def interventions_of(
     *,
     switch_at: int | None = None,
 ) -> list[Control]:
-    """The same policies in what is changed in one way each, to see whose work it is.
+    """The same policies with one thing changed each, to see whose work it is.
 
     *ideal actuator*, each condition's mean command, stretched to the full range, in place of the response; *random
-    spikes*, the culture's rates, whatever is delivered; *silent* and *shuffled* as among the controls; *yoked*, the
+    spikes*, the culture's rates, whatever is chosen; *silent* and *shuffled* as among the controls; *yoked*, the
     stimuli of another episode; *turned round*, the opposite command; *goal switched*, another goal in mid-episode.
 
     Args:
         environment, simulator: what the policies are evaluated in.
         switch_at: the iteration at which the goal is switched; None leaves that out, as a robot with one goal does.
     """
-    animat = unwrapped(environment)
-    assert isinstance(animat, Animat)
     # Mean commands from -1 to 1, of each command; 0 where all are equal.
     means = mean_commands(environment, simulator)[1]
     low, high = means.min(axis=0), means.max(axis=0)
     stretched = np.where(high > low, 2 * (means - low) / np.where(high > low, high - low, np.inf) - 1, 0.0)
-    levels = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
-    ideal = IdealActuator(animat.robot, animat.mapping, animat.n_conditions, levels)
+    ideal = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
 
-    def control(name: str, meaning: str, changed: Environment[Any], culture: NeuronSimulator = simulator) -> Control:
-        return Control(name, meaning, changed, culture, policies, n_policies)
+    def control(name: str, meaning: str, **changed: Any) -> Control:
+        return Control(name, meaning, policies, n_policies, **changed)
 
     found = [
         control(
             "ideal actuator",
             "each condition's mean command, stretched to the full range, in place of the response",
-            with_inmost(environment, lambda _: ideal),
+            commands=ideal,
         ),
-        control("random spikes", "at the culture's rates, whatever is delivered", environment, indifferent(simulator)),
-        *_without_effect(environment, simulator, policies, n_policies),
+        control("random spikes", "no pulse; any recorded response", delivery="silent", is_drawn=True),
+        *_without_effect(policies, n_policies),
     ]
     if not isinstance(environment.robot, HostRobot):
-        found.append(control("yoked", "the stimuli of another episode", YokedDelivery(environment)))
-    found.append(control("turned round", "the opposite of every command", turned_round(environment)))
+        found.append(control("yoked", "the stimuli of another episode", delivery="yoked"))
+    found.append(control("turned round", "the opposite of every command", is_turned_round=True))
     if switch_at is not None and hasattr(environment.robot, "with_goal_of"):
-        switched = GoalSwitch(environment, switch_at)
-        found.append(control("goal switched", f"another goal after {switch_at} actions", switched))
+        found.append(control("goal switched", f"another goal after {switch_at} actions", switch_at=switch_at))
     return found
 
 
-def turned_round(environment: Environment[Any]) -> Environment[Any]:
-    """The same with the opposite of every command."""
-    animat = unwrapped(environment)
-    assert isinstance(animat, Animat)
-    turned = TurnedRound(animat.robot, animat.mapping, animat.n_conditions)
-    return with_inmost(environment, lambda _: turned)
-
-
-def _without_effect(
-    environment: Environment[Any], simulator: NeuronSimulator, policies: Networks, n_policies: int
-) -> list[Control]:
+def _without_effect(policies: Networks, n_policies: int) -> list[Control]:
     """Policies whose choices decide nothing."""
-    silent, shuffled = silenced(simulator), ShuffledDelivery(environment)
+    silent = "no pulse; the culture's own activity is read (on its simulator 0)"
     return [
-        Control("silent", "the culture always answers 0", environment, silent, policies, n_policies, False),
-        Control("shuffled", "the delivered condition is drawn anew", shuffled, simulator, policies, n_policies),
+        Control("silent", silent, policies, n_policies, "silent"),
+        Control("shuffled", "the delivered condition is drawn anew", policies, n_policies, "shuffled"),
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from animat.coding.electrode_pulses import electrode_pulses
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.evaluation import transfer
-from animat.evaluation.controls import Control, controls_of
-from animat.evaluation.coupling import ContextGap, best_coupling, context_gap, least_context_gap
+from animat.evaluation.controls import Control, controls_of, coupling_of
+from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import Counted
 from animat.evaluation.rollouts import networks_of, roll_out
@@ -32,7 +32,7 @@ from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
 from animat.tables import briefly
 from animat.training.policy import Policy, first_of_alike
-from animat.wrappers import NeuralObservation, ShuffledDelivery, TrialCosts, unwrapped
+from animat.wrappers import NeuralObservation, TrialCosts, unwrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,36 +259,35 @@ def evaluate(
     networks = networks_of(list(policies.values()), greedy=greedy)
     n = len(policies)
     # A policy that was trained as a control is one here too: what it chooses decides nothing.
-    trained_in: Environment[Any] = environment
-    meaning = "as trained"
+    trained = Control("policies", "as trained", networks, n)
     if simulator is not None and first.delivery == "shuffled":
-        trained_in, meaning = ShuffledDelivery(environment), "as trained: what is delivered is drawn anew"
+        meaning = "as trained: what is delivered is drawn anew"
+        trained = replace(trained, meaning=meaning, delivery="shuffled")
     if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):
         raise InvalidArgument(f"optimum_resolution: expected a positive number, got {optimum_resolution!r}")
     if interventions and simulator is None:
         raise InvalidArgument("interventions: expected policies that act through neurons, got ones without")
-    acting = [Control("policies", meaning, trained_in, simulator, networks, n)]
     labels = [condition.label for condition in first.conditions]
     if first.mapping is None:
         labels = [f"{command:+g}" for command in first.commands or ()]
     every = controls_of(environment, simulator, labels, networks, n)
-    acting += [control for control in every if controls is None or control.name in controls]
+    acting = [trained, *(control for control in every if controls is None or control.name in controls)]
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
     steps = len(acting) + searches + (optimum_resolution is not None)
     if searches:
         progress.update(0, steps, "best coupling")
-        reflex = best_coupling(environment, simulator, seed=seed)
-        acting.append(Control("coupling", "the best reflex: no memory, no goal", environment, simulator, reflex))
+        acting.append(coupling_of(environment, simulator, seed=seed))
     if controls is None and (without := lacking(body).get("heuristic")):
         findings += (Finding("no-heuristic", "note", without),)
     pulses = 1 if first.presentation is None else first.presentation.pulses
     of_trials = electrode_pulses(first.conditions, pulses) if simulator is not None else None
     rows = []
     for each in acting:
-        ran = roll_out(each.environment, each.simulator, each.actor, each.n_actors, episodes=episodes, seed=seed)
-        changed = each.environment is not environment or each.simulator is not simulator
-        given = None if of_trials is None else ran.presented @ of_trials * each.is_stimulated / episodes
+        within = each.within(environment, simulator)
+        ran = roll_out(*within, each.actor, each.n_actors, episodes=episodes, seed=seed)
+        changed = within[0] is not environment or within[1] is not simulator
+        given = None if of_trials is None else ran.presented @ of_trials * (each.delivery != "silent") / episodes
         rows.append(Row(each.name, each.meaning, ran, changed, given, first.pulse_cost))
         progress.update(len(rows), steps, each.name)
     optimum, no_optimum, net_optimum = None, None, None
@@ -317,7 +316,8 @@ def evaluate(
     work = None
     if interventions:
         phase = in_phase(progress, "whose work it is")
-        work = whose_work(trained_in, simulator, networks, n, episodes=episodes, seed=seed, progress=phase)
+        trained_in = trained.within(environment, simulator)
+        work = whose_work(*trained_in, networks, n, episodes=episodes, seed=seed, progress=phase)
     return Evaluation(
         body.name,
         None if first.mapping is None else first.mapping.name,

@@ -14,7 +14,7 @@ from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
 from animat.evaluation.rollouts import Episodes, Networks, roll_out
 from animat.evaluation.statistics import Interval
-from animat.evaluation.traces import trace
+from animat.evaluation.traces import Traces, trace
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
@@ -148,9 +148,10 @@ def whose_work(
     progress, draws = progress or Silent(), 2 if policies.greedy else DRAWS
 
     def ran(control: Control) -> Episodes:
-        return roll_out(control.environment, control.simulator, policies, n_policies, episodes=episodes, seed=seed)
+        within = control.within(environment, simulator)
+        return roll_out(*within, policies, n_policies, episodes=episodes, seed=seed)
 
-    plain = Control(AS_THEY_ARE, "through the culture's simulator", environment, simulator, policies, n_policies)
+    plain = Control(AS_THEY_ARE, "through the culture's simulator", policies, n_policies)
     usual = ran(plain)
     has_goals = hasattr(environment.robot, "with_goal_of")
     switch_at = max(1, int(np.median(usual.lengths)) // 2) if has_goals else None
@@ -162,21 +163,22 @@ def whose_work(
         lost = usual.returns - returns
         information = None
         if has_goals and control.name in TOLD_INFORMATION:
-            information = goal_information(
-                control.environment, control.simulator, policies, n_policies, draws=draws, seed=seed
-            )
+            within = control.within(environment, simulator)
+            information = goal_information(*within, policies, n_policies, draws=draws, seed=seed)
         of_each = lost.mean(axis=1) if n_policies > 1 else lost[0]
         rows.append(Changed(control.name, control.meaning, returns, interval_of_mean(of_each), information))
-    turning = None if switch_at is None else _turning(plain, acting[-1], switch_at, seed)
+    turning = None
+    if switch_at is not None:
+        # The same episodes, with the same random numbers, with and without a switch.
+        usual_trace, switched = (
+            trace(*each.within(environment, simulator), policies, n_policies, episodes=TRACED, seed=seed)
+            for each in (plain, acting[-1])
+        )
+        turning = _turning(usual_trace, switched, switch_at)
     return WhoseWork(tuple(rows), turning)
 
 
-def _turning(plain: Control, switched: Control, at: int, seed: int) -> Turning:
-    """The same episodes, with the same random numbers, with and without a switch."""
-    usual, other = (
-        trace(each.environment, each.simulator, each.actor, each.n_actors, episodes=TRACED, seed=seed)
-        for each in (plain, switched)
-    )
+def _turning(usual: Traces, other: Traces, at: int) -> Turning:
     went_on = usual.lengths > at
     # What comes after the end of either episode is no choice.
     last = np.minimum(usual.lengths, other.lengths)[..., None]

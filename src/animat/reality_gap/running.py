@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.agents import Agent, CouplingController, Greedy, controls, interventions, random_control
+from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.running import run_session
@@ -25,8 +25,7 @@ from animat.cultures.failing import in_words
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
-from animat.evaluation.coupling import best_coupling
-from animat.evaluation.heuristic import heuristic_policy
+from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
 from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.rollouts import networks_of
@@ -160,37 +159,31 @@ def run_policies(
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
-    acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
-    agents = [Agent(name, "as trained", controller) for name, controller in acting.items()]
-    rule, lacks = None, lacking(loop.robot)
+    networks, n_policies = networks_of(list(policies.values()), greedy=greedy), len(policies)
+    trained, controls = Control("policies", "as trained", networks, n_policies), [RANDOM]
+    lacks = lacking(loop.robot)
     if with_controls:
         if "heuristic" in lacks:
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
-        else:
-            rule = heuristic_policy(environment, simulator)
-        agents += controls(
-            loop.robot,
-            [condition.label for condition in loop.conditions],
-            means=None if rule is None else np.asarray(rule.means)[0].tolist(),
-            policies=acting,
-        )
-    else:
-        agents.append(random_control(len(loop.conditions)))
+        labels = [condition.label for condition in loop.conditions]
+        controls = controls_of(environment, simulator, labels, networks, n_policies)
+        # Random numbers are drawn by place, and it was always the last.
+        controls.sort(key=lambda control: control.name == "heuristic")
     if with_coupling:
         in_phase(progress, "best coupling").update(0, 1, "searching for it on the simulator")
-        reflex = best_coupling(environment, simulator, seed=seed)
-        acts = CouplingController(reflex, animat.scales)
-        agents.append(Agent("coupling", "the best reflex: no memory, no goal", acts))
-
+        controls.append(coupling_of(environment, simulator, seed=seed))
     ideal = None
     if with_interventions:
         if isinstance(loop.robot, HostRobot):
             raise InvalidArgument(f"--interventions: expected a robot in JAX, got {loop.robot.name}")
-        networks = networks_of(list(policies.values()), greedy=greedy)
-        on_simulator = environment, simulator, networks, len(policies), seed
-        ideal = with_ideal_actuator(*on_simulator)
-        pooled = np.concatenate(calibration.responses_hz)
-        agents += interventions(loop.robot, acting, pooled, half_an_episode(*on_simulator))
+        half = half_an_episode(trained, environment, simulator, seed)
+        of_ideal, *changed = interventions_of(environment, simulator, networks, n_policies, switch_at=half)
+        ideal = with_ideal_actuator(of_ideal, environment, simulator, seed)
+        controls += [each for each in changed if each.name not in ("silent", "shuffled")]
+    acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
+    pooled = np.concatenate(calibration.responses_hz)
+    agents = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
+    agents += [agent_of(control, animat, acting, pooled) for control in controls]
 
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
@@ -198,12 +191,12 @@ def run_policies(
     if why_not is not None:
         findings += (Finding("no-optimum", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
     predicted = predict(
-        [agents[: len(policies)], *([control] for control in agents[len(policies) :])],
+        trained,
+        tuple(policies),
+        controls,
         environment,
         # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
         calibration if adaptive else calibration.with_percentiles(calibration.simulator.percentiles),
-        rule,
-        greedy=greedy,
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
@@ -212,7 +205,7 @@ def run_policies(
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and optimum is not None:
         _wait_for(optimum, progress)
-    of_each = planned_episodes(len(policies), len(agents) - len(policies), episodes)
+    of_each = planned_episodes(n_policies, len(controls), episodes)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]

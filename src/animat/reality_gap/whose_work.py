@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.environment import Environment
-from animat.evaluation.controls import interventions_of
-from animat.evaluation.rollouts import Networks, roll_out
+from animat.evaluation.controls import Control
+from animat.evaluation.rollouts import roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
@@ -45,20 +45,18 @@ class Replaced:
         return vars(self) | {"lost": as_json(self.lost.to_dict())}
 
 
-def half_an_episode(
-    environment: Environment[Any], simulator: NeuronSimulator, policies: Networks, n_policies: int, seed: int
-) -> int:
+def half_an_episode(policies: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int) -> int:
     """Half of the median episode of policies on the simulator, in iterations; one at least."""
-    ran = roll_out(environment, simulator, policies, n_policies, episodes=EPISODES, seed=seed)
+    ran = roll_out(environment, simulator, policies.actor, policies.n_actors, episodes=EPISODES, seed=seed)
     return max(1, int(np.median(ran.lengths)) // 2)
 
 
 def with_ideal_actuator(
-    environment: Environment[Any], simulator: NeuronSimulator, policies: Networks, n_policies: int, seed: int
+    ideal: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int
 ) -> tuple[str, Float64[np.ndarray, " episodes"]]:
     """What an ideal actuator is, and returns of policies that have one in the culture's place."""
-    ideal = interventions_of(environment, simulator, policies, n_policies)[0]
-    ran = roll_out(ideal.environment, ideal.simulator, policies, n_policies, episodes=EPISODES, seed=seed)
+    within = ideal.within(environment, simulator)
+    ran = roll_out(*within, ideal.actor, ideal.n_actors, episodes=EPISODES, seed=seed)
     return ideal.meaning, np.asarray(ran.returns, np.float64).ravel()
 
 

@@ -92,8 +92,9 @@ class Control(StudyTask):
             answering = setting.simulator(at_min)
             for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
                 drawn_by = _DRAWN_BY.get(each.name, each.name)
-                seed, n = draw_seed(study.seed, robot, name, at_min, drawn_by), each.n_actors
-                ran = roll_out(each.environment, each.simulator, each.actor, n, episodes=study.episodes, seed=seed)
+                seed = draw_seed(study.seed, robot, name, at_min, drawn_by)
+                within = each.within(setting.environment, answering)
+                ran = roll_out(*within, each.actor, each.n_actors, episodes=study.episodes, seed=seed)
                 parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:
             if networks is not None and not isinstance(setting.environment.robot, HostRobot):
