@@ -68,7 +68,7 @@ def run(folder: Path, ticks: int) -> None:
         agent = Agent("policy", "random weights", Greedy(policy()))
         session = run_session(culture, loop_of(ticks, real_time=True), [agent], folder, episodes=1)
     assert session.ending.by == "plan", session.ending
-    np.save(folder / REPORT, [1e3 * (tick.late_s or 0.0) for tick in session.ticks[1:]])
+    np.save(folder / REPORT, [1e3 * (tick.late_s or 0.0) for tick in list(session.ticks)[1:]])
     np.save(folder / PULSES, [(tick.number, at) for tick, at in zip(session.ticks, culture.given_s, strict=True)])
 
 

@@ -62,7 +62,7 @@ def loop_at(
 
 def assert_in_time(session: Session, chosen: int, frame_s: float) -> None:
     assert session.ending.by == "plan", session.ending.message
-    ticks = session.ticks
+    ticks = list(session.ticks)
     assert len(ticks) == 20
     assert [tick.late_s for tick in ticks] == [0.0] * 20
     for episode in (0, 1):

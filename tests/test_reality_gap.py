@@ -292,7 +292,7 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
     assert found.passes.presented.sum() == len(ticks)
     assert found.passes.passed.sum() == sum(passed)
     # What the culture was presented between is there too, for what it may remember.
-    assert len(found.responses.presentations[0].condition) == len(gap.session.ticks)
+    assert len(found.responses.presentations[0].condition) == len(list(gap.session.ticks))
 
 
 def test_controls_have_no_more_episodes_than_the_policies_but_five_each() -> None:

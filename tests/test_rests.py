@@ -240,7 +240,7 @@ def test_no_rest_comes_to_a_cl1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     session = read_session(tmp_path)
     assert session.ending.by == "plan", session.ending.message
     n = sum(tick.delivered for tick in session.ticks)
-    assert 0 < n < len(session.ticks) and len(neurons.pulses) == 2 * 3 * n
+    assert 0 < n < len(list(session.ticks)) and len(neurons.pulses) == 2 * 3 * n
 
 
 def test_no_rest_comes_to_a_maxone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

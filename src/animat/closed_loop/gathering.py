@@ -6,7 +6,6 @@ from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from animat.errors import AnimatError, InvalidFile
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
 from animat.recordings.told import from_words
-from animat.stimulation.stimulus import NOTHING, Stimuli
+from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
 LOG_FILE = "session.log"
@@ -26,48 +25,6 @@ RECORDING_FILE = "session.nwb"
 TICKS_FILE = "ticks.csv"
 STOP_FILE = "STOP"
 """In a session's folder: whoever makes it, empty or not, ends the session as Ctrl-C does."""
-
-
-class Pulses:
-    """The pulses of a session, column by column: half a million take 50 MB, and not a gigabyte."""
-
-    def __init__(self) -> None:
-        self._time_s, self._frequency_hz = array("d"), array("d")
-        self._pattern, self._presentation = array("q"), array("q")
-        self._electrodes, self._widths = array("q"), array("q")
-
-    def add(self, seen: Mapping[str, Any]) -> None:
-        """The pulses of a stretch, from the words of its record."""
-        for frequency_hz, pattern, presentation, electrodes in seen["stimuli"]:
-            self._frequency_hz.append(frequency_hz)
-            self._pattern.append(pattern)
-            self._presentation.append(presentation)
-            self._electrodes.extend(electrodes)
-            self._widths.append(len(electrodes))
-        if seen["tick"]:
-            self._time_s.extend(seen["tick"]["pulse_time_s"])
-
-    @property
-    def last_s(self) -> float:
-        """When the last one came; 0 before any."""
-        return self._time_s[-1] if self._time_s else 0.0
-
-    def stimuli(self) -> Stimuli:
-        """As the table of a recording.
-
-        Raises:
-            UnusableData: for columns that do not fit together.
-        """
-        widths = np.array(self._widths, np.int64)
-        electrodes = np.full((len(widths), int(np.max(widths, initial=0)) if len(widths) else 1), UNKNOWN)
-        electrodes[np.arange(electrodes.shape[1])[None, :] < widths[:, None]] = self._electrodes
-        return Stimuli(
-            time_s=np.array(self._time_s, np.float64),
-            frequency_hz=np.array(self._frequency_hz, np.float64),
-            pattern=np.array(self._pattern, np.int64),
-            electrodes=electrodes,
-            presentation=np.array(self._presentation, np.int64),
-        )
 
 
 class Gathered:
@@ -82,10 +39,13 @@ class Gathered:
     """
 
     def __init__(self, header: Header) -> None:
-        self.outline = Outline(header.presentation.pulses)
+        self.outline = Outline()
         self.spike_counts = SpikeCounts(len(header.channels))
         self._header = header
-        self._pulses = Pulses()
+        # Of each pulse, column by column: half a million take 50 MB, and not a gigabyte.
+        self._time_s, self._frequency_hz = array("d"), array("d")
+        self._pattern, self._presentation = array("q"), array("q")
+        self._electrodes, self._widths = array("q"), array("q")
         self._watched_s = self._end_s = 0.0
 
     def add(self, record: Record) -> None:
@@ -93,10 +53,18 @@ class Gathered:
         words = record.words
         self.outline.add(words)
         self.spike_counts.add(record.spike_times_s, record.spike_channels)
-        if words["kind"] == "seen":
-            self._pulses.add(words)
-            self._watched_s += words["duration_s"]
-            self._end_s = max(self._end_s, words["start_s"] + words["duration_s"])
+        if words["kind"] != "seen":
+            return
+        for frequency_hz, pattern, presentation, electrodes in words["stimuli"]:
+            self._frequency_hz.append(frequency_hz)
+            self._pattern.append(pattern)
+            self._presentation.append(presentation)
+            self._electrodes.extend(electrodes)
+            self._widths.append(len(electrodes))
+        if words["tick"]:
+            self._time_s.extend(words["tick"]["pulse_time_s"])
+        self._watched_s += words["duration_s"]
+        self._end_s = max(self._end_s, words["start_s"] + words["duration_s"])
 
     def recording_without_spikes(self, ending: Ending) -> Recording:
         """The session as a recording, but for its spikes.
@@ -107,7 +75,7 @@ class Gathered:
         Raises:
             UnusableData: for records that do not fit together.
         """
-        header, outline, stimuli = self._header, self.outline, self._pulses.stimuli()
+        header, outline = self._header, self.outline
         words = {
             **header.provenance,
             "session_description": "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who "
@@ -116,23 +84,35 @@ class Gathered:
             "recorded_at": header.recorded_at,
             "closed_loop": header.loop,
             "closed_loop_ended": f"{ending.by}: {ending.message}",
-            "closed_loop_unanswered_pulses": str(unanswered_pulses(outline)),
+            "closed_loop_unanswered_pulses": str(outline.unanswered_pulses),
         }
         if outline.left_out:
             words["left_out"] = in_words(outline.left_out)
-        duration_s = max(0.0, self._end_s, self.spike_counts.span_s[1], self._pulses.last_s)
+        duration_s = max(0.0, self._end_s, self.spike_counts.span_s[1], *self._time_s[-1:])
         words["closed_loop_unwatched_s"] = f"{max(0.0, duration_s - self._watched_s):.6f}"
         return Recording(
             spike_times_s=[],  # type: ignore[arg-type]
             spike_channels=[],  # type: ignore[arg-type]
             channels=header.channels,
-            stimuli=stimuli,
+            stimuli=self._stimuli(),
             sampling_rate_hz=header.sampling_rate_hz,
             start_s=0.0,
             duration_s=duration_s,
             start_min=header.start_min,
             presentation=header.presentation,
             **from_words(words),
+        )
+
+    def _stimuli(self) -> Stimuli:
+        widths = np.array(self._widths, np.int64)
+        electrodes = np.full((len(widths), int(np.max(widths, initial=0)) if len(widths) else 1), UNKNOWN)
+        electrodes[np.arange(electrodes.shape[1])[None, :] < widths[:, None]] = self._electrodes
+        return Stimuli(
+            time_s=np.array(self._time_s, np.float64),
+            frequency_hz=np.array(self._frequency_hz, np.float64),
+            pattern=np.array(self._pattern, np.int64),
+            electrodes=electrodes,
+            presentation=np.array(self._presentation, np.int64),
         )
 
 
@@ -145,11 +125,6 @@ def expecting_a_session(file: Path) -> Iterator[None]:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, AnimatError) as error:
         raise InvalidFile(f"{file}: expected a session's log, got {error!r}") from error
-
-
-def unanswered_pulses(outline: Outline) -> int:
-    """How many pulses were asked for and never answered."""
-    return sum(pattern != NOTHING for words in outline.unanswered for _, pattern, *_ in words["stimuli"])
 
 
 def in_words(left_out: Mapping[str, int]) -> str:

@@ -3,34 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from animat.closed_loop.tick import Ending
 from animat.stimulation.stimulus import NOTHING
-
-
-@dataclass
-class Acted:
-    """What was presented in an episode while its robot moved, without the warm-up.
-
-    Attributes:
-        trials: repeated ones among them.
-        actions: that the robot was moved by.
-        pulses: that the culture was given.
-        electrode_pulses: one for each electrode of each pulse.
-        pulses_s: of each presentation, its pulses over its frequency.
-        bursts: responses that were bursts.
-        late: trials that came late.
-    """
-
-    trials: int = 0
-    actions: int = 0
-    pulses: int = 0
-    electrode_pulses: int = 0
-    pulses_s: float = 0.0
-    bursts: int = 0
-    late: int = 0
 
 
 @dataclass
@@ -45,10 +21,12 @@ class Episode:
         iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
         is_whole: whether it came to its end; what the session broke off has no return.
-        pulses: that the culture was given, those of the warm-up among them.
-        bursts: responses that were bursts, also in the warm-up.
-        late: pulses that came late, also in the warm-up.
-        acted: the same without the warm-up, and more.
+        pulses: that the culture was given.
+        warm_up_pulses: those of them before the robot moved; all that follows is without the warm-up.
+        electrode_pulses: one for each electrode of each pulse.
+        trials: repeated ones among them.
+        bursts: responses that were bursts.
+        late: trials that came late.
     """
 
     number: int
@@ -59,19 +37,17 @@ class Episode:
     terminated: bool = False
     is_whole: bool = False
     pulses: int = 0
+    warm_up_pulses: int = 0
+    electrode_pulses: int = 0
+    trials: int = 0
     bursts: int = 0
     late: int = 0
-    acted: Acted = field(default_factory=Acted)
 
 
 class Outline:
     """Counts as records are added, in their order.
 
-    Args:
-        pulses: of a trial.
-
     Attributes:
-        ending: what was written about it, None where nothing was.
         left_out: what the culture's device reported and the session does not have, by what it is; known at the end.
         ticks: how many.
         pulses: that the culture was given.
@@ -81,13 +57,11 @@ class Outline:
         moved_at_s: when a robot first moved, on the clock of `wall_s`; None before.
     """
 
-    def __init__(self, pulses: int) -> None:
-        self.ending: Ending | None = None
+    def __init__(self) -> None:
         self.left_out: dict[str, int] = {}
         self.ticks = self.pulses = self.bursts = self.late = 0
         self.latest_s = 0.0
         self.moved_at_s: float | None = None
-        self._presented = pulses
         self._starts: dict[int, tuple[float, ...]] = {}
         self._episodes: dict[int, Episode] = {}
         self._asked: dict[int, dict[str, Any]] = {}
@@ -108,6 +82,11 @@ class Outline:
             if any(pattern != NOTHING for _, pattern, *_ in words["stimuli"]) and words.get("is_admitted", True)
         )
 
+    @property
+    def unanswered_pulses(self) -> int:
+        """How many pulses were asked for and never answered."""
+        return sum(pattern != NOTHING for words in self.unanswered for _, pattern, *_ in words["stimuli"])
+
     def add(self, words: Mapping[str, Any]) -> None:
         """Count one record in."""
         kind, stretch = words["kind"], words.get("stretch")
@@ -126,7 +105,6 @@ class Outline:
         elif kind == "start":
             self._starts[words["episode"]] = tuple(words["observation"])
         elif kind == "end":
-            self.ending = Ending(words["by"], words["message"])
             self.left_out = words.get("left_out", {})
 
     def _add_tick(self, tick: Mapping[str, Any], electrode_pulses: int) -> None:
@@ -137,25 +115,24 @@ class Outline:
             episode = Episode(number, tick["agent"], self._starts.pop(number, ()))
             self._episodes[number] = episode
         self.ticks += 1
+        self.pulses += n_pulses
+        self.bursts += tick["is_burst"]
+        self.late += is_late
         self.latest_s = max(self.latest_s, tick["late_s"])
+        episode.pulses += n_pulses
+        episode.terminated = tick["terminated"]
+        episode.is_whole = tick["terminated"] or tick["truncated"]
+        if tick["handled"] == "warm-up":
+            episode.warm_up_pulses += n_pulses
+            return
+        self.moved_at_s = tick.get("wall_s") if self.moved_at_s is None else self.moved_at_s
+        episode.electrode_pulses += electrode_pulses
+        episode.trials += 1
+        episode.bursts += tick["is_burst"]
+        episode.late += is_late
         if tick["reward"] is not None:
             episode.total += tick["reward"]
             episode.iterations += 1
-        episode.terminated = tick["terminated"]
-        episode.is_whole = tick["terminated"] or tick["truncated"]
-        counted: list[Any] = [self, episode]
-        if tick["handled"] != "warm-up":
-            self.moved_at_s = tick.get("wall_s") if self.moved_at_s is None else self.moved_at_s
-            acted = episode.acted
-            acted.trials += 1
-            acted.actions += tick["command"] is not None
-            acted.electrode_pulses += electrode_pulses
-            acted.pulses_s += self._presented / tick["frequency_hz"]
-            counted.append(acted)
-        for each in counted:
-            each.pulses += n_pulses
-            each.bursts += tick["is_burst"]
-            each.late += is_late
 
 
 def electrode_pulses_of(seen: Mapping[str, Any]) -> int:

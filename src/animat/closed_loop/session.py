@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from animat.closed_loop.gathering import (
     TICKS_FILE,
     Gathered,
     expecting_a_session,
-    unanswered_pulses,
 )
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, Records, read_log
@@ -35,37 +33,14 @@ from animat.writing import atomic_write, clear_away, exclusive_lock, is_unfinish
 _TOLD_EVERY = 1000
 
 
-class Ticks(Sequence[Tick]):
-    """Every tick of a log, in the order of time, read from it as they are asked for."""
+@dataclass(frozen=True, eq=False)
+class Ticks(Iterable[Tick]):
+    """Every tick of a log, in the order of time, read from it each time as they are asked for."""
 
-    def __init__(self, records: Records) -> None:
-        self._records = records
+    records: Records
 
     def __iter__(self) -> Iterator[Tick]:
-        return (Tick.from_dict(words["tick"]) for words in self._records.words() if words.get("tick"))
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    @overload
-    def __getitem__(self, index: int) -> Tick: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Tick, ...]: ...
-    def __getitem__(self, index: int | slice) -> Tick | tuple[Tick, ...]:
-        if isinstance(index, slice):
-            return tuple(self[i] for i in range(len(self))[index])
-        return Tick.from_dict(self._records[self._numbers[index]].words["tick"])
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Sequence) or len(self) != len(other):
-            return False
-        return all(a == b for a, b in zip(self, other, strict=True))
-
-    __hash__ = None  # type: ignore[assignment]
-
-    @cached_property
-    def _numbers(self) -> array[int]:
-        return array("Q", (number for number, words in enumerate(self._records.words()) if words.get("tick")))
+        return (Tick.from_dict(words["tick"]) for words in self.records.words() if words.get("tick"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +67,7 @@ class Session:
         """Where its ticks are as a table, once it was written."""
         return self.folder / TICKS_FILE
 
-    @cached_property
+    @property
     def ticks(self) -> Ticks:
         """Every tick, in the order of time."""
         return Ticks(self.log.records)
@@ -101,17 +76,6 @@ class Session:
     def episodes(self) -> tuple[Episode, ...]:
         """Every episode that was begun, in the order of time."""
         return self.outline.episodes
-
-    @property
-    def unanswered(self) -> tuple[dict[str, Any], ...]:
-        """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
-        known, and they are in no recording. The words of its record: when, which stimuli."""
-        return self.outline.unanswered
-
-    @property
-    def left_out(self) -> dict[str, int]:
-        """What the culture's device reported and the session does not have, by what it is; known once it has ended."""
-        return self.outline.left_out
 
     @property
     def outline(self) -> Outline:
@@ -144,21 +108,14 @@ class Session:
         Raises:
             InvalidFile: if the log does not fit together, or a file cannot be written.
         """
-        header, records = self._header, self.log.records
-        gathered = Gathered(header)
+        header = self._header
         with expecting_a_session(self.folder / LOG_FILE):
             with atomic_write(self.ticks_file) as beside, beside.open("w", newline="", encoding="utf-8") as file:
                 table = TickTable(file, header.conditions, header.observed, header.readouts)
-                for number, record in enumerate(records):
-                    gathered.add(record)
-                    if record.words["kind"] == "seen" and record.words["tick"]:
-                        table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
-                    if progress is not None and number % _TOLD_EVERY == 0:
-                        progress.update(number, len(records))
-            # Read once: what is asked for next is known.
-            vars(self)["_gathered"] = gathered
+                # Read once: what is asked for next is known.
+                vars(self)["_gathered"] = gathered = self._gather(table, progress)
             recording = gathered.recording_without_spikes(self.ending)
-            write_nwb(recording, self.recording_file, records.spike_blocks(), gathered.spike_counts)
+            write_nwb(recording, self.recording_file, self.log.records.spike_blocks(), gathered.spike_counts)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
@@ -172,7 +129,7 @@ class Session:
             "bursts": outline.bursts,
             "late_pulses": outline.late,
             "latest_ms": 1000 * outline.latest_s,
-            "unanswered_pulses": unanswered_pulses(outline),
+            "unanswered_pulses": outline.unanswered_pulses,
             "left_out": outline.left_out,
             "lost_bytes": self.log.lost_bytes,
         }
@@ -183,10 +140,18 @@ class Session:
 
     @cached_property
     def _gathered(self) -> Gathered:
-        gathered = Gathered(self._header)
         with expecting_a_session(self.folder / LOG_FILE):
-            for record in self.log.records:
-                gathered.add(record)
+            return self._gather()
+
+    def _gather(self, table: TickTable | None = None, progress: Progress | None = None) -> Gathered:
+        """Go through all records once, and write their ticks into a table."""
+        gathered, records = Gathered(self._header), self.log.records
+        for number, record in enumerate(records):
+            gathered.add(record)
+            if table is not None and record.words["kind"] == "seen" and record.words["tick"]:
+                table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
+            if progress is not None and number % _TOLD_EVERY == 0:
+                progress.update(number, len(records))
         return gathered
 
 
@@ -279,7 +244,7 @@ def told_lost(lost_bytes: int) -> str:
 
 def told_unanswered(session: Session) -> str:
     """What is to be known of pulses that were never answered, in a sentence."""
-    n = unanswered_pulses(session.outline)
+    n = session.outline.unanswered_pulses
     pulses, them = ("1 pulse was", "it") if n == 1 else (f"{n} pulses were", "them")
     return (
         f"{pulses} asked for and never answered: whether the culture got {them} is not known; {LOG_FILE} has times and "

@@ -28,7 +28,6 @@ class Row:
         electrode_pulses: in whole episodes, on average; NaN without any. One for each electrode of each pulse.
         predicted_electrode_pulses: in an episode on the simulator; None where conditions do not say.
         pulse_cost: of an electrode pulse, in the units of the return.
-        seconds_per_action: of the culture's time.
         bursts: share of responses that were.
         late: share of trials that came late.
         beside: the policies' measured returns beside these; None for the policies, and where either has none.
@@ -45,7 +44,6 @@ class Row:
     electrode_pulses: float
     predicted_electrode_pulses: float | None
     pulse_cost: float
-    seconds_per_action: float
     bursts: float
     late: float
     beside: Beside | None = None
@@ -106,7 +104,6 @@ class Row:
             "predicted_electrode_pulses": self.predicted_electrode_pulses,
             "net": self.net,
             "predicted_net": self.predicted_net,
-            "seconds_per_action": self.seconds_per_action,
             "bursts": self.bursts,
             "late": self.late,
             "p": None if self.beside is None else self.beside.p,

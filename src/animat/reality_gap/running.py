@@ -328,9 +328,9 @@ def _rows(
 
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         episodes = [episode for episode in session.episodes if episode.agent in of]
-        acted, whole = [episode.acted for episode in episodes], [each for each in episodes if each.is_whole]
-        actions = max(1, sum(each.actions for each in acted))
-        trials = max(1, sum(each.trials for each in acted))
+        whole = [each for each in episodes if each.is_whole]
+        actions = max(1, sum(each.iterations for each in episodes))
+        trials = max(1, sum(each.trials for each in episodes))
         of_them = together([predicted[each] for each in of])
         met = [came_to[episode.number] for episode in episodes if episode.number in came_to]
         return Row(
@@ -339,15 +339,14 @@ def _rows(
             predicted=of_them.returns,
             predicted_anew=of_them.anew,
             measured=np.array([episode.total for episode in whole], np.float64),
-            pulses_per_action=sum(each.pulses for each in acted) / actions,
-            electrode_pulses=sum(each.acted.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
+            pulses_per_action=sum(each.pulses - each.warm_up_pulses for each in episodes) / actions,
+            electrode_pulses=sum(each.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
             predicted_electrode_pulses=None
             if of_trials is None
             else float(of_them.presented @ of_trials) * (name not in unstimulated),
             pulse_cost=pulse_cost,
-            seconds_per_action=sum(each.pulses_s for each in acted) / actions,
-            bursts=sum(each.bursts for each in acted) / trials,
-            late=sum(each.late for each in acted) / trials,
+            bursts=sum(each.bursts for each in episodes) / trials,
+            late=sum(each.late for each in episodes) / trials,
             met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
         )
 

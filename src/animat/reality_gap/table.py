@@ -167,8 +167,8 @@ class RealityGap:
             lines += told_replaced(self.rows[0], self.whose_work)
         if outline["unanswered_pulses"]:
             lines.append(f"  {told_unanswered(self.session)}")
-        if self.session.left_out:
-            lines.append(f"  left out: {in_words(self.session.left_out)}")
+        if self.session.outline.left_out:
+            lines.append(f"  left out: {in_words(self.session.outline.left_out)}")
         return "\n".join(lines)
 
 

@@ -7,9 +7,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from animat.closed_loop.gathering import LOG_FILE, STOP_FILE, unanswered_pulses
+from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
+from animat.closed_loop.outline import Outline
 from animat.errors import InvalidArgument, InvalidFile
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
@@ -148,7 +149,7 @@ class SessionView(View):
                 raise InvalidFile(f"{self.tail.path}: expected a log of a session, got one without a whole beginning")
             self._header: Header = read_header(self.tail.path, first.words)
             self._words = first.words
-            self._sums = Sums(self.tail, self._header.presentation.pulses)
+            self._sums = Sums(self.tail)
             self._generation = self.tail.generation
         return is_whole
 
@@ -303,9 +304,9 @@ def _thresholds(mapping: Any) -> list[int]:
     return known.get(str(name), [0, 10])
 
 
-def _unanswered(outline: Any) -> int | None:
+def _unanswered(outline: Outline) -> int | None:
     try:
-        return unanswered_pulses(outline)
+        return outline.unanswered_pulses
     except (KeyError, TypeError, AttributeError):
         return None
 

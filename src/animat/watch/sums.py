@@ -19,7 +19,7 @@ _LOOKS = 64
 
 
 class Sums:
-    """The totals of a log's records, with so many pulses a trial, as far as they were counted.
+    """The totals of a log's records, as far as they were counted.
 
     Attributes:
         counted: of the log's records.
@@ -32,9 +32,9 @@ class Sums:
         strange: records that say nothing that is known.
     """
 
-    def __init__(self, tail: Tail, pulses: int) -> None:
+    def __init__(self, tail: Tail) -> None:
         self._tail = tail
-        self.outline = Outline(pulses)
+        self.outline = Outline()
         self.counted = self.strange = self.n_faults = 0
         self.totals = array("d")
         self.on_electrode: Counter[int] = Counter()
