@@ -42,6 +42,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.environment import Animat
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
+from animat.evaluation.statistics import Interval
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByFrequency
@@ -603,6 +604,17 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
         culture.stop()
         with pytest.raises(InvalidArgument, match="stopped"):
             run_session(culture, loop_of(), [RANDOM], tmp_path / "other")
+
+
+def test_what_is_predicted_stands_in_the_log(tmp_path: Path) -> None:
+    with FakeCulture() as culture:
+        with pytest.raises(InvalidArgument, match="predicted: expected names of agents, got someone"):
+            run_session(culture, loop_of(), [RANDOM], tmp_path, predicted={"someone": Interval(1.5, 1.0, 2.0, 0.95)})
+        predicted = {"random": Interval(1.5, 1.0, 2.0, 0.95)}
+        session = run_session(culture, loop_of(), [RANDOM], tmp_path / "with", episodes=1, predicted=predicted)
+        without = run_session(culture, loop_of(), [RANDOM], tmp_path / "without", episodes=1)
+    assert session.log.header["predicted"] == {"random": {"mean": 1.5, "low": 1.0, "high": 2.0}}
+    assert "predicted" not in without.log.header
 
 
 def test_the_heuristic_policy_steers_the_right_way() -> None:

@@ -151,6 +151,9 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     for i, name in enumerate(policies):
         np.testing.assert_array_equal(rows[name].predicted, predicted[i])
         np.testing.assert_allclose(rows[name].predicted_anew, anew[:, i])
+        # Who watches the session has it beforehand.
+        told, found = gap.session.log.header["predicted"][name], rows[name].prediction
+        assert told == {"mean": found.value, "low": found.low, "high": found.high}
     np.testing.assert_array_equal(rows["policies"].predicted, predicted.ravel())
     np.testing.assert_allclose(rows["policies"].predicted_anew, anew.mean(axis=1))
     for each in rolled[:ROLL_OUTS]:

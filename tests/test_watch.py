@@ -18,7 +18,6 @@ import pytest
 
 from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
-from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile
 from animat.watch.app import stop_session
@@ -180,12 +179,22 @@ def test_another_log_in_its_place_is_begun_anew(folder: Path, tmp_path: Path) ->
 
 
 def test_returns_that_were_predicted_stand_beside(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes())
-    write_predicted(tmp_path, {"random": (1.5, 1.0, 2.25)})
-    found = {each["name"]: each["predicted"] for each in whole(SessionView(tmp_path))["agents"]}
-    assert found == {"random": [1.5, 1.0, 2.25], "silent": None}
-    (tmp_path / "predicted.json").write_text("[]")
-    assert {each["predicted"] for each in whole(SessionView(tmp_path))["agents"]} == {None}
+    log = read_log(folder / LOG_FILE)
+
+    def shown(predicted: Any) -> dict[str, Any]:
+        writer = LogWriter(tmp_path / LOG_FILE, {**log.header, "predicted": predicted})
+        for record in log.records:
+            writer.append(record)
+        writer.close()
+        agents = whole(SessionView(tmp_path))["agents"]
+        (tmp_path / LOG_FILE).unlink()
+        return {each["name"]: each["predicted"] for each in agents}
+
+    assert shown({"random": {"mean": 1.5, "low": 1.0, "high": 2.25}}) == {"random": [1.5, 1.0, 2.25], "silent": None}
+    for none in ([], {"random": [1.5, 1.0, 2.25]}, {"random": {"mean": 1.5, "low": "1"}}):
+        assert shown(none) == {"random": None, "silent": None}
+    # As without.
+    assert {each["predicted"] for each in whole(SessionView(folder))["agents"]} == {None}
 
 
 def test_stop_makes_the_file_that_the_loop_looks_for(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -32,6 +32,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.observed import more_left_out
 from animat.errors import AnimatError, InvalidArgument, Mismatch, shown
+from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
 
 MOST_EPISODES = 100_000
@@ -58,6 +59,7 @@ def run_session(
     account: Account | None = None,
     clock: Clock | None = None,
     progress: Progress | None = None,
+    predicted: Mapping[str, Interval] | None = None,
 ) -> Session:
     """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
@@ -78,16 +80,20 @@ def run_session(
         account: of a stimulation budget; None: without end.
         clock: the machine's; None: its monotonic one.
         progress: told all the time how many episodes are done, and the returns so far.
+        predicted: mean return that is expected of each agent, with its interval; kept in the log for whoever watches.
 
     Raises:
         InvalidArgument: for a culture that is closed or stopped, no agents, one that sees the history state in a loop
-            that does not remember, or a session or a file `STOP` that is in the folder already.
+            that does not remember, a prediction of no agent, or a session or a file `STOP` that is in the folder
+            already.
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read, or a folder of other work.
         InvalidFile: if a file is in the folder's place, or the log cannot be begun.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
     _check(culture, loop, agents, planned, seed)
+    if strange := sorted({*(predicted or {})} - {agent.name for agent in agents}):
+        raise InvalidArgument(f"predicted: expected names of agents, got {', '.join(strange)}")
     expect_no_session(folder)
     stop_file = Path(folder) / STOP_FILE
     if stop_file.exists():
@@ -97,7 +103,7 @@ def run_session(
     driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed, stop_file)
     file = Path(folder) / LOG_FILE
     # As whoever reads the log has it.
-    header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed)))
+    header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed, predicted or {})))
     read_header(file, header)
     with closing(LogWriter(file, header)) as log:
         ending = _Supervisor(culture, loop, driver, log, progress, len(turns)).run()
@@ -263,9 +269,16 @@ class _Supervisor:
 
 
 def _header(
-    culture: Culture, loop: Loop, agents: Sequence[Agent], turns: Sequence[int], account: Account, seed: int
+    culture: Culture,
+    loop: Loop,
+    agents: Sequence[Agent],
+    turns: Sequence[int],
+    account: Account,
+    seed: int,
+    predicted: Mapping[str, Interval],
 ) -> dict[str, Any]:
     channels = culture.channels
+    told = {name: {"mean": of.value, "low": of.low, "high": of.high} for name, of in predicted.items()}
     return {
         "kind": "header",
         "format": FORMAT,
@@ -283,6 +296,7 @@ def _header(
         "agents": [_told(agent) for agent in agents],
         "turns": [agents[turn].name for turn in turns],
         "seed": seed,
+        **({"predicted": told} if told else {}),
     }
 
 

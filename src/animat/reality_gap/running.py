@@ -8,16 +8,14 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.predicted import write_predicted
 from animat.closed_loop.running import run_session
-from animat.closed_loop.session import Session, expect_no_session
+from animat.closed_loop.session import Session
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
@@ -217,11 +215,18 @@ def run_policies(
             report(f"warning: {message}")
         report(str(ahead))
     forecast = {name: between(of.returns.mean(), of.anew) for name, of in predicted.items()}
-    # Another session's forecast stays as it is.
-    expect_no_session(folder)
-    write_predicted(Path(folder), {name: (of.value, of.low, of.high) for name, of in forecast.items()})
     watched = in_phase(progress, "closed loop", sum(of_each), "episodes")
-    session = run_session(culture, loop, agents, folder, episodes=of_each, seed=seed, account=account, progress=watched)
+    session = run_session(
+        culture,
+        loop,
+        agents,
+        folder,
+        episodes=of_each,
+        seed=seed,
+        account=account,
+        progress=watched,
+        predicted=forecast,
+    )
     best = None
     # Whoever stopped the session does not wait for it.
     if optimum is not None and (optimum.done() or session.ending.by == "plan"):

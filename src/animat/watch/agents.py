@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
 from animat.closed_loop.outline import Episode
-from animat.closed_loop.predicted import read_predicted
-from animat.errors import InvalidFile
-from animat.watch.plain import number, text
+from animat.watch.plain import mapped, number, text
 
 _MOST_RETURNS = 200
 """Of each agent that are drawn, the last ones."""
 
 
-def by_agent(episodes: Sequence[Episode], folder: Path) -> list[dict[str, Any]]:
+def by_agent(episodes: Sequence[Episode], header: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Of each agent: how many episodes came to their end, their returns and mean with its 95 % interval, as it narrows.
 
-    The folder is the session's, with a prediction or without.
+    The header is that of the session's log, with a prediction or without.
     """
-    predicted = _predicted(folder)
+    predicted = _predicted(header)
     returns: dict[str, list[float]] = {name: [] for name in predicted}
     for episode in episodes:
         of = returns.setdefault(text(episode.agent), [])
@@ -50,9 +47,8 @@ def _half_width(returns: Sequence[float]) -> float | None:
     return float(stdtrit(len(returns) - 1, 0.975)) * stdev(returns) / math.sqrt(len(returns))
 
 
-def _predicted(folder: Path) -> dict[str, list[float | None]]:
-    try:
-        read = read_predicted(folder)
-    except InvalidFile:
-        return {}
-    return {text(name): [number(each) for each in of] for name, of in read.items()}
+def _predicted(header: Mapping[str, Any]) -> dict[str, list[float | None]]:
+    """Mean and interval; of what is no prediction nothing."""
+    read = {text(name): mapped(of) for name, of in mapped(header.get("predicted")).items()}
+    found = {name: [number(of.get(each)) for each in ("mean", "low", "high")] for name, of in read.items()}
+    return {name: of for name, of in found.items() if None not in of}

@@ -163,7 +163,7 @@ class SessionView(View):
             self._agents_at = outline.ticks, self._generation
             episodes = outline.episodes
             self._done = sum(episode.is_whole for episode in episodes)
-            self._agents = by_agent(episodes, self.folder)
+            self._agents = by_agent(episodes, self._words)
             self._agents_until_s = time.monotonic() + _AGENTS_S
         done = self._done
         last = self._last_tick()

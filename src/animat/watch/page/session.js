@@ -307,12 +307,12 @@ export class SessionPage {
       for (const total of each.returns) frame.dot(total, i, colour("blue"), { radius: 3, ring: true });
     });
     const goesOn = agents.some((each) => each.half !== null && (each.mean - each.half < frame.x[0] || each.mean + each.half > frame.x[1]));
-    const predicted = agents.some((each) => each.predicted) ? "Grey: predicted, the bar its 95 % interval, the line its mean." : "The folder has no prediction of these returns.";
+    const predicted = agents.some((each) => each.predicted) ? "Grey: predicted, the bar its 95 % interval, the line its mean." : "The log has no prediction of these returns.";
     this.returns.words.textContent = `${predicted} Blue rings: whole episodes. Orange: their mean and its 95 % interval, which narrows as episodes are added${goesOn ? "; one that reaches the frame goes on beyond it" : ""}.`;
     const within = (low, high) => ` (${shown(low, 3)} to\u00a0${shown(high, 3)})`;
     const measured = ({ mean, half }) => (mean === null ? "none yet" : `${shown(mean, 4)}${half === null ? "" : within(mean - half, mean + half)}`);
     table(this.agentTable, ["agent", "episodes", "measured (95 % interval)", "predicted (95 % interval)"], agents.map((each) => [
-      each.name, shown(each.n), measured(each), each.predicted ? `${shown(each.predicted[0], 4)}${within(each.predicted[1], each.predicted[2])}` : "not in the folder",
+      each.name, shown(each.n), measured(each), each.predicted ? `${shown(each.predicted[0], 4)}${within(each.predicted[1], each.predicted[2])}` : "not predicted",
     ]));
   }
 
