@@ -53,8 +53,8 @@ def test_the_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
         assert ticks["agent"][i] == row["agent"]
         assert about["conditions"][ticks["delivered"][i]] == row["delivered"]
         assert [float(each) for each in row["pulse_times_s"].split()] == ticks["pulse_time_s"][i]
-        for ours, theirs in (("time_s", "time_s"), ("rate_hz", "rate_hz"), ("late_s", "late_s"), ("wall_s", "wall_s")):
-            assert ticks[ours][i] == float(row[theirs])
+        for name in ("time_s", "rate_hz", "late_s", "decided_s"):
+            assert ticks[name][i] == float(row[name])
         assert ticks["command"][i] == ([float(row["command"])] if row["command"] else [])
         assert ticks["reward"][i] == (float(row["reward"]) if row["reward"] else None)
         observed = [row[name] for name in about["observed"]]

@@ -60,7 +60,7 @@ class Watched:
     def things(self) -> dict[str, Any]:
         """What there is."""
         found = [
-            {"kind": each.kind, "place": each.place, "changed_s": each.changed_s}
+            {"kind": each.kind, "place": each.place}
             for each in find(self.folder)
             # A name that is no text cannot be asked for.
             if text(each.place, 4096) == each.place

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
+from animat.progress import duration_in_words
 from animat.watch.plain import number, text
 
 Width = Literal["third", "half", "two-thirds", "whole"]
@@ -72,17 +73,8 @@ def facts(title: str, rows: Sequence[tuple[str, Any]], words: str = "") -> dict[
     return {"kind": "facts", "title": title, "rows": told, "words": text(words, 2000)}
 
 
-def duration(seconds: float | None) -> str:
-    """A time that is left, in words."""
-    if seconds is None or not math.isfinite(seconds):
-        return "not known yet"
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
-
-
 def time_left(seconds: float | None, state: dict[str, Any]) -> str:
     """How long work will still take, as it stands (`animat.watch.held.state_of`)."""
-    if state["state"] == "running":
-        return duration(seconds)
-    return "none: it is done" if state["state"] == "ended" else "none: it does not go on"
+    if state["state"] != "running":
+        return "none: it has ended" if state["state"] == "ended" else "none: it does not go on"
+    return "not known yet" if (known := number(seconds)) is None else duration_in_words(known)

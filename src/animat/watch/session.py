@@ -12,9 +12,10 @@ from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
 from animat.closed_loop.outline import Outline
 from animat.errors import InvalidArgument, InvalidFile
+from animat.progress import duration_in_words
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
-from animat.watch.blocks import duration
+from animat.watch.blocks import time_left
 from animat.watch.held import is_held
 from animat.watch.picture import is_drawn
 from animat.watch.plain import listed, mapped, number, numbers, text, whole
@@ -59,18 +60,13 @@ class SessionView(View):
             "generation": self.tail.generation,
             "title": f"{text(mapped(loop.get('robot')).get('name', 'robot'))} on the {text(words.get('culture', ''))} "
             "culture",
-            "recorded_at": text(header.recorded_at),
             "conditions": [text(each) for each in header.conditions],
-            "agents": [
-                {"name": text(each.get("name")), "meaning": text(each.get("meaning", ""))}
-                for each in map(mapped, listed(words.get("agents")))
-            ],
+            "agents": [text(each.get("name")) for each in map(mapped, listed(words.get("agents")))],
             "observed": [text(each) for each in header.observed],
             "readouts": [text(each) for each in header.readouts],
             "mapping": text(mapped(loop.get("mapping")).get("name", loop.get("mapping"))),
             "thresholds": _thresholds(loop.get("mapping")),
             "adaptive": bool(loop.get("adaptive")),
-            "burst_threshold": number(loop.get("burst_threshold")),
             "percentiles_hz": first_readout(listed(loop.get("percentiles"))),
             "planned": len(listed(words.get("turns"))),
             "limits": {text(name): number(value) for name, value in mapped(words.get("limits")).items()},
@@ -112,7 +108,6 @@ class SessionView(View):
             "pulsed": listed(ticks[-1][1]["electrodes"]) if ticks else [],
             # Where the robot of the last tick stood last.
             "picture": next((at for at, tick in ticks[::-1] if tick["observation"]), None),
-            "bytes": self.tail.n_bytes,
             "is_found": is_whole,
             **self._so_far(),
         }
@@ -171,8 +166,9 @@ class SessionView(View):
         # What comes before the first move comes once.
         moving_s = None if wall_s is None else wall_s - (number(outline.moved_at_s) or 0.0)
         left_s = None if not done or moving_s is None else moving_s * (planned - done) / done
+        state = self._state()
         return {
-            **self._state(),
+            **state,
             "summed": sums.share,
             "strange": sums.strange,
             "n_ticks": outline.ticks,
@@ -186,14 +182,14 @@ class SessionView(View):
             "n_faults": sums.n_faults,
             "percentiles": _thinned(sums.percentiles),
             "episodes_done": done,
-            "left_s": number(left_s),
-            "wall_s": wall_s,
+            "time_left": time_left(left_s, state),
             "agents": self._agents,
         }
 
     def _state(self) -> dict[str, Any]:
         """Whether it goes on, in words."""
         silent_s = max(0.0, time.time() - self.tail.path.stat().st_mtime)
+        silent = duration_in_words(silent_s)
         stop = (self.folder / STOP_FILE).exists()
         last = {} if not len(self.tail) else (self.tail.peek(len(self.tail) - 1) or {})
         damage = self.tail.damage
@@ -203,14 +199,12 @@ class SessionView(View):
             # A record that is just being written looks as one that is cut off.
             told, damage = {"state": "running", "message": "stopping" if stop else ""}, ""
         elif is_held(self.folder):
-            message = (
-                f"nothing was written for {duration(silent_s)}, but its program has not ended: it waits, or it hangs"
-            )
+            message = f"nothing was written for {silent}, but its program has not ended: it waits, or it hangs"
             told = {"state": "running", "message": message}
         else:
-            message = f"nothing was written for {duration(silent_s)}, and no end: it was killed, or it hangs"
+            message = f"nothing was written for {silent}, and no end: it was killed, or it hangs"
             told = {"state": "silent", "message": message}
-        return {**told, "damage": damage, "silent_s": silent_s, "stop": stop}
+        return {**told, "damage": damage, "stop": stop}
 
     def _end_s(self) -> float:
         at = self._before(len(self.tail) - 1)
@@ -267,7 +261,6 @@ class SessionView(View):
             "pulse_time_s": [] if NOTHING in listed(tick.get("patterns")) else numbers(tick.get("pulse_time_s")),
             "command": numbers(tick.get("command")),
             "observation": numbers(tick.get("observation")),
-            "readout_hz": numbers(tick.get("readout_hz")),
             "total": number(totals[at]) if at < len(totals) else None,
             "electrodes": [whole(each) for each in listed(chosen[-1])] if chosen else [],
         }
@@ -276,12 +269,10 @@ class SessionView(View):
 _TRAIL = 400
 """Ticks that are looked back at for a robot's trail."""
 _NUMBERS = (
-    "number", "episode", "iteration", "chosen", "delivered", "frequency_hz", "spikes", "rate_hz", "active_ratio",
-    "reward", "late_s", "decided_s", "wall_s", "is_burst", "terminated", "truncated",
+    "number", "episode", "iteration", "chosen", "delivered", "spikes", "rate_hz", "reward", "late_s", "decided_s",
+    "is_burst",
 )  # fmt: skip
-_COLUMNS = (
-    *_NUMBERS, "time_s", "agent", "handled", "pulse_time_s", "command", "observation", "readout_hz", "total",
-)  # fmt: skip
+_COLUMNS = (*_NUMBERS, "time_s", "agent", "handled", "pulse_time_s", "command", "observation", "total")
 
 
 def _plain(value: Any) -> float | bool | None:

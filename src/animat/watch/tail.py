@@ -48,11 +48,6 @@ class Tail:
     def __len__(self) -> int:
         return len(self._places) - 1
 
-    @property
-    def n_bytes(self) -> int:
-        """Of the file, as far as its records go."""
-        return self._places[-1]
-
     def close(self) -> None:
         """Let go of the file."""
         if self._file is not None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
-from animat.watch.blocks import chart, curve, duration, facts, table, time_left
+from animat.watch.blocks import chart, curve, facts, table, time_left
 from animat.watch.files import json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
 from animat.watch.plain import listed, mapped, number, short, text, whole
@@ -64,7 +64,9 @@ class TuningView(View):
         if trials <= 0:
             return "not known: the best trials are retrained"
         left_s = self._speed.left_s(trials)
-        return duration(left_s) + ("" if left_s is None else " of trials, then the best are retrained")
+        return time_left(left_s, {"state": "running"}) + (
+            "" if left_s is None else " of trials, then the best are retrained"
+        )
 
     def _manifest(self) -> dict[str, Any]:
         return self._described("tune.json", "tuning")

@@ -18,7 +18,7 @@ export function ordered(i, n) {
   return `rgb(${a.map((x, k) => Math.round(x + share * (b[k] - x))).join(",")})`;
 }
 
-export const SERIES = ["blue", "orange", "green", "purple", "sky", "red"];
+const SERIES = ["blue", "orange", "green", "purple", "sky", "red"];
 
 export function series(i) {
   return colour(SERIES[i % SERIES.length]);
@@ -34,7 +34,7 @@ export function shown(value, digits = 4) {
 }
 
 // Few round numbers within a span.
-export function marks(low, high, most) {
+function marks(low, high, most) {
   const raw = (high - low) / Math.max(1, most);
   if (!(raw > 0) || !Number.isFinite(raw)) return [low];
   const unit = 10 ** Math.floor(Math.log10(raw));
@@ -123,14 +123,6 @@ export class Frame {
     g.restore();
   }
 
-  level(value, stroke, dashes = [4, 3]) {
-    this.within((g) => {
-      g.setLineDash(dashes);
-      this.#rule(this.left, this.atY(value), this.right, this.atY(value), stroke);
-      g.setLineDash([]);
-    });
-  }
-
   // Points that are joined; null breaks the line. As steps each holds until the next.
   line(xs, ys, stroke, { steps = false, width = 1.6, dashes = [] } = {}) {
     this.within((g) => {
@@ -150,18 +142,6 @@ export class Frame {
       });
       g.stroke();
       g.setLineDash([]);
-    });
-  }
-
-  band(xs, lows, highs, fill) {
-    this.within((g) => {
-      g.globalAlpha = 0.22;
-      g.fillStyle = fill;
-      g.beginPath();
-      xs.forEach((x, i) => g.lineTo(this.atX(x), this.atY(lows[i])));
-      for (let i = xs.length - 1; i >= 0; i -= 1) g.lineTo(this.atX(xs[i]), this.atY(highs[i]));
-      g.fill();
-      g.globalAlpha = 1;
     });
   }
 
@@ -235,11 +215,4 @@ export function table(target, head, rows) {
   const isText = head.map((_, i) => rows.some((row) => /[a-z]{3}/i.test(row[i]) && !/^(none|not)\b/.test(row[i])));
   const line = (cells, kind) => make("tr", {}, ...cells.map((each, i) => make(kind, { textContent: each.replaceAll(" %", "\u00a0%"), className: isText[i] ? "text" : "" })));
   target.replaceChildren(make("thead", {}, line(head, "th")), make("tbody", {}, ...rows.map((row) => line(row, "td"))));
-}
-
-export function duration(seconds) {
-  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "not known yet";
-  if (seconds < 100) return `${seconds.toFixed(0)} s`;
-  if (seconds < 6000) return `${(seconds / 60).toFixed(1)} min`;
-  return `${(seconds / 3600).toFixed(1)} h`;
 }

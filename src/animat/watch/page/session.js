@@ -1,6 +1,6 @@
 // The view of a closed loop.
 
-import { Frame, colour, duration, list, make, ordered, series, shown, spanOf, table, unpacked } from "./draw.js";
+import { Frame, colour, list, make, ordered, series, shown, spanOf, table, unpacked } from "./draw.js";
 
 // Of every canvas over the last seconds, so that their times stand below each other.
 const LEFT = 52, CLOCK = "session's clock (s)";
@@ -282,9 +282,9 @@ export class SessionPage {
 
   #drawAgents(view) {
     // As the session names them; those that did not act yet too.
-    const order = new Map(this.about.agents.map((each, i) => [each.name, i]));
+    const order = new Map(this.about.agents.map((name, i) => [name, i]));
     const acted = new Set(view.agents.map((each) => each.name));
-    const waiting = this.about.agents.filter((each) => !acted.has(each.name)).map((each) => ({ name: each.name, n: 0, returns: [], mean: null, half: null, predicted: null }));
+    const waiting = this.about.agents.filter((name) => !acted.has(name)).map((name) => ({ name, n: 0, returns: [], mean: null, half: null, predicted: null }));
     const agents = [...view.agents, ...waiting].sort((a, b) => (order.get(a.name) ?? 1e9) - (order.get(b.name) ?? 1e9));
     const rows = Math.max(1, agents.length);
     this.returns.canvas.style.height = `${Math.max(90, 26 * rows + 40)}px`;
@@ -339,7 +339,7 @@ export class SessionPage {
       ...summing,
       ["ticks", shown(view.n_ticks)],
       ["episodes", `${shown(view.episodes_done)} of ${this.about.planned ? shown(this.about.planned) : "an unknown number"}`],
-      ["time left", view.state === "running" ? duration(view.left_s) : view.state === "ended" ? "none: it has ended" : "none: it does not go on"],
+      ["time left", view.time_left],
       ["pulses", `${shown(view.pulses)}${budget}`],
       ["fullest electrode", view.fullest ? `${view.fullest[0]}, with ${shown(view.fullest[1])}${each} pulses` : "none was pulsed"],
       ["bursts", `${shown(view.bursts)} (${shown((100 * view.bursts) / Math.max(1, view.n_ticks), 2)} % of the responses)`],
