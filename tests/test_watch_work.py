@@ -221,21 +221,21 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     assert rows["trials done"] == "3 of 5"
     assert [rows[name] for name in ("complete", "stopped early", "diverged")] == [1, 1, 1]
     # One that came further counts before one that did well at the first rung.
-    assert rows["best so far"] == "trial 0, 4" and rows["under way"] == "nothing"
+    assert rows["best so far"] == "trial 0, 4" and rows["running"] == 0
     journal = block(found, "Journal")["rows"]
-    assert journal[-1] == [0, "complete", "4.00", "discount 0.9877"]
-    assert [row[1:3] for row in journal[:2]] == [["diverged", "none"], ["stopped early", "55.00"]]
+    assert journal[-1] == [0, "complete", 4.0, "discount 0.9877"]
+    assert [row[1:3] for row in journal[:2]] == [["diverged", None], ["stopped early", 55.0]]
     drawn = {each["name"]: (each["x"], each["y"]) for each in block(found, "Return of each trial")["series"]}
     assert drawn == {"best so far": ([0, 1], [4, 4]), "complete": ([0], [4]), "stopped early": ([1], [55])}
     notices = tmp_path / ".unfinished" / ".told"
     notices.mkdir(parents=True)
-    (notices / "rung-2+trials-3+4.json").write_text("[0.5, null]")
+    (notices / "rung-2+trials-3,4.json").write_text("[0.5, null]")
     with exclusive_lock(tmp_path):
         found = TuningView(tmp_path).view(None, 8.0)
-    assert facts(found, "Trials")["under way"] == "trials 3 to 4, rung 2 of 3"
+    assert facts(found, "Trials")["running"] == 1
     # No job says more than how far it is.
     assert block(found, "Running")["head"] == ["job", "done"]
-    assert block(found, "Running")["rows"] == [["trials 3, 4, rung 2", "50 %"]]
+    assert block(found, "Running")["rows"] == [["rung-2/trials-3,4", "50 %"]]
     assert block(found, "Return of each trial")["until"] == 4
     finals = [
         {"trial": 0, "mean_return": None},
@@ -244,11 +244,10 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     ]
     (tmp_path / "results.json").write_text(json.dumps({"best": {"trial": 1}, "finals": finals}))
     found = TuningView(tmp_path).view(None, 8.0)
-    assert facts(found, "Trials")["best, retrained"] == "trial 1, 6.25"
     assert block(found, "Retrained")["rows"] == [
-        [1, "6.25", "0.5000", "batch 64"],
-        [2, "-10.00", "none", ""],
-        [0, "none", "none", ""],
+        [1, 6.25, 0.5, "batch 64"],
+        [2, -10.0, None, ""],
+        [0, None, None, ""],
     ]
     assert "Running" not in [each["title"] for each in found["blocks"]]
 

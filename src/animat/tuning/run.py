@@ -152,7 +152,7 @@ class _Run:
         for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
             jobs = [
                 self._job(
-                    f"rung-{rung + 1}/trials-{'+'.join(str(trial.number) for trial in group)}",
+                    f"rung-{rung + 1}/trials-{','.join(str(trial.number) for trial in group)}",
                     TrainTrials(
                         self._tuning.study, group, members, seeds, tune.episodes, (first, last), place, last < CHUNKS
                     ),
