@@ -30,7 +30,7 @@ from animat.errors import (
     UnusableData,
 )
 from animat.live import shadowing
-from animat.live.plan import LOG_FILE, Timetable, check_plan, what_stands
+from animat.live.plan import LOG_FILE, Timetable, check_plan
 from animat.live.shadowing import LiveRun, live
 from animat.live.trainers import Exchange
 from animat.neurons.synthetic import synthetic_simulator
@@ -307,7 +307,8 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
     told = lines(tmp_path / "live")
     assert [line["what"] for line in told[-2:]] == ["interrupted", "end"]
     assert told[-1]["budget"]["pulses"] == culture.pulses
-    with pytest.raises(Mismatch, match=r"ended before its time \(stopped by a person\), with .* 1 policies"):
+    assert told[-2]["message"] == "stopped by a person"
+    with pytest.raises(Mismatch, match="expected an empty folder for a live run, got one with files"):
         live(ONE, culture, PROTOCOL, tmp_path / "live")
 
 
@@ -350,7 +351,6 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
     written = lines(tmp_path / "live")
     assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
     assert told in written[-2]["message"]
-    assert f"ended before its time ({told}" in (what_stands(tmp_path / "live") or "")
 
 
 @pytest.mark.oracle
@@ -381,7 +381,8 @@ def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
     with FakeCulture(fault=fail, at=7) as culture:
         found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert found.gap.session.ending.by == "culture"
-    assert "ended before its time (the culture raised DeviceFailed: gone)" in (what_stands(tmp_path / "live") or "")
+    (told,) = [line for line in lines(tmp_path / "live") if line["what"] == "closed loop"]
+    assert (told["ended_by"], told["ended"]) == ("culture", "the culture raised DeviceFailed: gone")
 
 
 @pytest.mark.oracle
@@ -401,35 +402,15 @@ def test_policies_are_kept_while_they_are_trained(tmp_path: Path, monkeypatch: p
         live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=timetable, progress=Looking())
 
 
-def test_a_killed_run_says_what_stands_there_and_what_can_be_done_with_it(tmp_path: Path) -> None:
-    folder = tmp_path / "live"
-    (folder / "recordings").mkdir(parents=True)
-    (folder / "live.log").write_text('{"what": "begun"}\n{"what": "reco')
-
-    def said() -> str:
-        with pytest.raises(Mismatch) as refused:
-            check_plan(ONE, PROTOCOL, folder, QUICK, 1, {})
-        assert "\n" not in str(refused.value)
-        return str(refused.value)
-
-    assert "was killed, or still goes on, with 0 recordings (nothing of it can be used)" in said()
-    (folder / "recordings" / "recording_00.0_min.nwb").touch()
-    assert f"`animat train --recordings {folder / 'recordings'}`" in said()
-    (folder / "policies").mkdir()
-    (folder / "policies" / "p0.safetensors").touch()
-    (folder / "policies" / ".p1.safetensors.abc.partial.safetensors").touch()
-    assert "with 1 recordings, 1 policies" in said()
-    assert f"`animat run {folder / 'policies'} --recordings {folder / 'recordings'}`" in said()
-    (folder / "session").mkdir()
-    (folder / "session" / "session.log").touch()
-    assert f"`animat recover {folder / 'session'}`" in said()
-    (folder / "session" / "session.nwb").touch()
-    assert "a session" in said()
-    assert "recover" not in said()
-    (folder / "live.log").write_text('{"what": "begun"}\n{"what": "end"}\n')
-    assert "a live run that is done" in said()
-    (folder / "live.log").unlink()
-    assert "got one with files" in said()
+@pytest.mark.parametrize("left", ["live.log", "recordings", "policies", "session"])
+def test_a_folder_with_an_earlier_live_run_is_refused_in_a_line(left: str, tmp_path: Path) -> None:
+    (tmp_path / left).mkdir()
+    with pytest.raises(Mismatch) as refused:
+        check_plan(ONE, PROTOCOL, tmp_path, QUICK, 1, {})
+    assert str(refused.value) == (
+        f"{tmp_path}: expected an empty folder for a live run, got one with files; choose another, or see what is "
+        f"there: animat watch {tmp_path}"
+    )
 
 
 @pytest.mark.oracle

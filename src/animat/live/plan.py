@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.gathering import LOG_FILE as SESSION_LOG
-from animat.closed_loop.gathering import RECORDING_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_episodes
 from animat.coding.mapping import N_PERCENTILES
@@ -69,7 +66,7 @@ def check_plan(
         InvalidArgument: for a training without neurons or with a neural observation, recordings that take longer than
             an interval, no episodes, or a setting of the closed loop that cannot be.
         InvalidFile: if a file is in the folder's place.
-        Mismatch: if something is in the folder already; for an earlier live run, what, and what can be done with it.
+        Mismatch: if something is in the folder already: a live run is not gone on with, as its culture has lived on.
     """
     if training.mapping is None:
         raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
@@ -100,47 +97,7 @@ def check_plan(
     Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **given)
     expect_no_file(folder, "the live run")
     if folder.exists() and any(each.name != LOCK for each in folder.iterdir()):
-        stands = what_stands(folder) or "one with files"
-        raise Mismatch(f"{folder}: expected an empty folder for a live run, got {stands}: choose another")
-
-
-def what_stands(folder: Path) -> str | None:
-    """What an earlier live run left in a folder, and what can be done with it; None if there was none.
-
-    A live run is not gone on with: its culture has lived on meanwhile. What it recorded and trained is there.
-    """
-    log = folder / LOG_FILE
-    if not log.is_file():
-        return None
-    recordings = sorted(file.name for file in (folder / RECORDINGS).glob("[!.]*.nwb"))
-    policies = sorted(file.name for file in (folder / POLICIES).glob("[!.]*.safetensors"))
-    kept, can = [f"{len(recordings)} recordings"], []
-    if policies:
-        kept.append(f"{len(policies)} policies")
-        can.append(f"`animat run {folder / POLICIES} --recordings {folder / RECORDINGS}` runs them")
-    elif recordings:
-        can.append(f"`animat train --recordings {folder / RECORDINGS}` trains on what was recorded")
-    if (folder / SESSION / SESSION_LOG).is_file():
-        kept.append("a session")
-        if not (folder / SESSION / RECORDING_FILE).is_file():
-            can.append(f"`animat recover {folder / SESSION}` writes its recording")
-    return f"a live run that {_ended(log)}, with {', '.join(kept)} ({'; '.join(can) or 'nothing of it can be used'})"
-
-
-def _ended(log: Path) -> str:
-    """How the log of a live run says that it ended."""
-    told: list[dict[str, Any]] = []
-    for line in log.read_text(errors="replace").splitlines():
-        try:
-            told.append(json.loads(line))
-        except ValueError:
-            break
-    if not told or told[-1]["what"] != "end":
-        return "was killed, or still goes on"
-    for line in reversed(told[:-1]):
-        if line["what"] in ("interrupted", "fault"):
-            # Logs of before have a sentence.
-            return f"ended before its time ({line.get('message', line.get('sentence', line['what']))})"
-        if line["what"] == "closed loop" and line.get("ended_by") != "plan":
-            return f"ended before its time ({line.get('ended', 'in the closed loop')})"
-    return "is done"
+        raise Mismatch(
+            f"{folder}: expected an empty folder for a live run, got one with files; choose another, or see what is "
+            f"there: animat watch {folder}"
+        )
