@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
@@ -21,7 +22,7 @@ from animat.cli import _parse, main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.execution.cluster import Cluster
 from animat.execution.dask_worker import made_of
-from animat.execution.jobs import Job, Jobs
+from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.local_cluster import local_cluster
 from animat.execution.task import Task
 from animat.progress import Progress, Silent
@@ -138,6 +139,7 @@ def test_what_fails_twice_is_done_and_thrice_is_reported(running: Running, tmp_p
         run(jobs, tmp_path, cluster)
     assert (tmp_path / "thrice").read_text().count("tried") == 3
     assert {path.stem for path in (tmp_path / "jobs").iterdir()} == {"twice", "other"}
+    assert [*json.loads((tmp_path / ".unfinished" / PLANNED).read_text())] == [job.name for job in jobs]
 
 
 @oracle

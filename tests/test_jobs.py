@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from animat.errors import AnimatError, InvalidFile
-from animat.execution.jobs import Job, Jobs, in_order
+from animat.execution.jobs import PLANNED, Job, Jobs, in_order
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import Task, carry_out, carry_out_alone, reported
@@ -123,6 +123,15 @@ def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
     notes = {told[2] for told in kept.told}
     assert {"0 of 2 jobs; a 50 % half", "1 of 2 jobs; b 50 % half"} <= notes
     assert not any("nearly" in note for note in notes)
+
+
+def test_what_is_planned_and_what_it_costs_is_in_a_file_until_all_is_done(tmp_path: Path) -> None:
+    jobs = [joined("b", "a", cost_s=2.5), joined("a", cost_s=0.1), Job("c/d", Fail(), ("b",))]
+    for _ in ("anew", "going on"):
+        with pytest.raises(InvalidFile):
+            run(jobs, tmp_path)
+        told = json.loads((tmp_path / ".unfinished" / PLANNED).read_text())
+        assert list(told.items()) == [("b", 2.5), ("a", 0.1), ("c/d", 1.0)]
 
 
 def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:

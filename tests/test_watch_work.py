@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,10 +14,12 @@ import numpy as np
 import pytest
 
 from animat.errors import InvalidFile
+from animat.execution.jobs import PLANNED, Job
 from animat.execution.receipts import Receipt
 from animat.recordings.reading import read_recording
 from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.inspection import inspect_recording
+from animat.studies.context import plan_context_study
 from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
@@ -123,14 +127,24 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     assert block(together, "Policies")["words"] == "p0 to p1: 55 % return 31.0; p2: 55 %"
 
 
+def planned_in(folder: Path, jobs: Sequence[Job]) -> None:
+    """As jobs leave it that are run."""
+    (folder / ".unfinished").mkdir(exist_ok=True)
+    (folder / ".unfinished" / PLANNED).write_text(json.dumps({job.name: job.cost_s for job in jobs}))
+
+
 def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
-    (tmp_path / "study.toml").write_text(TINY.read_text())
     (tmp_path / "study.json").write_text(json.dumps({"study": {"robots": [{"name": "navigation"}]}}))
-    jobs = [job.name for job in plan_study(read_study(TINY), tmp_path)]
+    planned = plan_study(read_study(TINY), tmp_path)
+    jobs = [job.name for job in planned]
     for job in jobs[:2]:
         Receipt(job, "x", {}, {"a": "b", "c": "d"}).save(tmp_path / "jobs")
     told = tmp_path / ".unfinished" / ".told"
     told.mkdir(parents=True)
+    # As a version before this one left it.
+    before = StudyView(tmp_path).view(None, 8.0)
+    assert (before["state"], facts(before, "Jobs")["waiting"]) == ("silent", "not known")
+    planned_in(tmp_path, planned)
     (told / f"{jobs[2].replace('/', '+')}.json").write_text('[0.25, "a remark"]')
     # Of a job that is done by now.
     (told / f"{jobs[0].replace('/', '+')}.json").write_text('[1.0, ""]')
@@ -141,6 +155,12 @@ def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
     assert block(found, "Running")["rows"] == [[jobs[2], "25 %", "a remark"]]
     assert sorted(block(found, "Done")["rows"]) == sorted([job, 2] for job in jobs[:2])
     assert [job for (job,) in block(found, "Waiting")["rows"]] == jobs[3:]
+    for job in jobs:
+        Receipt(job, "x", {}, {"a": "b"}).save(tmp_path / "jobs")
+    assert StudyView(tmp_path).view(None, 8.0)["state"] == "silent"
+    shutil.rmtree(tmp_path / ".unfinished")
+    ended = StudyView(tmp_path).view(None, 8.0)
+    assert (ended["state"], facts(ended, "Jobs")["waiting"]) == ("ended", 0)
 
 
 def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_path: Path) -> None:
@@ -151,10 +171,10 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
         table = ["comparison,robot,mean_first,mean_second", f"a and b,arm,{means[0]},{means[1]}"]
         (tmp_path / name / "tables" / "comparisons.csv").write_text("\n".join(table))
         Receipt("report", "x", {}, {"a": "b"}).save(tmp_path / name / "jobs")
+    planned = plan_study(read_study(TINY), tmp_path)
     for name in names[3:]:
         (tmp_path / name / "jobs").mkdir(parents=True)
-        (tmp_path / name / "study.toml").write_text(TINY.read_text())
-    planned = plan_study(read_study(TINY), tmp_path)
+        planned_in(tmp_path / name, planned)
     Receipt(planned[0].name, "x", {}, {"a": "b"}).save(tmp_path / names[3] / "jobs")
     view = CulturesView(tmp_path)
     assert view.about()["title"] == "study over 5 cultures"
@@ -188,13 +208,14 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
 
 def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -> None:
     study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
-    words = json.dumps({"context study": asdict(study), "versions": {}, "fingerprint": "x"})
-    (tmp_path / "study.json").write_text(words)
+    words = {"context study": asdict(study), "versions": {}, "fingerprint": "x"}
+    (tmp_path / "study.json").write_text(json.dumps(words))
     Receipt("record/2", "x", {}, {"a": "b"}).save(tmp_path / "jobs")
     row = {"name": "policies", "mean_return": 61.5, "actors": 4, "episodes": 400}
     found_out = tmp_path / "culture-2" / "shuttle" / "simulated.json"
     found_out.parent.mkdir(parents=True)
     found_out.write_text(json.dumps({"rows": [row, row | {"name": "random", "mean_return": 1.0}]}))
+    planned_in(tmp_path, plan_context_study(study))
     view = StudyView(tmp_path)
     assert view.about()["title"] == "context study of shuttle, cartpole"
     found = view.view(None, 8.0)
@@ -202,9 +223,6 @@ def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -
     assert (facts(found, "Jobs")["jobs done"], facts(found, "Jobs")["waiting"]) == (1, 2 * (1 + 2 * 3) - 1)
     assert ["measure/1/cartpole"] in block(found, "Waiting")["rows"]
     assert block(found, "Results")["rows"] == [["shuttle", "policies, culture-2", 61.5, 4, 400]]
-    # No code is imported that a file names.
-    (tmp_path / "study.json").write_text(words.replace("shuttle", "nobodys_module:Robot"))
-    assert "code of one's own" in facts(StudyView(tmp_path).view(None, 8.0), "Jobs")["waiting"]
 
 
 def test_a_tuning_is_its_journal(tmp_path: Path) -> None:

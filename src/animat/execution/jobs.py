@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import signal
 import time
@@ -19,8 +20,11 @@ from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
 from animat.progress import Progress
+from animat.writing import write_whole
 
 _LOOK_EVERY_S = 0.2
+PLANNED = ".planned.json"
+"""Of all jobs what they cost, by name, for whoever looks how far it is; as what is unfinished it goes in the end."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,8 @@ class Jobs:
         Raises:
             AnimatError: if a job failed; its message names the job, or all that failed.
         """
+        costs_s = {name: job.cost_s for name, job in self._jobs.items()}
+        write_whole(self._folder / UNFINISHED / PLANNED, json.dumps(costs_s, indent=1) + "\n")
         notices = self._folder / UNFINISHED / ".told"
         notices.mkdir(parents=True, exist_ok=True)
         # Of a run that was killed; its locks may still be held.

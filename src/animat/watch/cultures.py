@@ -14,7 +14,7 @@ from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, newest_s
 from animat.watch.held import is_held, state_of
 from animat.watch.plain import listed, mapped, text
-from animat.watch.study import StudyView
+from animat.watch.study import share_of
 from animat.watch.view import View, in_blocks, titled
 
 _MANIFEST, _DONE, _COMPARISONS = "cultures.json", "jobs/report.json", "tables/comparisons.csv"
@@ -29,7 +29,6 @@ class CulturesView(View):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self._studies: dict[str, StudyView] = {}
         self._compared: dict[str, _Means] = {}
 
     def about(self) -> dict[str, Any]:
@@ -41,7 +40,7 @@ class CulturesView(View):
         names, failed = self._names(), self._failed()
         done = [name for name in names if (self.folder / name / _DONE).exists()]
         begun = [name for name in names if name not in done and (self.folder / name).is_dir()]
-        shares = {name: self._share(name) for name in begun if is_held(self.folder / name) is not False}
+        shares = {name: share_of(self.folder / name) for name in begun if is_held(self.folder / name) is not False}
         self._speed.see(worked := len(done) + sum(shares.values()))
         changed_s = newest_s([self.folder, *(self.folder / name / "jobs" for name in begun)])
         state = state_of(self.folder, changed_s, is_done=len(done) == len(names))
@@ -64,12 +63,6 @@ class CulturesView(View):
             self._comparisons(done, "two-thirds" if is_done else "whole"),
         ]
         return in_blocks(state, blocks)
-
-    def _share(self, name: str) -> float:
-        if name not in self._studies:
-            self._studies = {n: view for n, view in self._studies.items() if is_held(self.folder / n) is not False}
-            self._studies[name] = StudyView(self.folder / name)
-        return self._studies[name].share() or 0.0
 
     def _comparisons(self, done: list[str], width: Width) -> dict[str, Any]:
         over: dict[tuple[str, str], list[tuple[float, float]]] = {}

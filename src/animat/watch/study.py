@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from animat.errors import AnimatError, InvalidFile
-from animat.plain_file import read_toml
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, mean_of_episodes, newest_s, told_by_jobs
 from animat.watch.held import state_of
@@ -22,11 +20,6 @@ _FAILED = "A job that fails ends the study, and its command says which: the fold
 class StudyView(View):
     """A study's folder."""
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self._planned: list[tuple[str, float]] | None = None
-        self._why_not = ""
-
     def about(self) -> dict[str, Any]:
         """What is studied."""
         manifest = self._manifest()
@@ -40,22 +33,20 @@ class StudyView(View):
         self._manifest()
         done = done_jobs(self.folder)
         told = running_jobs(self.folder, done)
-        planned = self._plan(done)
-        names = set(done)
-        left = [] if planned is None else [(name, cost) for name, cost in planned if name not in names]
-        worked, total = _work(planned or [], done, told)
+        worked, costs = _work(self.folder, done, told)
         self._speed.see(worked)
-        is_done = planned is not None and not left
+        # Whoever has come to an end leaves nothing unfinished.
+        is_done = bool(done) and not (self.folder / _UNFINISHED).exists()
         changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / _UNFINISHED).glob("*/*.json")])
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
-        waiting = [name for name, _ in left if name not in told]
+        waiting = [name for name in costs if name not in done and name not in told]
         rows: list[tuple[str, Any]] = [
             ("jobs done", len(done)),
             ("running", len(told) if is_running else 0),
-            ("waiting", len(waiting) if planned is not None else f"not known: {self._why_not}"),
+            ("waiting", len(waiting) if costs or is_done else "not known"),
             ("failed", "none" if is_running or is_done else "its command said which, if any"),
-            ("time left", time_left(self._speed.left_s(total - worked), state)),
+            ("time left", time_left(self._speed.left_s(sum(costs.values()) - worked), state)),
         ]
         blocks = [
             facts("Jobs", rows, "" if is_done else _FAILED),
@@ -66,64 +57,25 @@ class StudyView(View):
         ]
         return in_blocks(state, blocks)
 
-    def share(self) -> float | None:
-        """How much of the work is done, by what jobs cost; None where that is not known."""
-        done = done_jobs(self.folder)
-        worked, total = _work(self._plan(done) or [], done, running_jobs(self.folder, done))
-        return worked / total if total else None
-
     def _manifest(self) -> dict[str, Any]:
         return self._described("study.json", "study")
 
-    def _plan(self, done: dict[str, int]) -> list[tuple[str, float]] | None:
-        """All jobs with what they cost, by the study's specification; None where that cannot be known."""
-        if self._planned is None and not self._why_not:
-            try:
-                self._planned = _jobs_of(self.folder)
-            except AnimatError as error:
-                self._why_not = text(str(error))
-            except Exception as error:
-                # Of another version, or damaged.
-                self._why_not = f"the specification cannot be read ({type(error).__name__})"
-        return self._planned
+
+def share_of(folder: Path) -> float:
+    """How much of a study is done, by what its jobs cost; 0 where that is not known."""
+    done = done_jobs(folder)
+    worked, costs = _work(folder, done, running_jobs(folder, done))
+    return worked / total if (total := sum(costs.values())) else 0.0
 
 
 def _work(
-    planned: list[tuple[str, float]], done: dict[str, int], told: dict[str, tuple[float, str, float]]
-) -> tuple[float, float]:
-    """How much of the work is done, and all that there is, in what jobs cost."""
-    costs = dict(planned)
+    folder: Path, done: dict[str, int], told: dict[str, tuple[float, str, float]]
+) -> tuple[float, dict[str, float]]:
+    """How much of the work is done, and what each job costs, as it is written where jobs run."""
+    found = mapped(json_of(folder / _UNFINISHED / ".planned.json"))
+    costs = {text(name): float(cost) for name, cost in found.items() if number(cost) is not None}
     worked = sum(costs.get(name, 0.0) for name in done)
-    return worked + sum(share * costs.get(name, 0.0) for name, (share, *_) in told.items()), sum(costs.values())
-
-
-def _jobs_of(folder: Path) -> list[tuple[str, float]]:
-    context = mapped(json_of(folder / "study.json")).get(_CONTEXT)
-    if context is not None:
-        return _jobs_of_context(mapped(context))
-    specification = folder / "study.toml"
-    words = read_toml(specification, 2**20)
-    named = [mapped(each) for name in ("robots", "arms") for each in listed(words.get(name))]
-    if any(":" in str(each.get(key, "")) for each in named for key in ("name", "kind", "mapping")):
-        # Reading it would import what it names.
-        raise InvalidFile("the study names code of one's own, which a page does not import")
-    from animat.studies.plan import plan_study
-    from animat.studies.toml import read_study
-
-    return [(job.name, job.cost_s) for job in plan_study(read_study(specification), folder)]
-
-
-def _jobs_of_context(words: dict[str, Any]) -> list[tuple[str, float]]:
-    robots, cultures = (tuple(listed(words.get(name))) for name in ("robots", "cultures"))
-    if any(":" in str(robot) for robot in robots):
-        raise InvalidFile("the study names code of one's own, which a page does not import")
-    if len(robots) * len(cultures) > _MOST_RECEIPTS:
-        raise InvalidFile("the study has more robots and cultures than a page looks through")
-    from animat.studies.context import plan_context_study
-    from animat.studies.context_tasks import ContextStudy
-
-    study = ContextStudy(**{**words, "robots": robots, "cultures": cultures})
-    return [(job.name, job.cost_s) for job in plan_context_study(study)]
+    return worked + sum(share * costs.get(name, 0.0) for name, (share, *_) in told.items()), costs
 
 
 def done_jobs(folder: Path) -> dict[str, int]:
