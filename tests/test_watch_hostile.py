@@ -145,7 +145,7 @@ def test_spikes_that_cannot_be(records: list[Any], tmp_path: Path, seed: int) ->
 TRAINING = {
     "training": {
         "policies": 2, "iterations": 1000, "duration_min": 10.0, "shadowing": True, "mapping": "9-thresholds",
-        "robot": {"name": "cartpole"}, "algorithm": {"discount": 0.9}, "assess": 3,
+        "robot": {"name": "cartpole"}, "algorithm": {"discount": 0.9},
     },
     "simulators": {"recorded_at_min": [0.0, 5.0]},
 }  # fmt: skip
@@ -166,7 +166,7 @@ def test_folders_that_say_anything(tmp_path: Path, seed: int) -> None:
     told = tmp_path / ".unfinished" / ".told"
     told.mkdir(parents=True, exist_ok=True)
     (told / "p0 to p1.json").write_text(json.dumps([anything(draw), anything(draw)]))
-    for file in (".unfinished/from-p0.npz", "p0.safetensors", "assessments.csv", "jobs/x.json"):
+    for file in (".unfinished/from-p0.npz", "p0.safetensors", "jobs/x.json"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_bytes(draw.randbytes(draw.choice([0, 9, 60])))
     costs = {name: anything(draw) for name in ("x", *HOSTILE[:2])}

@@ -38,10 +38,6 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
 
     They are in the training's description and in an evaluation of its policies, which is empty where there is none.
     """
-    training = mapped(manifest.get("training"))
-    others = [name for name in ("robot", "mapping") if _differs(training.get(name), evaluation.get(name))]
-    if others:
-        evaluation = {}
     rows = {str(row.get("name")): number(row.get("mean_return")) for row in map(mapped, listed(evaluation.get("rows")))}
     optimum = mapped(evaluation.get("optimum")).get("value")
     known = {
@@ -59,15 +55,7 @@ def levels_of(manifest: Mapping[str, Any], evaluation: Mapping[str, Any]) -> tup
     if missing := [name for name, value in known.items() if value is None]:
         told += f" Not known: {', '.join(missing)}. To show them, run animat evaluate with --optimum and "
         told += "--out evaluation.json, in this folder."
-    if others:
-        told += f" The evaluation.json in this folder is of another {' and '.join(others)}."
     return [(name, value) for name, value in known.items() if value is not None], told.strip()
-
-
-def _differs(described: Any, named: Any) -> bool:
-    """Whether what a training describes has another name in an evaluation; of a family only that is looked at."""
-    own = mapped(described).get("name") if isinstance(described, Mapping) else described
-    return isinstance(own, str) and isinstance(named, str) and own.partition(":")[0] != named.partition(":")[0]
 
 
 def learning_charts(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import InvalidFile
-from animat.plain_file import read_plain_text
 from animat.watch.blocks import facts, table, time_left
 from animat.watch.files import curve_of_policy, curves_of_checkpoint, json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
@@ -64,8 +61,7 @@ class TrainingView(View):
         ]
         swaps = _swaps(training, simulators, iterations)
         charts = learning_charts(curves, swaps, iterations, levels, missing)
-        policies = _table(planned, curves, shares, told, self._assessed(training))
-        return in_blocks(state, [facts("So far", rows), *charts, policies])
+        return in_blocks(state, [facts("So far", rows), *charts, _table(planned, curves, shares, told)])
 
     def _manifest(self) -> dict[str, Any]:
         return self._described("training.json", "training")
@@ -103,20 +99,6 @@ class TrainingView(View):
         if self._curves.get(path, (None,))[0] != changed_s:
             self._curves[path] = changed_s, read(path)
         return self._curves[path][1]
-
-    def _assessed(self, training: dict[str, Any]) -> dict[str, str]:
-        """The best assessment of each policy, in words."""
-        if not training.get("assess"):
-            return {}
-        try:
-            rows = csv.DictReader(read_plain_text(self.folder / "assessments.csv", 2**24).splitlines())
-            best = {row["policy"]: row for row in rows if row.get("best") == "1" and row.get("policy")}
-        except InvalidFile:
-            return {}
-        return {
-            text(name): f"{text(row.get('mean_return', ''))} after {text(row.get('iterations', ''))} iterations"
-            for name, row in best.items()
-        }
 
 
 def _speed(speed: Speed) -> str:
@@ -157,16 +139,12 @@ def _table(
     curves: dict[int, Float64[np.ndarray, "chunks columns"]],
     shares: dict[int, float],
     told: dict[str, tuple[float, str, float]],
-    assessed: dict[str, str],
 ) -> dict[str, Any]:
     rows = []
     for i in range(planned):
         of = curves.get(i)
         ended = [] if of is None else [x for x in of[:, 2].tolist() if np.isfinite(x)]
         last = ended[-1] if ended else "none yet"
-        rows.append([f"p{i}", f"{100 * shares[i]:.0f} %", last, assessed.get(f"p{i}", "none in the folder yet")])
+        rows.append([f"p{i}", f"{100 * shares[i]:.0f} %", last])
     words = "; ".join(f"{name}: {100 * share:.0f} % {note}".strip() for name, (share, note, _) in told.items())
-    head = ["policy", "done", "last return", "best assessment"]
-    if not assessed:
-        head, rows = head[:3], [row[:3] for row in rows]
-    return table("Policies", head, rows, words, width="whole")
+    return table("Policies", ["policy", "done", "last return"], rows, words, width="whole")
