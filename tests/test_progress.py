@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from animat.progress import Bar, InTurn, Part, Phase, in_phase
+from animat.progress import Bar, InTurn, Part, Phase, Speed, in_phase
 
 SCRIPT = """
 from animat.progress import Bar
@@ -146,6 +146,17 @@ def test_compiling_and_going_on_from_a_checkpoint_are_forgotten(monkeypatch: pyt
         phase.update(0.0 if now_s < 20 else 0.5 + (now_s - 20) / 200, 1)
     assert phase.left() == "40 s left"
     assert phase.counted() == ["800 of 1,000 iterations", "5.0 a second"]
+
+
+def test_the_speed_of_the_last_minute_is_that_of_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    speed, now_s = Speed(60.0), 0.0
+    monkeypatch.setattr("animat.progress.time.monotonic", lambda: now_s)
+    assert speed.left_s(10) is None
+    for second in range(201):
+        now_s = float(second)
+        speed.see(min(second, 100) * 1.0 + 3.0 * max(0, second - 100))
+    assert speed.per_s == pytest.approx(3.0)
+    assert speed.left_s(30.0) == pytest.approx(10.0)
 
 
 def test_parts_make_up_the_whole() -> None:

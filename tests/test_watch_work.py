@@ -29,7 +29,6 @@ from animat.watch.recording import RecordingView
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
-from animat.watch.view import Speed
 from animat.writing import exclusive_lock
 
 TINY = Path(__file__).parent / "tiny_study.toml"
@@ -287,14 +286,3 @@ def test_a_folder_is_held_while_a_run_has_locked_it(tmp_path: Path) -> None:
     with exclusive_lock(tmp_path):
         assert is_held(tmp_path)
     assert not is_held(tmp_path)
-
-
-def test_speed_is_that_of_the_last_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    speed, now_s = Speed(), [0.0]
-    monkeypatch.setattr("animat.watch.view.time.monotonic", lambda: now_s[0])
-    assert speed.left_s(10) is None
-    for second in range(201):
-        now_s[0] = float(second)
-        speed.see(min(second, 100) * 1.0 + 3.0 * max(0, second - 100))
-    assert speed.per_s == pytest.approx(3.0)
-    assert speed.left_s(30.0) == pytest.approx(10.0)

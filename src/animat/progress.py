@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -17,7 +18,7 @@ LINE_EVERY_S = 10.0
 """Between lines, where there is no terminal."""
 _LOOK_EVERY_S = 1.0
 _BAR_WIDTH = 24
-_FORGOTTEN = 1 / 3
+_OF_USE = 2 / 3
 """Of the time that passed: how fast the beginning went is of less use for the rest."""
 _ROUNDING = 1e-9
 """Of all work: what sums of parts may be off by is no progress."""
@@ -91,40 +92,50 @@ def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: s
 
 
 class Speed:
-    """How fast work goes on, of its whole a second: over the later two thirds of the time since it first moved.
+    """How fast work goes on: over the later two thirds of the time since it first moved.
 
-    What was before, compiling and the part of a checkpoint that is gone on from, says nothing about the rest.
+    What was before, compiling and the part of a checkpoint that is gone on from, says nothing about the rest. Work is
+    measured as a share of its whole, or in larger units.
+
+    Args:
+        most_s: over so many seconds at most.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, most_s: float = math.inf) -> None:
+        self._most_s = most_s
         self._seen: deque[tuple[float, float]] = deque()
-        self._began_s = 0.0
+        self._began_s = self._done = 0.0
         self._has_moved = False
 
-    def see(self, now_s: float, share: float) -> None:
-        """Take in how far it is; where that is less than before, other work has begun."""
-        if self._seen and share < self._seen[-1][1]:
+    def see(self, done: float) -> None:
+        """Take in how much is done; where that is less than before, other work has begun."""
+        now_s, self._done = time.monotonic(), done
+        if self._seen and done < self._seen[-1][1]:
             self._seen.clear()
             self._has_moved = False
-        if self._seen and not self._has_moved and share > self._seen[0][1] + _ROUNDING:
+        if self._seen and not self._has_moved and done > self._seen[0][1] + _ROUNDING:
             self._seen.clear()
             self._has_moved = True
         if not self._seen:
             self._began_s = now_s
-        passed_s = now_s - self._began_s
-        if not self._seen or now_s - self._seen[-1][0] >= max(0.5, passed_s / 200):
-            self._seen.append((now_s, share))
-        while len(self._seen) > 1 and self._seen[1][0] <= self._began_s + _FORGOTTEN * passed_s:
+        over_s = min(_OF_USE * (now_s - self._began_s), self._most_s)
+        if not self._seen or now_s - self._seen[-1][0] >= max(0.5, over_s / 130):
+            self._seen.append((now_s, done))
+        while len(self._seen) > 1 and self._seen[1][0] <= now_s - over_s:
             self._seen.popleft()
 
-    def per_s(self, now_s: float, share: float) -> float | None:
-        """None as long as too little is done to tell."""
+    @property
+    def per_s(self) -> float | None:
+        """How much is done a second; None as long as too little is to tell."""
         if not self._seen:
             return None
         since_s, before = self._seen[0]
-        if now_s <= since_s or share - before < _FEWEST_MOVED:
-            return None
-        return (share - before) / (now_s - since_s)
+        passed_s, moved = time.monotonic() - since_s, self._done - before
+        return moved / passed_s if passed_s > 0 and moved >= _FEWEST_MOVED else None
+
+    def left_s(self, left: float) -> float | None:
+        """Until so much more is done; None where that is not known."""
+        return None if self.per_s is None else left / self.per_s
 
 
 class Phase:
@@ -142,7 +153,7 @@ class Phase:
         """Take in a report."""
         # Sums of parts may be a rounding beyond either end.
         self.share, self.note, self.was_told = min(1.0, max(0.0, done / total)), note, True
-        self._speed.see(time.monotonic(), self.share)
+        self._speed.see(self.share)
 
     def end(self) -> None:
         """It is done."""
@@ -158,13 +169,13 @@ class Phase:
         if not self._amount:
             return []
         told = [f"{self.share * self._amount:,.0f} of {self._amount:,.0f} {self._unit}"]
-        per_s = self._speed.per_s(time.monotonic(), self.share)
+        per_s = self._speed.per_s
         return told if per_s is None else [*told, rate_in_words(per_s * self._amount)]
 
     def left(self) -> str:
         """How long the rest would take at the speed so far; empty where that cannot be told."""
-        per_s = self._speed.per_s(time.monotonic(), self.share)
-        return "" if per_s is None or self.share == 1 else f"{duration_in_words((1 - self.share) / per_s)} left"
+        left_s = self._speed.left_s(1 - self.share)
+        return f"{duration_in_words(left_s)} left" if left_s else ""
 
 
 def rate_in_words(per_s: float) -> str:

@@ -14,7 +14,7 @@ from animat.watch.files import curve_of_policy, curves_of_checkpoint, json_of, n
 from animat.watch.held import state_of
 from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
-from animat.watch.view import Speed, View, in_blocks, titled
+from animat.watch.view import View, in_blocks, titled
 
 _UNFINISHED = ".unfinished"
 _MOST_POLICIES = 1000
@@ -53,7 +53,7 @@ class TrainingView(View):
             ("policies", f"{planned:,}, of which {sum(each >= 1 for each in shares.values()):,} are done"),
             ("iterations of each", iterations),
             ("done", f"{100 * done / max(1, planned):.0f} % of all"),
-            ("iterations a second", _speed(self._speed) if is_running else "none now"),
+            ("iterations a second", _speed(self._speed.per_s) if is_running else "none now"),
             ("time left", time_left(self._speed.left_s(left), state)),
             ("mapping", training.get("mapping") or "none: without neurons"),
             *_in_use(training, simulators, share),
@@ -101,8 +101,8 @@ class TrainingView(View):
         return self._curves[path][1]
 
 
-def _speed(speed: Speed) -> str:
-    return "being measured" if speed.per_s is None else f"{speed.per_s:,.0f}, all policies together"
+def _speed(per_s: float | None) -> str:
+    return "being measured" if per_s is None else f"{per_s:,.0f}, all policies together"
 
 
 def _in_use(training: dict[str, Any], simulators: dict[str, Any], share: float) -> list[tuple[str, Any]]:

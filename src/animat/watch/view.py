@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import abc
-import time
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
+from animat.progress import Speed
 from animat.watch.files import json_of
+
+_SPAN_S = 60.0
+"""Over which it is measured how fast work goes on."""
 
 
 class View(abc.ABC):
@@ -18,7 +20,7 @@ class View(abc.ABC):
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._speed = Speed()
+        self._speed = Speed(_SPAN_S)
 
     @abc.abstractmethod
     def about(self) -> dict[str, Any]:
@@ -47,35 +49,3 @@ def titled(title: str) -> dict[str, Any]:
 def in_blocks(state: dict[str, Any], blocks: Sequence[dict[str, Any]], damage: str = "") -> dict[str, Any]:
     """A view that is made of blocks, below how the work stands."""
     return {"generation": 0, **state, "damage": damage, "blocks": list(blocks)}
-
-
-_SPAN_S, _EVERY_S = 60.0, 1.0
-
-
-class Speed:
-    """Amounts of work that were seen to be done, and when."""
-
-    def __init__(self) -> None:
-        self._seen: deque[tuple[float, float]] = deque()
-
-    def see(self, done: float) -> None:
-        """Note that so much is done by now."""
-        now_s = time.monotonic()
-        if self._seen and done < self._seen[-1][1]:
-            self._seen.clear()
-        if not self._seen or now_s - self._seen[-1][0] >= _EVERY_S:
-            self._seen.append((now_s, done))
-        while len(self._seen) > 2 and now_s - self._seen[0][0] > _SPAN_S:
-            self._seen.popleft()
-
-    @property
-    def per_s(self) -> float | None:
-        """In the last minute; None while nothing was seen to be done."""
-        if len(self._seen) < 2:
-            return None
-        (from_s, before), (to_s, after) = self._seen[0], self._seen[-1]
-        return (after - before) / (to_s - from_s) if after > before else None
-
-    def left_s(self, left: float) -> float | None:
-        """Until so much more is done; None where that is not known."""
-        return None if self.per_s is None else left / self.per_s
