@@ -152,7 +152,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
     None for a session that did not end by its plan.
     """
     from animat.cultures.kinds import pulse_for
-    from animat.cultures.living_series import record_living_series
+    from animat.cultures.series import record_series
     from animat.reality_gap import Calibration, run_policies
     from animat.recordings.reading import read_recording
     from animat.responses.series import extract_series
@@ -167,8 +167,8 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
         with backends.opened(backend, channels, seed) as culture:
             pulse = pulse_for(backend)
             protocol = replace(CLOSED_LOOP, patterns=min(100, len(culture.patterns)), pulse=pulse)
-            series = record_living_series(
-                culture, protocol, attempt / "recordings", sessions=2, interval_min=5, seed=seed
+            series = record_series(
+                lambda: culture, protocol, attempt / "recordings", sessions=2, interval_min=5, seed=seed
             )
             out = str(attempt / "policies")
             iterations = ["--iterations", str(options.iterations)] if options.iterations else []

@@ -69,7 +69,7 @@ def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, cap
         signal.raise_signal(signal.SIGTERM)
         time.sleep(5.0)
 
-    monkeypatch.setattr("animat.cultures.series.record_virtual_series", killed)
+    monkeypatch.setattr("animat.cultures.series.record_series", killed)
     before = signal.getsignal(signal.SIGTERM)
     assert animat(["record", "--out", str(tmp_path / "recordings")]) == 130
     assert capsys.readouterr().err.endswith("animat: interrupted; what was finished is kept; start again to go on\n")

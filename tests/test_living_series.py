@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,9 @@ from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MaxOneCulture
 from animat.cultures.kinds import culture_of
-from animat.cultures.living_series import record_living_series
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
+from animat.cultures.series import record_series
 from animat.errors import DeviceFailed, InvalidArgument, Mismatch
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
@@ -47,7 +48,7 @@ def replay() -> ReplayCulture:
 
 def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
     with replay() as culture:
-        series = record_living_series(culture, SHORT, tmp_path / "a", sessions=3, interval_min=2.0, seed=4)
+        series = record_series(lambda: culture, SHORT, tmp_path / "a", sessions=3, interval_min=2.0, seed=4)
     assert [file.name for file in series.files] == [f"recording_{minute:04}_min.nwb" for minute in (0, 2, 4)]
     assert series.missed_min == []
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [file.name for file in series.files]
@@ -61,12 +62,12 @@ def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
 @pytest.mark.oracle
 def test_what_is_due_next_is_recorded_and_what_was_missed_is_told(tmp_path: Path) -> None:
     with FakeCulture() as culture:
-        first = record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
+        first = record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
         kept = [file.read_bytes() for file in first.files]
         # Sessions 2 and 3 would have begun, and 3 be over, when the next is due.
         culture.rest(150.0)
         pulses = culture.pulses
-        series = record_living_series(culture, SHORT, tmp_path, sessions=6, interval_min=1.0)
+        series = record_series(lambda: culture, SHORT, tmp_path, sessions=6, interval_min=1.0)
     assert series.missed_min == [2.0]
     assert [file.name[10:14] for file in series.files] == ["0000", "0001", "0003", "0004", "0005"]
     assert [file.read_bytes() for file in series.files[:2]] == kept
@@ -83,16 +84,16 @@ def test_a_culture_that_fails_leaves_what_was_recorded_before(tmp_path: Path) ->
     # Two blocks a recording: the second recording's first.
     with FakeCulture(fault=fail, at=2) as culture:  # type: ignore[arg-type]
         with pytest.raises(DeviceFailed, match="the test says so"):
-            record_living_series(culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
+            record_series(lambda: culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
         assert [file.name for file in tmp_path.iterdir()] == ["recording_0000_min.nwb"]
-        series = record_living_series(culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
+        series = record_series(lambda: culture, SHORT, tmp_path, sessions=3, interval_min=1.0)
         assert len(series.files) == 3
 
 
 def test_a_second_run_in_a_folder_at_work_is_refused_before_any_stimulus(tmp_path: Path) -> None:
     with replay() as culture, exclusive_lock(tmp_path):
         with pytest.raises(Mismatch, match="another run is at work in this folder"):
-            record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+            record_series(lambda: culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         assert culture.delivered == 0
 
 
@@ -100,7 +101,7 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with replay() as other:
-        (file,) = record_living_series(other, SHORT, tmp_path / "other", sessions=1, interval_min=2.0).files
+        (file,) = record_series(lambda: other, SHORT, tmp_path / "other", sessions=1, interval_min=2.0).files
 
     @contextmanager
     def ended_in_between(folder: Path) -> Iterator[None]:
@@ -108,29 +109,29 @@ def test_what_another_run_left_at_the_last_moment_is_checked_too(
         with exclusive_lock(folder):
             yield
 
-    monkeypatch.setattr("animat.cultures.living_series.exclusive_lock", ended_in_between)
+    monkeypatch.setattr("animat.cultures.series.exclusive_lock", ended_in_between)
     with replay() as culture:
         with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* got another \(protocol\."):
-            record_living_series(culture, replace(SHORT, pulses=2), tmp_path / "series", sessions=2, interval_min=2.0)
+            record_series(lambda: culture, replace(SHORT, pulses=2), tmp_path / "series", sessions=2, interval_min=2.0)
         assert culture.delivered == 0
 
 
 def test_nothing_is_mixed_or_written_over(tmp_path: Path) -> None:
     with replay() as culture:
-        record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+        record_series(lambda: culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         with pytest.raises(Mismatch, match=r"recording_0000_min\.nwb: expected .* got another \(protocol\."):
-            record_living_series(culture, replace(SHORT, pulses=2), tmp_path, sessions=2, interval_min=2.0)
+            record_series(lambda: culture, replace(SHORT, pulses=2), tmp_path, sessions=2, interval_min=2.0)
     with replay() as culture, pytest.raises(Mismatch, match=r"clock, which is at 30\.00 min, got one at 30\.00 min"):
-        record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
+        record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
     with FakeCulture() as culture:
         with pytest.raises(Mismatch, match=r"got another \(source: .* there, .* now\): choose another folder"):
-            record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
+            record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=2.0)
         with pytest.raises(InvalidArgument, match="sessions: expected at least 1"):
-            record_living_series(culture, SHORT, tmp_path / "b", sessions=0)
+            record_series(lambda: culture, SHORT, tmp_path / "b", sessions=0)
         with pytest.raises(InvalidArgument, match="interval_min: expected more than 0 minutes, got nan"):
-            record_living_series(culture, SHORT, tmp_path / "b", interval_min=float("nan"))
+            record_series(lambda: culture, SHORT, tmp_path / "b", interval_min=float("nan"))
         with pytest.raises(InvalidArgument, match="interval_min: expected at least the"):
-            record_living_series(culture, SHORT, tmp_path / "b", sessions=2, interval_min=0.01)
+            record_series(lambda: culture, SHORT, tmp_path / "b", sessions=2, interval_min=0.01)
     assert not (tmp_path / "b").exists()
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -159,9 +160,9 @@ def test_devices_are_recorded_by_the_same_calls(
     protocol = replace(SHORT, pulse=CL1_PULSE if make is cl1 else BALANCED_PULSE)
     with device as culture:
         zero_s = culture.now_s
-        first = record_living_series(culture, protocol, tmp_path, sessions=2, interval_min=0.5)
+        first = record_series(lambda: culture, protocol, tmp_path, sessions=2, interval_min=0.5)
     with device as culture:
-        series = record_living_series(culture, protocol, tmp_path, sessions=3, interval_min=0.5)
+        series = record_series(lambda: culture, protocol, tmp_path, sessions=3, interval_min=0.5)
     assert series.files[:2] == first.files
     assert [r.start_min - zero_s / 60 for r in read_recordings(tmp_path)] == pytest.approx([0, 0.5, 1.0], abs=0.01)
     assert len(pulses_s()) == 3 * 10
@@ -171,19 +172,19 @@ def test_another_chip_or_other_patterns_of_a_cl1_are_refused(tmp_path: Path, mon
     culture, pulses_s = cl1(monkeypatch)
     protocol = replace(SHORT, pulse=CL1_PULSE)
     with culture:
-        record_living_series(culture, protocol, tmp_path, sessions=1, interval_min=0.5)
+        record_series(lambda: culture, protocol, tmp_path, sessions=1, interval_min=0.5)
     with CL1Culture(culture.patterns) as given:
-        record_living_series(given, protocol, tmp_path / "given", sessions=1, interval_min=0.5)
+        record_series(lambda: given, protocol, tmp_path / "given", sessions=1, interval_min=0.5)
     chip = {"system_id": "stand-in", "chip_id": "another"}
-    for other, folder, words in (
-        (CL1Culture(seed=2), tmp_path, r"pattern_seed: 0 there, 2 now"),
-        (CL1Culture(culture.patterns[10:]), tmp_path / "given", r"patterns, got others \(\d+ of them\)"),
-        (CL1Culture(), tmp_path, r"chip_id: 'none' there, 'another' now"),
+    for make, folder, words in (
+        (partial(CL1Culture, seed=2), tmp_path, r"pattern_seed: 0 there, 2 now"),
+        (partial(CL1Culture, culture.patterns[10:]), tmp_path / "given", r"patterns, got others \(\d+ of them\)"),
+        (CL1Culture, tmp_path, r"chip_id: 'none' there, 'another' now"),
     ):
         if "chip_id" in words:
             monkeypatch.setattr(sys.modules["cl"], "get_system_attributes", lambda: chip)
-        with other, pytest.raises(Mismatch, match=words):
-            record_living_series(other, protocol, folder, sessions=2, interval_min=0.5)
+        with pytest.raises(Mismatch, match=words):
+            record_series(make, protocol, folder, sessions=2, interval_min=0.5)
     assert len(pulses_s()) == 2 * 10
 
 
@@ -194,29 +195,29 @@ def test_other_electrodes_of_a_maxone_are_refused_and_other_units_are_not(
     assert isinstance(culture, MaxOneCulture)
     protocol = replace(SHORT, pulse=BALANCED_PULSE)
     with culture:
-        record_living_series(culture, protocol, tmp_path, sessions=1, interval_min=0.5)
+        record_series(lambda: culture, protocol, tmp_path, sessions=1, interval_min=0.5)
         units = culture.provenance["stimulation_units"]
     rig, chosen = culture._given_stream.rig, culture.selection  # type: ignore[union-attr]
     again = Selection(MAXONE, chosen.recording, chosen.stimulation[::-1], chosen.patterns)
     with MaxOneCulture(again, stream=stand_in_maxlab.Stream(rig), settle=False) as rewired:
         assert rewired.provenance["stimulation_units"] != units
         rewired.rest(20.0)
-        record_living_series(rewired, protocol, tmp_path, sessions=2, interval_min=0.5)
+        record_series(lambda: rewired, protocol, tmp_path, sessions=2, interval_min=0.5)
     moved = Selection(MAXONE, chosen.recording + 1, chosen.stimulation, chosen.patterns)
     with MaxOneCulture(moved, stream=stand_in_maxlab.Stream(rig), settle=False) as other:
         assert other.channels.label.tolist() == culture.channels.label.tolist()
         with pytest.raises(Mismatch, match=r"channels, got others \(electrodes differ\)"):
-            record_living_series(other, protocol, tmp_path, sessions=3, interval_min=0.5)
+            record_series(lambda: other, protocol, tmp_path, sessions=3, interval_min=0.5)
 
 
 def test_a_replay_of_other_recordings_is_refused(tmp_path: Path) -> None:
     with replay() as culture:
-        record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
+        record_series(lambda: culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         now_s = culture.now_s
     with ReplayCulture([synthetic_recording(2, channels=32, start_min=30.0)], seed=3) as other:
         other.rest(now_s - other.now_s)
         with pytest.raises(Mismatch, match="replayed seed: 1 there, 2 now"):
-            record_living_series(other, SHORT, tmp_path, sessions=2, interval_min=2.0)
+            record_series(lambda: other, SHORT, tmp_path, sessions=2, interval_min=2.0)
 
 
 def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -279,7 +280,7 @@ def test_a_seed_below_0_is_refused_before_a_device_is_touched(
 ) -> None:
     stand_in_cl.install(monkeypatch)
     with FakeCulture() as culture, pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
-        record_living_series(culture, SHORT, tmp_path / "a", sessions=1, seed=-1)
+        record_series(lambda: culture, SHORT, tmp_path / "a", sessions=1, seed=-1)
     assert culture.pulses == 0
     for make in (
         lambda: CL1Culture(seed=-1),

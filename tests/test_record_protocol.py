@@ -15,7 +15,7 @@ from animat.cli import main
 from animat.cli.record import Record
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
-from animat.cultures.series import check_interval
+from animat.cultures.series import Series, check_interval
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.synthetic import synthetic_recording
@@ -72,9 +72,12 @@ def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path
 
 def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr(
-        "animat.cultures.series.record_virtual_series", lambda culture, protocol, out, **_: asked.append(protocol) or []
-    )
+
+    def noted(make_culture: object, protocol: Protocol, *_: object, **__: object) -> Series:
+        asked.append(protocol)
+        return Series([], [])
+
+    monkeypatch.setattr("animat.cultures.series.record_series", noted)
     (tmp_path / "mine.json").write_text('{"frequencies_hz": [5, 20], "setup_s": 0}')
     assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]) == 0
     assert main(["record", "--pulses", "5", "--out", str(tmp_path / "out")]) == 0
@@ -141,7 +144,7 @@ def test_more_patterns_than_a_virtual_culture_has_are_refused_before_its_array_i
 def test_pulses_faster_than_the_response_window_are_warned_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.cultures.series.record_virtual_series", lambda *_, **__: [])
+    monkeypatch.setattr("animat.cultures.series.record_series", lambda *_, **__: Series([], []))
     (tmp_path / "mine.json").write_text('{"frequencies_hz": [80, 100, 125, 500]}')
     assert main(["record", "--protocol", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]) == 0
     assert "warning: at 125 Hz, 500 Hz the next pulse comes before the response window ends" in capsys.readouterr().err

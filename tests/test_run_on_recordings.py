@@ -14,7 +14,7 @@ import pytest
 from animat.cli import main
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
-from animat.cultures.series import STATE_FILE, record_virtual_series
+from animat.cultures.series import STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
@@ -56,7 +56,7 @@ def policy_of(seed: int, frequencies_hz: tuple[float, ...] = FIVE_HZ) -> Policy:
 @pytest.fixture(scope="module")
 def series(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "recordings"
-    record_virtual_series(partial(small_culture, rule=RULE), PROTOCOL, folder, sessions=2, interval_min=1.0)
+    record_series(partial(small_culture, rule=RULE), PROTOCOL, folder, sessions=2, interval_min=1.0)
     return folder
 
 

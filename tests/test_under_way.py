@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from animat.cultures.living_series import record_living_series
 from animat.cultures.observed import Observed
+from animat.cultures.series import record_series
 from animat.cultures.under_way import UNDER_WAY, UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed
@@ -89,7 +89,7 @@ def test_the_page_shows_a_recording_as_far_as_it_is(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("animat.cultures.under_way.EVERY_S", 0.0)
     looking = Looking(tmp_path)
     with FakeCulture() as culture:
-        record_living_series(culture, SHORT, tmp_path, sessions=2, interval_min=1.0, progress=looking)
+        record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=1.0, progress=looking)
     series = read_recordings([tmp_path])
     # After the second block of each, when there is a file of the first.
     begun, of_the_next = looking.seen
@@ -111,7 +111,7 @@ def test_one_that_fails_leaves_nothing_and_one_that_was_killed_is_told(tmp_path:
         raise DeviceFailed("out of order")
 
     with FakeCulture(fault=fail, at=1) as culture, pytest.raises(DeviceFailed, match="out of order"):
-        record_living_series(culture, SHORT, tmp_path, sessions=1, interval_min=1.0)
+        record_series(lambda: culture, SHORT, tmp_path, sessions=1, interval_min=1.0)
     assert list(tmp_path.iterdir()) == []
     with FakeCulture() as culture:
         recording = culture.record(SHORT, 1)

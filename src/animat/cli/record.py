@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -91,10 +92,7 @@ class Record:
         _expect_no_others(self.out)
         there = set(self.out.glob("*"))
         with Bar("recording") as progress:
-            if self.culture == "synthetic":
-                files = self._synthetic(progress)
-            else:
-                files = self._virtual(progress) if self.culture == "virtual" else self._living(progress)
+            files = self._synthetic(progress) if self.culture == "synthetic" else self._series(progress)
         were_there = "; all were there already" if files and there.issuperset(files) else ""
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{were_there}")
         if protocol is not None and protocol.places:
@@ -115,37 +113,25 @@ class Record:
                 self.seed, self.out, sessions=self._sessions, interval_min=self._interval_min, progress=progress
             )
 
-    def _virtual(self, progress: Progress) -> list[Path]:
-        from animat.cultures.series import record_virtual_series
-        from animat.cultures.virtual import VirtualCulture
-
-        return record_virtual_series(
-            lambda: VirtualCulture(self.seed, progress=progress),
-            self._protocol(),
-            self.out,
-            sessions=self._sessions,
-            interval_min=self._interval_min,
-            progress=progress,
-        )
-
-    def _living(self, progress: Progress) -> list[Path]:
+    def _series(self, progress: Progress) -> list[Path]:
         from animat.cultures.kinds import culture_of
-        from animat.cultures.living_series import record_in_held_folder
-        from animat.cultures.series import check_interval
+        from animat.cultures.series import record_series
         from animat.recordings.reading import read_recordings
 
         assert self.culture != "synthetic"
-        # What can be refused is refused before a culture is opened, whose patterns are not known until then.
-        check_interval(self._protocol(), self._sessions, self._interval_min)
         recordings = read_recordings(self.recordings) if self.recordings else []
-        with (
-            # Held before a device is opened, which stops whatever another run has it do.
-            exclusive_lock(self.out),
-            culture_of(self.culture, seed=self.seed, recordings=recordings, selection=self.selection) as culture,
-        ):
-            protocol = self._protocol(len(culture.patterns))
-            settings = self._sessions, self._interval_min, self.seed
-            series = record_in_held_folder(culture, protocol, self.out, *settings, progress)
+        given: dict[str, Any] = {"recordings": recordings, "selection": self.selection, "progress": progress}
+        make_culture = partial(culture_of, self.culture, seed=self.seed, **given)
+        protocol = self._protocol() if self.culture == "virtual" else self._protocol(len(make_culture().patterns))
+        series = record_series(
+            make_culture,
+            protocol,
+            self.out,
+            sessions=self._sessions,
+            interval_min=self._interval_min,
+            seed=self.seed,
+            progress=progress,
+        )
         for minute in series.missed_min:
             print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
         return series.files

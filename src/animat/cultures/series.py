@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from animat.cultures.base import Culture
 from animat.cultures.safety import Guard
+from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
-from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
+from animat.errors import InvalidArgument, Mismatch, shown
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
@@ -28,134 +30,107 @@ STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
 LONGEST_MIN = 365 * 24 * 60.0
 """From the first recording to the last: a virtual culture's clock goes no further."""
+_MAY_DIFFER = ("stimulation_units",)
+"""What a device tells of itself that can be otherwise when it is opened anew, and makes no other culture of it."""
 
 
-def record_virtual_series(
-    make_culture: Callable[[], VirtualCulture],
+class Series(NamedTuple):
+    """What a series has in the end.
+
+    Attributes:
+        files: the recordings, in the order of time.
+        missed_min: minutes of the series at which none was made: the next was due when the culture was there again.
+    """
+
+    files: list[Path]
+    missed_min: list[float]
+
+
+def record_series(
+    make_culture: Callable[[], Culture],
     protocol: Protocol,
     folder: str | os.PathLike[str],
     *,
     sessions: int = 15,
     interval_min: float = 10.0,
-    needs_state: bool = False,
+    seed: int = 1,
     progress: Progress | None = None,
-) -> list[Path]:
-    """Record a virtual culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
+) -> Series:
+    """Record a culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
 
-    Whatever interrupts it, at whatever moment, calling it again gives the very recordings that an undisturbed run
-    gives, and the state after the last. Every file is complete or absent. After each recording the culture's state is
-    written (`culture.state`); a series goes on from it. What lies between the state and the recordings that are there
-    is recorded again and compared; where there is no state, that is all of an unfinished series. The electrodes in use
-    are written to `selection.json`.
+    The names count from the first recording; `start_min` within is on the culture's own clock. Every file is complete
+    or absent, and none is written over. Called again it goes on with what is due next, as long as the culture's clock
+    went on; a recording whose successor is due is missed.
+
+    A closed `VirtualCulture` misses none: its state is written after each recording (`culture.state`), and whatever
+    interrupts it, calling again gives the very recordings, and state, that an undisturbed run gives. What lies between
+    the state and the recordings that are there is recorded again and compared; where there is no state, that is all.
+    The electrodes in use are written to `selection.json`.
 
     Args:
-        make_culture: makes the culture, new and closed.
+        make_culture: makes the culture, closed, to be opened and closed here; or gives an open one, which stays so. To
+            open a device is to do something to it: the folder is held before (`animat.writing.exclusive_lock`).
         protocol: of every recording; the order of stimuli differs from one to the next.
         folder: where the files go; made if it is missing.
         sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
-        needs_state: whether a complete series without its state is recorded again to have it.
-        progress: told about the scan and after each block.
-
-    Returns:
-        The files, in the order of time.
+        seed: of the orders of stimuli; zero or more.
+        progress: told after each block.
 
     Raises:
-        InvalidArgument: for no sessions, an interval shorter than a recording, or more patterns than the culture has.
-        UnsafeStimulus: for a pulse that the culture's limits do not allow.
-        Mismatch: if a file of the series is there but from another culture, protocol or version, or another run is at
-            work in the folder.
+        InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or more patterns than
+            the culture has.
+        Mismatch: if recordings are there that another culture, protocol or version made, or that lie ahead of the
+            culture's clock, or another run is at work in the folder.
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
+        UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
-    fresh = make_culture()
-    check_interval(protocol, sessions, interval_min, fresh.n_patterns)
-    Guard(fresh.limits, ()).check_pulse(protocol.pulse)
+    if seed < 0:
+        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     folder, progress = Path(folder), progress or Silent()
-    files = series_files(folder, sessions, interval_min)
-    # Seen before it is touched: somebody else's folder stays as it is.
-    _expect_series(files, fresh, protocol, interval_min)
-    with exclusive_lock(folder):
-        # And again now that nobody writes: another run may have ended in between.
-        _expect_series(files, fresh, protocol, interval_min)
-        # What a killed run was just writing; no reader takes such files for whole ones.
-        UnderWay(folder).remove()
+    with exclusive_lock(folder), ExitStack() as opened:
+        culture, recorded, zero_s = make_culture(), 0, 0.0
+        virtual = culture if isinstance(culture, VirtualCulture) and not culture.is_open else None
+        check_interval(protocol, sessions, interval_min, None if virtual is None else virtual.n_patterns)
+        files, interval_s = series_files(folder, sessions, interval_min), 60 * interval_min
+        if virtual is not None:
+            Guard(virtual.limits, ()).check_pulse(protocol.pulse)
+            _expect_lived(files, virtual, protocol, interval_s, seed)
+            virtual, recorded = _resumed(make_culture, virtual, files)
+            culture = virtual
+        if not culture.is_open and recorded < sessions:
+            opened.enter_context(culture)
+        if virtual is None:
+            zero_s = _beginning_s(files, culture, protocol, interval_s)
+        # No reader takes what a killed run was just writing for whole files.
         for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
             for leftover in folder.glob(f"{name}.*.partial*"):
                 clear_away(leftover)
-        _record(make_culture, protocol, files, interval_min, needs_state, progress)
-    return files
-
-
-def _record(
-    make_culture: Callable[[], VirtualCulture],
-    protocol: Protocol,
-    files: list[Path],
-    interval_min: float,
-    needs_state: bool,
-    progress: Progress,
-) -> None:
-    """Record what is missing of a series, from the state that it came to."""
-    folder, sessions = files[0].parent, len(files)
-    there = next((i for i, file in enumerate(files) if not file.exists()), sessions)
-    if there == sessions and not _is_behind(make_culture(), folder / STATE_FILE, sessions, needs_state):
-        if not (folder / SELECTION_FILE).exists():
-            with make_culture() as fresh:
-                fresh.selection.save(folder / SELECTION_FILE)
-        progress.update(sessions, sessions, "all there already")
-        return
-    culture, recorded = _resume(make_culture, folder / STATE_FILE, there)
-    with culture:
-        if not recorded or not (folder / SELECTION_FILE).exists():
-            culture.selection.save(folder / SELECTION_FILE)
-        if not recorded:
-            culture.save_state(folder / STATE_FILE, sessions=0)
-        left = range(recorded, sessions)
-        for session, recording in record_when_due(
-            culture, protocol, files, left, 0.0, 60 * interval_min, culture.seed, progress
-        ):
-            if not (file := files[session]).exists():
+        follow = opened.enter_context(UnderWay(folder))
+        if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
+            virtual.selection.save(folder / SELECTION_FILE)
+        for session, file in enumerate(files[recorded:], recorded):
+            due_s = zero_s + session * interval_s
+            if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
+                continue
+            culture.rest(max(0.0, due_s - culture.now_s))
+            part = Part(progress, session, 1, sessions, file.name)
+            recording = culture.record(protocol, order_seed(seed, session), part, follow)
+            if not file.exists():
                 write_nwb(recording, file)
             elif not read_recording(file).equals(recording):
                 raise Mismatch(
                     f"{file}: expected what recording it again gives, got another culture's, protocol's or version's "
                     "recording: remove it, or choose another folder"
                 )
-            # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
-            culture.save_state(folder / STATE_FILE, sessions=session + 1)
-
-
-def record_when_due(
-    culture: Culture,
-    protocol: Protocol,
-    files: Sequence[Path],
-    left: Iterable[int],
-    zero_s: float,
-    interval_s: float,
-    seed: int,
-    progress: Progress,
-) -> Iterator[tuple[int, Recording]]:
-    """Each recording of a series that is left, with its number, when it is due; one whose successor is due is missed.
-
-    Args:
-        culture: open.
-        protocol: of every recording.
-        files: of the whole series.
-        left: numbers of the recordings to be made, rising.
-        zero_s: when the first one is due, on the culture's clock.
-        interval_s: from one to the next.
-        seed: of the orders of stimuli.
-        progress: told after each block, and when a recording is dealt with.
-    """
-    # Entered where nothing is left, too: a killed run may have left a file.
-    with UnderWay(files[0].parent) as follow:
-        for session in left:
-            due_s = zero_s + session * interval_s
-            if culture.now_s < due_s + interval_s:
-                culture.rest(max(0.0, due_s - culture.now_s))
-                part = Part(progress, session, 1, len(files), files[session].name)
-                yield session, culture.record(protocol, order_seed(seed, session), part, follow)
-                follow.remove()
-                progress.update(session + 1, len(files), files[session].name)
+            if virtual is not None:
+                # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
+                virtual.save_state(folder / STATE_FILE, sessions=session + 1)
+            follow.remove()
+            progress.update(session + 1, sessions, file.name)
+    made = [file for file in files if file.exists()]
+    progress.update(sessions, sessions, made[-1].name if made else "")
+    return Series(made, [session * interval_min for session, file in enumerate(files) if not file.exists()])
 
 
 def order_seed(seed: int, session: int) -> int:
@@ -163,43 +138,25 @@ def order_seed(seed: int, session: int) -> int:
     return seed * 10_000 + session
 
 
-def _is_behind(culture: VirtualCulture, state: Path, sessions: int, needs_state: bool) -> bool:
-    """Whether a run was killed between the last recording and the state after it: the series is to end with both.
-
-    A state that is missing was taken away, as one is written before the first recording; that, and one that cannot be
-    read, matters to a series that goes on or needs its state, not to one that is complete.
-    """
+def _resumed(
+    make_culture: Callable[[], Culture], culture: VirtualCulture, files: list[Path]
+) -> tuple[VirtualCulture, int]:
+    """The culture after the recordings that are there, or as near before that as is known; and after how many."""
+    state = files[0].with_name(STATE_FILE)
     if not state.exists():
-        return needs_state
-    try:
-        return _recorded(culture, state) < sessions
-    except (InvalidFile, Mismatch):
-        if needs_state:
-            raise
-        return False
-
-
-def _recorded(culture: VirtualCulture, state: Path) -> int:
-    """Make a culture what it was when the state of its series was written; returns how many recordings came before."""
-    sessions = culture.restore_state(state).get("sessions")
-    if sessions is None:
+        return culture, 0
+    recorded = culture.restore_state(state).get("sessions")
+    if recorded is None:
         raise Mismatch(
             f"{state}: expected the state of a series of recordings, got one after something else (animat live): "
             "choose another folder"
         )
-    return sessions
-
-
-def _resume(make_culture: Callable[[], VirtualCulture], state: Path, there: int) -> tuple[VirtualCulture, int]:
-    """The culture as it was after the recordings that are there, or as near before that as is known."""
-    culture = make_culture()
-    if state.exists():
-        recorded = _recorded(culture, state)
-        if recorded <= there:
-            return culture, recorded
-        # Recordings were taken away that came before the state: only the beginning is before them.
-        culture = make_culture()
-    return culture, 0
+    if all(file.exists() for file in files[:recorded]):
+        return culture, recorded
+    # Recordings were taken away that came before the state: only the beginning is before them.
+    new = make_culture()
+    assert isinstance(new, VirtualCulture)
+    return new, 0
 
 
 def series_files(folder: Path, sessions: int, interval_min: float) -> list[Path]:
@@ -235,23 +192,63 @@ def minutes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
     return make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
 
 
-def _expect_series(files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_min: float) -> None:
+def _expect_lived(files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_s: float, seed: int) -> None:
+    """Raise unless the recordings that are there are of a culture of these settings, each at its minute."""
     for session, file in enumerate(files):
         if not file.exists():
             continue
-        there = read_recording(file)
-        expected = culture.settings | {"protocol_seed": str(order_seed(culture.seed, session))}
-        if difference := difference_from(expected, protocol, there):
+        told = culture.settings | {"protocol_seed": str(order_seed(seed, session))}
+        there = _read_of(file, told, protocol)
+        if abs(there.start_min * 60 - session * interval_s) > 1e-6:
             raise Mismatch(
-                f"{file}: expected a recording of the same culture and protocol, got another ({difference}): remove "
-                "it, or choose another folder"
+                f"{file}: expected a recording at {session * interval_s / 60:g} min, got one at "
+                f"{there.start_min:g} min: choose another folder"
             )
-        start_s = 60 * session * interval_min
-        if abs(there.start_min * 60 - start_s) > 1e-6:
-            raise Mismatch(f"{file}: expected a recording at {start_s / 60:g} min, got one at {there.start_min:g} min")
 
 
-def difference_from(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:
+def _beginning_s(files: list[Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
+    """When the series began or begins, on the clock of an open culture; raises where recordings are not of it."""
+    zero_s = None
+    told = {name: words for name, words in culture.provenance.items() if name not in _MAY_DIFFER}
+    for session, file in enumerate(files):
+        if not file.exists():
+            continue
+        there = _read_of(file, told, protocol)
+        for name in ("label", "electrode"):
+            if getattr(there.channels, name).tolist() != getattr(culture.channels, name).tolist():
+                raise Mismatch(
+                    f"{file}: expected a recording of this culture's channels, got others ({name}s differ): choose "
+                    "another folder"
+                )
+        # Places are told by the protocol, and are no patterns.
+        if not protocol.places and (strange := other_patterns(there, culture)) is not None:
+            raise Mismatch(
+                f"{file}: expected a recording by this culture's patterns, got others ({strange.value:g} of them): "
+                "choose another folder"
+            )
+        if zero_s is None:
+            zero_s = 60 * there.start_min - session * interval_s
+        if culture.now_s < 60 * there.start_min + there.duration_s:
+            raise Mismatch(
+                f"{file}: expected a recording before the culture's clock, which is at {culture.now_s / 60:.2f} min, "
+                f"got one at {there.start_min:.2f} min: the clock began anew, or it is another culture: choose another "
+                "folder"
+            )
+    return culture.now_s if zero_s is None else zero_s
+
+
+def _read_of(file: Path, told: Mapping[str, str], protocol: Protocol) -> Recording:
+    """A recording that is there; raises unless it was made by this protocol of a culture that tells this of itself."""
+    there = read_recording(file)
+    if difference := _difference(told, protocol, there):
+        raise Mismatch(
+            f"{file}: expected a recording of the same culture and protocol, got another ({difference}): choose "
+            "another folder"
+        )
+    return there
+
+
+def _difference(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:
     """The first setting that a recording was not made with; nothing where there is none."""
     for name, words in expected.items():
         there = {name: _parsed(recording.provenance[name])} if name in recording.provenance else {}

@@ -105,19 +105,19 @@ class RecordCulture(ContextTask):
     n_commands: int = 1
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
+        from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
         from animat.cultures.virtual import VirtualCulture
 
         out = self.recordings(folder, self.n_commands)
-        files = record_virtual_series(
+        files = record_series(
             lambda: VirtualCulture(self.culture),
             presented_for(self.n_commands),
             out,
             sessions=2,
             interval_min=5.0,
-            needs_state=True,
+            seed=self.culture,
             progress=progress,
-        )
+        ).files
         return [*files, out / STATE_FILE, out / SELECTION_FILE]
 
 

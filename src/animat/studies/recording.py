@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_virtual_series
+from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
 from animat.errors import InvalidFile
 from animat.execution.receipts import Receipt
 from animat.progress import Progress
@@ -64,16 +64,15 @@ def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
     from animat.cultures.virtual import VirtualCulture
 
     culture = study.culture
-    return record_virtual_series(
+    return record_series(
         lambda: VirtualCulture(culture.seed),
         culture.protocol(),
         out,
         sessions=culture.sessions,
         interval_min=culture.interval_min,
-        # From which `animat run` goes on; its bytes follow from the culture.
-        needs_state=True,
+        seed=culture.seed,
         progress=progress,
-    )
+    ).files
 
 
 def _synthetic(study: Study, out: Path, progress: Progress) -> list[Path]:
