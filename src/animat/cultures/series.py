@@ -109,6 +109,9 @@ def record_series(
         follow = opened.enter_context(UnderWay(folder))
         if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
             virtual.selection.save(folder / SELECTION_FILE)
+        if virtual is not None and not recorded:
+            # Whatever is killed in the first recording needs no second scan.
+            virtual.save_state(folder / STATE_FILE, sessions=0)
         for session, file in enumerate(files[recorded:], recorded):
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
