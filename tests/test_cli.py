@@ -397,6 +397,11 @@ BAD = {
         ["{policies}, p0: expected a policy for navigation, got one for cartpole; give others, or no --robot"],
     ),
     "no policies": (nothing, ["evaluate", "{folder}", "--recordings", "{recordings}"], ["{folder}", "policies"]),
+    "no recordings to run by": (
+        nothing,
+        ["run", "{policies}", "--out", "{folder}/session"],
+        ["animat: --recordings: expected those that the policies were trained on, got none: record first with"],
+    ),
     "another training's folder": (
         other_robot,
         ["train", "navigation", *QUICK, "--recordings", "{recordings}", "--out", "{folder}/policies"],

@@ -34,7 +34,6 @@ from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.stimulus import Stimulus
 from fake_culture import FakeCulture, Fault
 from test_closed_loop import RANDOM, assert_read_alike, loop_of
-from test_run_on_recordings import policy_of
 
 LONG = Navigation(episode_limit=100_000, stride_m=1e-9)
 
@@ -628,37 +627,6 @@ def test_a_session_comes_back_whatever_its_files_are_like(
     assert len(session.episodes) == 5
     assert recover_session(tmp_path).episodes == session.episodes
     assert_read_alike(tmp_path, loop_of())
-
-
-@pytest.mark.oracle
-def test_a_culture_that_was_recorded_for_a_run_that_failed_is_not_recorded_again(
-    few_bootstraps: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cultures = []
-
-    def made(*_: Any, **__: Any) -> FakeCulture:
-        cultures.append(FakeCulture())
-        return cultures[-1]
-
-    def dead(*_: Any, **__: Any) -> Any:
-        raise UnusableData("dead-window: nothing is answered")
-
-    policy_of(0).save(tmp_path / "p0.safetensors")
-    given = ["run", str(tmp_path / "p0.safetensors"), "--episodes", "1", "--controls", "random"]
-    given += ["--out", str(tmp_path / "session")]
-    monkeypatch.setattr("animat.cultures.kinds.culture_of", made)
-    with monkeypatch.context() as patched:
-        patched.setattr("animat.responses.series.extract_series", dead)
-        assert main(given) == 1
-    assert "dead-window" in capsys.readouterr().err
-    recorded = tmp_path / "session" / "calibration.nwb"
-    before = recorded.read_bytes()
-    assert main([*given, "--allow", "dead-window"]) == 1
-    assert f"`--recordings {recorded}` to run by that" in capsys.readouterr().err
-    assert len(cultures) == 1
-    assert main([*given, "--recordings", str(recorded)]) == 0
-    assert "recorded first" not in capsys.readouterr().err
-    assert recorded.read_bytes() == before
 
 
 KILLED = """

@@ -15,15 +15,12 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.encoder import Dealer, Encoder
 from animat.coding.mapping import Thresholds
-from animat.coding.recording import protocol_of
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition, other_stimulus
 from animat.responses.conditions import All, ByBoth, ByElectrode, ByFrequency, ByInterval, ByPattern, conditions_named
 from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
-from animat.stimulation.pulse import PUBLISHED_PULSE
-from animat.stimulation.schedule import make_schedule
 from animat.stimulation.stimulus import Stimuli
 from fake_culture import FakeCulture, OneCondition
 
@@ -224,30 +221,3 @@ def test_electrodes_that_a_culture_does_not_have_are_refused_before_a_pulse(tmp_
             run_session(culture, loop, [Agent("any", "", AnyCondition(2))], tmp_path)
         assert culture.pulses == 0
     assert not list(tmp_path.iterdir())
-
-
-def test_the_protocol_of_an_encoder_presents_every_condition_as_often() -> None:
-    on_places = tuple(Condition(f"{i}", i, "", (5.0, 20.0), (SETS[i],)) for i in (0, 2))
-    protocol = protocol_of(Encoder(on_places, 2), "mixed", 4, PUBLISHED_PULSE)
-    assert (protocol.frequencies_hz, protocol.places, protocol.pulses) == ((5.0, 20.0), (SETS[0], SETS[2]), 2)
-    stimuli = make_schedule(protocol, PATTERNS, 0, places=(SETS[0], SETS[2])).blocks[0].stimuli
-    last = stimuli.is_last_of_presentation
-    each = Counter(zip(stimuli.frequency_hz[last].tolist(), stimuli.pattern[last].tolist(), strict=True))
-    assert each == {(hz, place): 500 for hz in (5.0, 20.0) for place in (0, 2)}
-    protocol = protocol_of(Encoder((Condition("8 Hz", 8.0, "Hz"),)), "blocked", 4, PUBLISHED_PULSE)
-    assert (protocol.frequencies_hz, protocol.patterns, protocol.trials) == ((8.0,), 4, 100)
-    assert protocol.places == ()
-
-
-@pytest.mark.parametrize(
-    ("others", "pulses"),
-    [
-        ([a_condition(None)], 1),
-        ([a_condition((SETS[1],), only_last=True)], 2),
-        ([a_condition((SETS[1],), 20.0)], 1),
-    ],
-)
-def test_conditions_that_no_protocol_presents_need_their_recordings(others: list[Condition], pulses: int) -> None:
-    encoder = Encoder((a_condition((SETS[0],)), *others), pulses)
-    with pytest.raises(InvalidArgument, match="expected every one on electrodes of its own"):
-        protocol_of(encoder, "mixed", 4, PUBLISHED_PULSE)

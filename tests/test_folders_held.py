@@ -21,21 +21,20 @@ from test_run_on_recordings import policy_of
 
 pytestmark = pytest.mark.usefixtures("few_bootstraps")
 
-OPENING = ["record cl1", "record replay", "run", "run on recordings", "live"]
+OPENING = ["record cl1", "record replay", "run", "live"]
 
 
 def command(name: str, folder: Path) -> list[str]:
     """A command that opens a culture for the folder `out`."""
     policy_of(0).save(folder / "p0.safetensors")
     synthetic = folder / "synthetic.nwb"
-    if name in ("record replay", "run on recordings"):
+    if name in ("record replay", "run"):
         write_nwb(synthetic_recording(1, patterns=40, channels=32), synthetic)
     return {
         "record synthetic": ["record", "--culture", "synthetic", "--sessions", "1"],
         "record cl1": ["record", "--culture", "cl1"],
         "record replay": ["record", "--culture", "replay", "--recordings", str(synthetic)],
-        "run": ["run", str(folder / "p0.safetensors")],
-        "run on recordings": ["run", str(folder / "p0.safetensors"), "--recordings", str(synthetic)],
+        "run": ["run", str(folder / "p0.safetensors"), "--recordings", str(synthetic)],
         "live": ["live", "navigation"],
     }[name] + ["--out", str(folder / "in" / "out")]
 
@@ -68,7 +67,7 @@ def test_the_folder_is_held_while_a_culture_is_opened_and_taken_away_if_that_fai
 
 @pytest.mark.oracle
 def test_a_session_that_still_runs_is_not_recovered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*command("run on recordings", tmp_path), "--culture", "replay", "--episodes", "1"]) == 0
+    assert main([*command("run", tmp_path), "--culture", "replay", "--episodes", "1"]) == 0
     session = tmp_path / "in" / "out"
     before = (session / "session.nwb").stat().st_mtime_ns
     with exclusive_lock(session):

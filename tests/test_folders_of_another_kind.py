@@ -12,7 +12,8 @@ from animat.cultures.series import SELECTION_FILE, STATE_FILE
 from animat.errors import Mismatch
 from animat.live.plan import LOG_FILE as LIVE
 from animat.marks import MARKS, Kind, expect_no_other
-from animat.recordings.formats.nwb import recording_name
+from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.recordings.synthetic import synthetic_recording
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
@@ -24,7 +25,7 @@ TINY = Path(__file__).parent / "tiny_study.toml"
 COMMANDS: dict[Kind, tuple[str, list[str]]] = {
     "recording": ("recordings", ["record", "--culture", "synthetic", "--sessions", "1"]),
     "training": ("policies", ["train", "cartpole", "--mapping", "none", "--policies", "1", "--iterations", "1000"]),
-    "session": ("a session", ["run", "{beside}/p0.safetensors"]),
+    "session": ("a session", ["run", "{beside}/p0.safetensors", "--recordings", "{beside}/synthetic.nwb"]),
     "cultures": ("a study of many cultures", ["study", "{beside}/many.toml"]),
 }
 """What each takes its folder for, and its words but for the folder."""
@@ -47,8 +48,10 @@ OTHERS: list[tuple[Kind, str, str]] = [
     ("kind", "mark", "told"), [(kind, *other) for kind in COMMANDS for of, *other in OTHERS if of != kind]
 )
 def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
-    kind: Kind, mark: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: Kind, mark: str, told: str, few_bootstraps: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    if kind == "session":
+        write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
     policy_of(0).save(tmp_path / "p0.safetensors")
     (tmp_path / "many.toml").write_text(TINY.read_text().replace("[culture]\n", '[culture]\nseeds = "1-2"\n'))
     out = tmp_path / "out"

@@ -44,7 +44,6 @@ from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.reading import read_recording
 from animat.recordings.recording import RecordedCulture, Recording
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
@@ -706,11 +705,9 @@ class TestCommand:
         session = folder / "session"
         session.mkdir()
         (session / "session.log").write_bytes(b"what a killed program left")
-        (session / "calibration.nwb").write_bytes(b"its recording")
-        for given in ([], ["--recordings", str(folder / "recordings")]):
-            assert main(["run", str(folder / "policies"), "--out", str(session), *given]) == 1
-            assert f"`animat recover {session}` does it; choose another folder" in capsys.readouterr().err
-        assert (session / "calibration.nwb").read_bytes() == b"its recording"
+        assert self.command(folder) == 1
+        assert f"`animat recover {session}` does it; choose another folder" in capsys.readouterr().err
+        assert [file.name for file in session.iterdir()] == ["session.log"]
 
     def test_a_recording_that_could_not_be_written_is_an_error(
         self, folder: Path, capsys: pytest.CaptureFixture[str]
@@ -723,10 +720,7 @@ class TestCommand:
         assert "animat recover" in printed.err
         assert "is its recording" not in printed.out
 
-    @pytest.mark.parametrize("is_recorded", [True, False])
-    def test_a_polite_kill_closes_the_culture_whenever_it_comes(
-        self, folder: Path, is_recorded: bool, monkeypatch: pytest.MonkeyPatch, recordings: list[Recording]
-    ) -> None:
+    def test_a_polite_kill_closes_the_culture(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def kill(culture: FakeCulture, observed: Observed) -> Observed:
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(0.2)
@@ -735,7 +729,7 @@ class TestCommand:
         culture = FakeCulture(fault=kill, at=0)
         monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: culture)
         before = signal.getsignal(signal.SIGTERM)
-        given = ["--recordings", str(folder / "recordings")] if is_recorded else []
+        given = ["--recordings", str(folder / "recordings")]
         assert main(["run", str(folder / "policies"), *given, "--out", str(folder / "new")]) == 130
         assert not culture.is_open
         assert culture.deliveries <= 2
@@ -781,25 +775,13 @@ class TestCommand:
         assert "budget.pulses: 50 of 50 pulses are spent, and 2 more were wanted" in printed.err
         assert "50 of 50 pulses" in printed.out
 
-    @pytest.mark.oracle
-    def test_without_recordings_the_culture_is_recorded_first(
-        self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("animat.cultures.kinds.culture_of", lambda *_, **__: FakeCulture())
-        policy, out = str(folder / "policies" / "p0.safetensors"), folder / "new"
-        assert main(["run", policy, "--episodes", "1", "--controls", "random", "--out", str(out)]) == 0
-        printed = capsys.readouterr()
-        assert "the culture is recorded first" in printed.err
-        assert (out / "calibration.nwb").is_file()
-        assert read_recording(out / "calibration.nwb").presentation == Presentation("mixed", 2)
-        assert "other-presentation" not in printed.err
-
-    def test_a_bad_simulator_is_found_before_the_culture_is_recorded_for_it(
+    def test_a_bad_simulator_is_found_before_recordings_are_read(
         self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], never_opened: None
     ) -> None:
         policy, out = str(folder / "policies" / "p0.safetensors"), tmp_path / "session"
         for option, value in (("--bins", "0"), ("--range-hz", "-5")):
-            assert main(["run", policy, option, value, "--out", str(out)]) == 1
+            given = ["--recordings", str(tmp_path / "none"), "--out", str(out)]
+            assert main(["run", policy, option, value, *given]) == 1
             assert f"{option}: expected" in capsys.readouterr().err.splitlines()[-1]
         assert not out.exists()
 

@@ -20,7 +20,6 @@ from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.coding.encoder import Dealer, Encoder
 from animat.coding.mapping import Thresholds
-from animat.coding.recording import protocol_of
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, Budget
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
@@ -112,10 +111,9 @@ def test_rests_are_recorded_sorted_and_read_as_other_trials(pulses: int, tmp_pat
     responses = extract_responses(read, burst_threshold=1.0)
     assert responses.by == "electrode" and np.bincount(responses.condition).tolist() == [12, 12, 12]
     assert ByPattern().assign(read.stimuli).conditions == ()
-    # As policies keep them, and as a culture without recordings is recorded first.
+    # As policies keep them.
     encoder = Encoder(responses.conditions, pulses)
     assert encoder.electrodes == tuple(sorted((sites[0], *sites[2:5])))
-    assert protocol_of(encoder, "mixed", 20, PUBLISHED_PULSE).places == (NONE, sites[:1], sites[2:5])
     dealt = Dealer(encoder, np.array([[7, 8]]), np.random.default_rng(1)).targets(0)
     assert [tuple(each) for each in dealt] == [((), NOTHING)] * pulses
 

@@ -125,17 +125,15 @@ def test_recordings_of_no_virtual_culture_are_told(
 
 
 @pytest.mark.parametrize(
-    ("frequencies_hz", "is_recorded"),
+    "frequencies_hz",
     [
-        pytest.param((5.0, 80.0), True, marks=pytest.mark.oracle),
-        pytest.param((80.0, 5.0), True, marks=pytest.mark.oracle),
-        pytest.param((80.0, 40.0, 20.0, 10.0, 5.0), True, marks=pytest.mark.oracle),
-        ((80.0, 5.0), False),
+        pytest.param((5.0, 80.0), marks=pytest.mark.oracle),
+        (80.0, 5.0),
+        pytest.param((80.0, 40.0, 20.0, 10.0, 5.0), marks=pytest.mark.oracle),
     ],
 )
 def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
     frequencies_hz: tuple[float, ...],
-    is_recorded: bool,
     series: Path,
     tmp_path: Path,
     small_ones: None,
@@ -151,14 +149,8 @@ def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
 
     monkeypatch.setattr("animat.reality_gap.Calibration", Noted)
     policy = policy_of(0, frequencies_hz)
-    if is_recorded:
-        assert run(tmp_path / "session", policy, series, "--at-min", "1") == 0
-        recording = read_recording(series / "recording_0001_min.nwb")
-    else:
-        policy.save(tmp_path / "p0.safetensors")
-        given = ["--out", str(tmp_path / "session"), "--controls", "random", "--episodes", "1"]
-        assert main(["run", str(tmp_path / "p0.safetensors"), *given]) == 0
-        recording = read_recording(tmp_path / "session" / "calibration.nwb")
+    assert run(tmp_path / "session", policy, series, "--at-min", "1") == 0
+    recording = read_recording(series / "recording_0001_min.nwb")
     (calibration,) = taken
     assert calibration.conditions == policy.conditions
     # As animat train --conditions has it, whose percentiles are those of the responses to these frequencies.
@@ -258,22 +250,6 @@ def test_policies_of_before_are_run_as_their_recordings_tell(series: Path, tmp_p
     assert run(tmp_path / "session", replace(policy, conditions=before), series, "--at-min", "1") == 0
     patterns = [tick.patterns[-1] for tick in read_session(tmp_path / "session").ticks if tick.patterns]
     assert set(patterns) == {1, 6, 4}
-
-
-@pytest.mark.oracle
-def test_a_culture_is_recorded_first_on_the_electrodes_of_the_policies(
-    series: Path, tmp_path: Path, small_ones: None
-) -> None:
-    sets = {c.label: c.electrodes for c in over(series, "pattern:1,6,4").conditions}
-    alone = tuple(replace(c, only_last=False, frequencies_hz=(80.0,)) for c in over(series, "pattern:1,6,4").conditions)
-    policy = replace(over(series, "pattern:1,6,4"), conditions=alone, presentation=Presentation("blocked", 1))
-    policy.save(tmp_path / "p0.safetensors")
-    given = ["--out", str(tmp_path / "session"), "--controls", "random", "--episodes", "1"]
-    assert main(["run", str(tmp_path / "p0.safetensors"), *given]) == 0
-    recording = read_recording(tmp_path / "session" / "calibration.nwb")
-    found = conditions_named("pattern").assign(recording.stimuli)
-    assert {c.label: c.electrodes for c in found.conditions} == sets
-    assert np.bincount(found.condition).tolist() == [100] * 3
 
 
 @pytest.mark.parametrize("lacks", ["electrodes", "frequency_hz"])

@@ -122,10 +122,10 @@ class Record:
         recordings = read_recordings(self.recordings) if self.recordings else []
         given: dict[str, Any] = {"recordings": recordings, "selection": self.selection, "progress": progress}
         make_culture = partial(culture_of, self.culture, seed=self.seed, **given)
-        protocol = self._protocol() if self.culture == "virtual" else self._protocol(len(make_culture().patterns))
         series = record_series(
             make_culture,
-            protocol,
+            # A virtual culture has as many patterns as are usual.
+            self._protocol() if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
             self.out,
             sessions=self._sessions,
             interval_min=self._interval_min,

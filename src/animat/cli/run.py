@@ -21,7 +21,6 @@ from animat.writing import exclusive_lock
 if TYPE_CHECKING:
     from animat.closed_loop.loop import Loop
     from animat.cultures.base import Culture
-    from animat.cultures.budget import Account
     from animat.progress import Progress
     from animat.reality_gap import Calibration, RealityGap
     from animat.recordings.findings import Finding
@@ -29,9 +28,6 @@ if TYPE_CHECKING:
     from animat.responses.conditions import Conditions
     from animat.stimulation.pulse import Pulse
     from animat.training.policy import Policy
-
-CALIBRATION_FILE = "calibration.nwb"
-"""What `run` records first where no recordings are given, in the session's folder."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +41,7 @@ class Run(Stimulating):
     mapping: str | None = None
     """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
     recordings: tuple[Path, ...] = ()
-    """Recordings the policies were trained on: their percentiles and prediction; default: the culture is recorded"""
+    """Recordings the policies were trained on: their percentiles and prediction"""
     at_min: float | None = None
     """Minute whose newest recording is taken; default: the last that the policies were trained on"""
     state: Path | None = None
@@ -99,6 +95,11 @@ class Run(Stimulating):
         from animat.robots.host import HostRobot
 
         # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
+        if not self.recordings:
+            raise InvalidArgument(
+                "--recordings: expected those that the policies were trained on, got none: record first with "
+                "`animat record`, and train on that"
+            )
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
@@ -115,24 +116,20 @@ class Run(Stimulating):
         settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         keep_compilations()
-        recordings = read_recordings(self.recordings) if self.recordings else []
-        calibration, conditions = None, first.conditions
-        if recordings:
-            calibration = self._calibration(recordings, first, self.at_min)
-            check_conditions(first, calibration)
-            conditions = calibration.conditions
-        loop, _ = Loop.of_policy(first, np.zeros(percentiles_shape(first.readouts)), conditions=conditions, **settings)
+        recordings = read_recordings(self.recordings)
+        calibration = self._calibration(recordings, first)
+        check_conditions(first, calibration)
+        loop, _ = Loop.of_policy(
+            first, np.zeros(percentiles_shape(first.readouts)), conditions=calibration.conditions, **settings
+        )
         with (
             ExitStack() as told,
             # Last, as it makes the folder.
-            _held_for_session(self.out, is_recording=not recordings),
+            _held_for_session(self.out),
             Bar("culture") as progress,
             self._culture(recordings, progress) as culture,
         ):
             pulse, patterns, noticed = self._presenting(culture, recordings, calibration, loop)
-            if calibration is None:
-                recording = self._record(culture, first, account, progress)
-                calibration = self._calibration([recording], first, recording.start_min)
             gap = run_policies(
                 policies,
                 culture,
@@ -166,8 +163,6 @@ class Run(Stimulating):
     def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
         from animat.cultures.kinds import culture_of, recorded_culture
 
-        if self.culture == "replay" and not recordings:
-            raise InvalidArgument("--recordings: expected some for a replay to answer from, got none")
         known = recorded_culture(self.culture, recordings, self.recordings)
         state = self.state or (known.get("state") if self.culture_seed is None else None)
         seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
@@ -179,14 +174,12 @@ class Run(Stimulating):
         return culture
 
     def _presenting(
-        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration | None, loop: Loop
+        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration, loop: Loop
     ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
-        """The pulse and how many patterns, as in the recordings where there are any; and where the culture differs."""
+        """The pulse and how many patterns, as in the recordings where they tell; and where the culture differs."""
         from animat.cultures.kinds import pulse_for
         from animat.cultures.same_culture import other_culture, other_patterns
 
-        if calibration is None:
-            return pulse_for(self.culture), None, ()
         found = [other_culture(recordings[0], calibration.start_min, culture)]
         if loop.encoder.takes_patterns:
             found.append(other_patterns(recordings[0], culture))
@@ -196,25 +189,7 @@ class Run(Stimulating):
             return pulse_for(self.culture), None, noticed
         return protocol.pulse, min(protocol.patterns, len(culture.patterns)), noticed
 
-    def _record(self, culture: Culture, first: Policy, account: Account, progress: Progress) -> Recording:
-        """The culture as it is now, presented as the policies' recordings were."""
-        from animat.coding.encoder import Encoder
-        from animat.coding.recording import protocol_of
-        from animat.cultures.budget import record_within
-        from animat.cultures.kinds import pulse_for
-        from animat.progress import in_phase
-        from animat.recordings.formats.nwb import write_nwb
-        from animat.stimulation.protocol import CLOSED_LOOP
-
-        presentation = first.presentation or CLOSED_LOOP.presentation
-        encoder = Encoder(first.conditions, presentation.pulses)
-        protocol = protocol_of(encoder, presentation.order, len(culture.patterns), pulse_for(self.culture))
-        print("no recordings were given: the culture is recorded first", file=sys.stderr)
-        recording = record_within(account, culture, protocol, self.seed, in_phase(progress, "recording"))
-        write_nwb(recording, self.out / CALIBRATION_FILE)
-        return recording
-
-    def _calibration(self, recordings: Sequence[Recording], first: Policy, at_min: float | None) -> Calibration:
+    def _calibration(self, recordings: Sequence[Recording], first: Policy) -> Calibration:
         from animat.reality_gap import Calibration
         from animat.responses.series import extract_series
         from animat.responses.windows import DEFAULT_WINDOW_MS
@@ -229,27 +204,18 @@ class Run(Stimulating):
             readouts=first.readouts,
         )
         return Calibration.of_series(
-            series, first, at_min=at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
+            series, first, at_min=self.at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         )
 
 
 @contextmanager
-def _held_for_session(folder: Path, *, is_recording: bool) -> Iterator[None]:
-    """Hold a folder that can take a new session; the error of one that cannot says what is there.
-
-    Where the culture `is_recording` first, a recording of a run that failed must not be there: each costs a living
-    culture some thousand pulses.
-    """
+def _held_for_session(folder: Path) -> Iterator[None]:
+    """Hold a folder that can take a new session; the error of one that cannot says what is there."""
     from animat.closed_loop.session import expect_no_session
 
     expect_no_file(folder, "the session")
     with exclusive_lock(folder):
         expect_no_session(folder)
-        if is_recording and (there := folder / CALIBRATION_FILE).exists():
-            raise InvalidArgument(
-                f"{there}: the culture was recorded there already, for a session that did not begin; give "
-                f"`--recordings {there}` to run by that, or choose another folder"
-            )
         yield
 
 

@@ -48,7 +48,7 @@ class Series(NamedTuple):
 
 def record_series(
     make_culture: Callable[[], Culture],
-    protocol: Protocol,
+    protocol: Protocol | Callable[[Culture], Protocol],
     folder: str | os.PathLike[str],
     *,
     sessions: int = 15,
@@ -70,7 +70,8 @@ def record_series(
     Args:
         make_culture: makes the culture, closed, to be opened and closed here; or gives an open one, which stays so. To
             open a device is to do something to it: the folder is held before (`animat.writing.exclusive_lock`).
-        protocol: of every recording; the order of stimuli differs from one to the next.
+        protocol: of every recording, or what gives it for the culture, which is not opened yet; the order of stimuli
+            differs from one recording to the next.
         folder: where the files go; made if it is missing.
         sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
@@ -90,6 +91,8 @@ def record_series(
     folder, progress = Path(folder), progress or Silent()
     with exclusive_lock(folder), ExitStack() as opened:
         culture, recorded, zero_s = make_culture(), 0, 0.0
+        if not isinstance(protocol, Protocol):
+            protocol = protocol(culture)
         virtual = culture if isinstance(culture, VirtualCulture) and not culture.is_open else None
         check_interval(protocol, sessions, interval_min, None if virtual is None else virtual.n_patterns)
         files, interval_s = series_files(folder, sessions, interval_min), 60 * interval_min
