@@ -293,7 +293,7 @@ def test_a_delivery_that_hung_hands_over_nothing_in_a_later_session(neurons: Neu
 
 def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]
     with CL1Culture(record_to=tmp_path) as culture:
-        culture.present([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)])
+        culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)], 0.01)
     ((frame, text),) = neurons.stream
     assert frame == neurons.pulses[0][0]
     assert said(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 3, "presentation": 7}

@@ -29,11 +29,6 @@ class TestReplay(CultureContract):
         return ReplayCulture([synthetic_recording(1, channels=32), synthetic_recording(1, channels=32, start_min=10.0)])
 
 
-class TestReplayInOrder(CultureContract):
-    def make_culture(self) -> Culture:
-        return ReplayCulture([synthetic_recording(2, channels=32)], how="in order")
-
-
 class Leaky(ReplayCulture):
     """Breaks the contract: its clock stands still."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failing import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, stimulus_table, with_rests
+from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, with_rests
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
@@ -22,10 +22,10 @@ from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.places import electrodes_of
 from animat.stimulation.plain import number, seconds
-from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.schedule import Block, Schedule, make_schedule
-from animat.stimulation.stimulus import Stimulus, plain_stimuli
+from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN
 
 
@@ -173,33 +173,6 @@ class Culture(Openable):
         # Spikes lie on samples: half a nanosecond off an edge is on it.
         inside = (since_s >= start_ms * 1e-3 - 5e-10) & (since_s < end_ms * 1e-3 - 5e-10)
         return Spikes(since_s[inside], observed.spikes.channel[inside])
-
-    @final
-    def present(
-        self, stimuli: Iterable[Stimulus], *, until_ms: float = 10.0, presentation: Presentation | None = None
-    ) -> Recording:
-        """Deliver the stimuli of a presentation and record up to `until_ms` after the last one.
-
-        For trying out by hand: the short recording is read by the same extraction of responses as any other. A closed
-        loop calls `deliver`, and its session is one recording.
-
-        Args:
-            stimuli: at least one, in the order of time, counted from now.
-            until_ms: the end of the response window.
-            presentation: how it is presented.
-
-        Raises:
-            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
-        """
-        stimuli, until_ms = plain_stimuli(stimuli), number("until_ms", until_ms)
-        if not stimuli:
-            raise InvalidArgument("stimuli: expected at least one in a trial, got none")
-        start_min = self.now_s / 60
-        observed = self.deliver(stimuli, stimuli[-1].time_s + until_ms * 1e-3)
-        table = stimulus_table(stimuli, observed.stimulus_time_s)
-        # From 0 s on its own clock.
-        span = 0.0, observed.duration_s, start_min
-        return Recording(*observed.spikes, self.channels, table, self.sampling_rate_hz, *span, presentation)
 
     @final
     def schedule(self, protocol: Protocol, seed: int = 0) -> Schedule:

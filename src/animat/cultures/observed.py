@@ -12,7 +12,6 @@ from jaxtyping import Float64, Int64
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.schedule import Schedule
 from animat.stimulation.stimulus import Stimuli, Stimulus
-from animat.tables import padded
 
 
 class Spikes(NamedTuple):
@@ -65,17 +64,6 @@ def with_rests(observed: Observed, stimuli: Sequence[Stimulus], now_s: float) ->
     time_s = np.maximum(0.0, asked_s + late_s)
     time_s[~is_rest] = observed.stimulus_time_s
     return replace(observed, stimulus_time_s=time_s)
-
-
-def stimulus_table(stimuli: Sequence[Stimulus], time_s: Float64[np.ndarray, " stimuli"]) -> Stimuli:
-    """Delivered stimuli as a recording's table, at the times they really began."""
-    return Stimuli(
-        time_s=time_s,
-        frequency_hz=np.array([stimulus.frequency_hz for stimulus in stimuli]),
-        pattern=np.array([stimulus.pattern for stimulus in stimuli]),
-        electrodes=padded([stimulus.electrodes for stimulus in stimuli]),
-        presentation=np.array([stimulus.presentation for stimulus in stimuli]),
-    )
 
 
 def assembled(

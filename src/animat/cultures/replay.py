@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -17,8 +17,6 @@ from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
 NS = 1_000_000_000
-_Key = tuple[int, float, bool, int]
-"""A recording, a frequency, whether the pulse is the last of its presentation, and its set of electrodes."""
 REACH_S = 1.0
 """How much of what followed a stimulus is its answer, unless another one came sooner: beyond any response window."""
 
@@ -34,12 +32,11 @@ class ReplayCulture(ComputedCulture):
 
     Args:
         recordings: of one culture, at least one, with stimuli of known frequencies and electrodes.
-        how: `"draw"`, a response is drawn at random; `"in order"`, they come as they were recorded, then over again.
-        seed: decides the draws; 0 or more.
+        seed: decides which response is drawn; 0 or more.
         limits: tighter limits than `SIMULATED_LIMITS`.
 
     Raises:
-        InvalidArgument: for no recordings, another `how`, or a seed below 0.
+        InvalidArgument: for no recordings, or a seed below 0.
         Mismatch: for recordings with different channels.
         UnusableData: for a recording without stimuli of known frequency and electrodes.
     """
@@ -50,7 +47,6 @@ class ReplayCulture(ComputedCulture):
         self,
         recordings: Sequence[Recording],
         *,
-        how: Literal["draw", "in order"] = "draw",
         seed: int = 0,
         limits: Limits | None = None,
     ) -> None:
@@ -59,8 +55,6 @@ class ReplayCulture(ComputedCulture):
             raise InvalidArgument("recordings: expected at least one to answer from, got none")
         if seed < 0:
             raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
-        if how not in ("draw", "in order"):
-            raise InvalidArgument(f"how: expected 'draw' or 'in order', got {how!r}")
         self._recordings = sorted(recordings, key=lambda recording: recording.start_min)
         first = self._recordings[0]
         for recording in self._recordings:
@@ -75,13 +69,12 @@ class ReplayCulture(ComputedCulture):
                     f"the recording at {recording.start_min:g} min: expected stimuli of known frequency and "
                     "electrodes, got none: a replay answers by frequency, and is stimulated on electrodes"
                 )
-        self._how, self._seed = how, seed
+        self._seed = seed
         self._patterns = _patterns(first)
         self._zero_s = 60.0 * first.start_min
         self._now_ns = 0
         self._answered = 0
         self._sets = [_numbered_sets(recording.stimuli.electrodes) for recording in self._recordings]
-        self._turn: dict[_Key, int] = {}
         self._pending_ns, self._pending_channel = np.empty(0, np.int64), np.empty(0, np.int64)
 
     @property
@@ -117,7 +110,7 @@ class ReplayCulture(ComputedCulture):
         of = {f"replayed {name}": words for name, words in first.provenance.items()}
         minutes = ", ".join(f"{recording.start_min:g}" for recording in self._recordings)
         how = {"source": "replay of recordings by animat.cultures.replay", "replayed minutes": minutes}
-        return {**how, "how": self._how, "seed": str(self._seed), **of}
+        return {**how, "how": "draw", "seed": str(self._seed), **of}
 
     def _open(self) -> None:
         pass
@@ -131,8 +124,10 @@ class ReplayCulture(ComputedCulture):
             (start_ns + round(stimulus.time_s * NS), self._pool(stimulus, is_last))
             for stimulus, is_last in zip(admitted.stimuli, is_last_of(numbers), strict=True)
         ]
-        for time_ns, (recording, key, pool) in answers:
-            self._answer(time_ns, recording, self._choose(key, pool))
+        for time_ns, (recording, pool) in answers:
+            chosen = np.random.default_rng([self._seed, 13, self._answered]).integers(len(pool))
+            self._answered += 1
+            self._answer(time_ns, recording, int(pool[chosen]))
         known = int(np.searchsorted(self._pending_ns, end_ns))
         spikes = Spikes((self._pending_ns[:known] - start_ns) / NS, self._pending_channel[:known])
         self._pending_ns, self._pending_channel = self._pending_ns[known:], self._pending_channel[known:]
@@ -144,7 +139,7 @@ class ReplayCulture(ComputedCulture):
             stimulus_time_s=np.array([time_ns - start_ns for time_ns, _ in answers], dtype=np.float64) / NS,
         )
 
-    def _pool(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, _Key, Int64[np.ndarray, " pulses"]]:
+    def _pool(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, Int64[np.ndarray, " pulses"]]:
         """The recorded pulses that may answer, and the recording they are in."""
         minute = (self.now_s + stimulus.time_s) / 60
         row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
@@ -163,16 +158,7 @@ class ReplayCulture(ComputedCulture):
                 f"frequency_hz: expected one that was recorded ({known} Hz), got {stimulus.frequency_hz:g}: a replay "
                 "has answers to nothing else"
             )
-        return recording, (row, stimulus.frequency_hz, is_last, electrodes), pool
-
-    def _choose(self, key: _Key, pool: Int64[np.ndarray, " pulses"]) -> int:
-        if self._how == "draw":
-            chosen = int(np.random.default_rng([self._seed, 13, self._answered]).integers(len(pool)))
-        else:
-            chosen = self._turn.get(key, 0) % len(pool)
-            self._turn[key] = chosen + 1
-        self._answered += 1
-        return int(pool[chosen])
+        return recording, pool
 
     def _answer(self, time_ns: int, recording: Recording, pulse: int) -> None:
         """Put the spikes that followed a recorded pulse after this one, in place of what was still to come."""
