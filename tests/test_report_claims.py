@@ -25,7 +25,6 @@ from animat.studies.arms import arms_shown, what_parts
 from animat.studies.cultures import RanCultures
 from animat.studies.cultures_page import _in_short
 from animat.studies.differences import came_out_otherwise, decisions, explain
-from animat.studies.learned import beside_the_optimum, known_of, learned_of
 from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
@@ -233,7 +232,7 @@ def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
         RobotSpec("as printed")
 
 
-# --- learning as good as the optimum allows ---------------------------------------------------------------------------
+# --- what arms are evaluated on ------------------------------------------------------------------------------------
 
 
 def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
@@ -246,11 +245,10 @@ def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
 
 
-LEARNED = Score(
+SCORED = Score(
     robot="cartpole", arm="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
     mean_return=96.0, standard_deviation=3.0, interquartile_mean=96.0, low_95=95.0, high_95=97.0, random=-80.0,
-    optimum=110.0, optimum_grid_error=0.1, optimum_run=105.0, optimum_run_standard_error=0.1,
-    optimum_without_clock=100.0, normalised_score=0.88, score_without_clock=0.9,
+    optimum=110.0, normalised_score=0.88,
 )  # fmt: skip
 
 
@@ -259,32 +257,7 @@ def score(
 ) -> Score:
     """That of an arm, as far as figures and sentences go by it."""
     known = {"interquartile_mean": middle, "low_95": low, "high_95": high, "random": random, "optimum": best}
-    return replace(LEARNED, robot=robot, arm=arm, **known)
-
-
-def test_only_what_is_trained_on_one_recording_is_measured_by_it() -> None:
-    rows = [replace(LEARNED, at_min=140.0), LEARNED, replace(LEARNED, arm="1 threshold")]
-    assert learned_of(paper_study(), rows) == [LEARNED]
-
-
-def test_what_was_learned_stands_between_random_actions_and_the_optimum() -> None:
-    table = beside_the_optimum(paper_study(), [replace(LEARNED, optimum=120.0)])
-    (shown,) = (dict(zip(table.head, row, strict=True)) for row in table.rows)
-    assert (shown["random"], shown["optimum"], shown["score"]) == (-80.0, 120.0, 0.88)
-    assert table.head.index("mean ± s.e.") < table.head.index("random") < table.head.index("optimum")
-
-
-def test_a_score_below_the_aim_is_told_with_what_is_known() -> None:
-    spec = RobotSpec("cartpole")
-    assert known_of(replace(LEARNED, normalised_score=0.98), spec) == "reached"
-    assert known_of(replace(LEARNED, normalised_score=None), spec).startswith("nothing to learn")
-    assert known_of(replace(LEARNED, optimum=None, normalised_score=None), spec).startswith(
-        "no optimum: conditions with few"
-    )
-    assert known_of(LEARNED, spec).endswith("short by 0.09, which neither the clock nor the grid explains")
-    assert "short by the clock" in known_of(replace(LEARNED, score_without_clock=0.99), spec)
-    assert "its controller was seen to get" in known_of(replace(LEARNED, optimum_run=100.0), spec)
-    assert "trained for 60,000 iterations, not 800,000" in known_of(LEARNED, RobotSpec("cartpole", iterations=60_000))
+    return replace(SCORED, robot=robot, arm=arm, **known)
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------

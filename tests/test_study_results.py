@@ -144,7 +144,7 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
 
 def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_are_json(tmp_path: Path) -> None:
     assert [_known(end) for end in (-np.inf, 1.5, np.inf)] == [None, 1.5, None]
-    score = Score("rover", "one", "none", 0.0, 1, 2, 3.0, None, 3.0, None, None, *6 * [None], None, None)
+    score = Score("rover", "one", "none", 0.0, 1, 2, 3.0, None, 3.0, *5 * [None])
     results = Results((score,), (), (), (), (), ())
     write_typed(tmp_path / "results.json", results)
     told = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)

@@ -62,12 +62,7 @@ class Score:
     high_95: float | None
     random: float | None
     optimum: float | None
-    optimum_grid_error: float | None
-    optimum_run: float | None
-    optimum_run_standard_error: float | None
-    optimum_without_clock: float | None
     normalised_score: float | None
-    score_without_clock: float | None
 
 
 @dataclass(frozen=True)

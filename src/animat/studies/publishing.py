@@ -27,7 +27,6 @@ from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
 from animat.studies.goals import goals_shown
 from animat.studies.heuristic import not_outperforming
-from animat.studies.learned import beside_the_optimum, learned_of
 from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
 from animat.studies.reflex import reflexes_told
@@ -44,7 +43,7 @@ from animat.studies.shown import (
 )
 from animat.studies.simulating import controllability, load_timeline, read_series
 from animat.studies.specification import Arm, RobotSpec, Study
-from animat.studies.tabulating import AIM, FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
+from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
 
 
@@ -72,7 +71,7 @@ class Publish(StudyTask):
             table = controllability_shown(study, folder, kept)
             pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(study, folder))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
-        sections += [_controls(study, results), _compared(study, results), _scores(study, results)]
+        sections += [_controls(study, results), _compared(study, results), _scores(results)]
         sections.append(_done(study, results))
         if study.paper:
             sections.append(_differences(study, results, kept))
@@ -219,22 +218,14 @@ def _otherwise(rows: Sequence[ComparedReturns]) -> Iterator[str]:
         yield f"the paper found “{second}” better than “{first}”, but here {' and '.join(better + none)}"
 
 
-def _scores(study: Study, results: Results) -> Section:
-    learned = learned_of(study, results.scores)
+def _scores(results: Results) -> Section:
     tables = [scores_shown(results.scores), optima_shown(results.optima)]
-    paragraphs = [
-        "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
-    ]
-    if learned:
-        paragraphs.append(
-            f"As good as the optimum: a score of {AIM:g} on the very simulator that policies were trained on is "
-            "what learning should come to. Arms whose simulators are refreshed during training are not asked "
-            "this, as they are trained on several."
-        )
-        tables.insert(0, beside_the_optimum(study, learned))
     if results.goals:
         tables.append(goals_shown(results.goals))
-    return Section("Scores", tuple(paragraphs), tables=tuple(tables))
+    said = (
+        "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
+    )
+    return Section("Scores", (said,), tables=tuple(tables))
 
 
 _NUMBERS_OF_CULTURE = {

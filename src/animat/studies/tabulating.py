@@ -37,9 +37,6 @@ T = TypeVar("T")
 LEVEL = 0.01
 """The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
 
-AIM = 0.97
-"""Normalised score from which an arm counts as being as good as its optimum allows."""
-
 LEFT_OUT = "left-out"
 """The finding that a robot cannot do something, which the study is without."""
 
@@ -139,14 +136,13 @@ class References:
             return None
         return self._of(self._optima, arm, at_min)
 
-    def score(self, arm: Arm, at_min: float, mean: float, against: str = "best_return") -> float | None:
-        """The normalised score, against the optimum or another of its fields; None where nothing can be learned."""
+    def score(self, arm: Arm, at_min: float, mean: float) -> float | None:
+        """The normalised score; None where nothing can be learned."""
         random, optimum = self.random(arm, at_min), self.optimum(arm, at_min)
-        best = None if optimum is None else getattr(optimum, against)
-        if random is None or best is None:
+        if random is None or optimum is None or optimum.best_return is None:
             return None
         try:
-            return normalised_score(mean, random, best)
+            return normalised_score(mean, random, optimum.best_return)
         except InvalidArgument:
             return None
 
@@ -196,12 +192,7 @@ def _scores(
                     high_95=_known(middle.high),
                     random=known.random(arm, at_min),
                     optimum=None if optimum is None else optimum.best_return,
-                    optimum_grid_error=None if optimum is None else optimum.grid_error,
-                    optimum_run=None if optimum is None else optimum.monte_carlo,
-                    optimum_run_standard_error=None if optimum is None else optimum.standard_error,
-                    optimum_without_clock=None if optimum is None else optimum.without_clock,
                     normalised_score=known.score(arm, at_min, mean),
-                    score_without_clock=known.score(arm, at_min, mean, "without_clock"),
                 )
 
 
