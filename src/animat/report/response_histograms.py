@@ -7,17 +7,18 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import BLACK, MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes
 from animat.responses.responses import Responses
 
 _MOST_PANELS = 16
 _BINS = 30
 
 
-def draw_response_histograms(responses: Responses) -> Figure:
+def draw_response_histograms(responses: Responses, last: Responses | None = None) -> Figure:
     """Non-burst responses of every condition on one axis of rates, with the median P50 of all together.
 
-    At most 16 conditions are drawn, those with the most responses; the title says so.
+    At most 16 conditions are drawn, those with the most responses; the title says so. Those of the last recording of a
+    series, which has the same conditions, are outlines.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     drawn = sorted(sorted(range(len(n)), key=lambda i: -n[i])[:_MOST_PANELS])
@@ -26,18 +27,25 @@ def draw_response_histograms(responses: Responses) -> Figure:
     figure = new_figure(5.0 * columns, 0.9 + 1.25 * rows if rows > 1 else 3.2)
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False).T.reshape(-1)
     colours = condition_colours([condition.unit for condition in responses.conditions])
-    edges_hz = rate_edges(responses, responses.non_burst_rate_hz, _BINS)
+    rates_hz = [each.non_burst_rate_hz for each in (responses, last) if each is not None]
+    edges_hz = rate_edges(responses, np.concatenate(rates_hz), _BINS)
     shares = responses.shares_above_median()
     for axes, i in zip(panels, drawn, strict=False):
         x = responses.rates_of(i)
-        axes.hist(x, bins=edges_hz.tolist(), weights=np.full(len(x), 1 / max(len(x), 1)), color=colours[i])
+        weights, alpha = np.full(len(x), 1 / max(len(x), 1)), None if last is None else 0.7
+        axes.hist(x, bins=edges_hz.tolist(), weights=weights, color=colours[i], alpha=alpha)
         share = f", P(x ≥ P50) = {shares[i]:.2f}" if len(x) else ""
         style_axes(axes, f"{responses.conditions[i].label}: n = {len(x):,}{share}", "", "fraction")
         if math.isfinite(responses.median_rate_hz):
             label = f"P50 = {responses.median_rate_hz:.1f} Hz"
             axes.axvline(responses.median_rate_hz, color=MEDIAN, linewidth=1.2, linestyle="--", label=label)
-            if i == drawn[0]:
-                add_legend(axes, loc="best")
+        if last is not None and math.isfinite(last.median_rate_hz):
+            x = last.rates_of(i)
+            axes.stairs(np.histogram(x, edges_hz)[0] / max(len(x), 1), edges_hz, color=BLACK, linewidth=1.2)
+            label = f"P50 at {last.start_min:g} min = {last.median_rate_hz:.1f} Hz"
+            axes.axvline(last.median_rate_hz, color=BLACK, linewidth=1.2, linestyle=":", label=label)
+        if i == drawn[0] and axes.lines:
+            add_legend(axes, loc="best")
     for axes in panels[len(drawn) :]:
         axes.set_visible(False)
     for column in range(columns):

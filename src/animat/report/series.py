@@ -10,7 +10,6 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.recording import Recording
 from animat.report.array import draw_array
 from animat.report.drift import draw_drift
-from animat.report.first_and_last import draw_first_and_last
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.style import save_figure
 from animat.responses.responses import Responses
@@ -19,7 +18,7 @@ from animat.responses.responses import Responses
 def draw_series(
     first: Recording | None, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
 ) -> list[Path]:
-    """Draw a series: `series-array`, `series-responses`, `series-over-time`, `series-drift`, in one of `FORMATS`.
+    """Draw a series: `series-array`, `series-over-time`, `series-drift`, in one of `FORMATS`.
 
     The array is that of the first recording, where its positions are known; the others, of responses in any order, are
     drawn for two recordings or more.
@@ -42,7 +41,6 @@ def draw_series(
     if first is not None and first.channels.has_positions:
         figures["array"] = draw_array(first)
     if len(ordered) > 1 and all(len(responses) for responses in ordered):
-        figures["responses"] = draw_first_and_last(ordered)
         figures["over-time"] = draw_responses_over_time(ordered)
         figures["drift"] = draw_drift(ordered)
     return [save_figure(figure, Path(folder) / f"series-{what}.{file_format}") for what, figure in figures.items()]

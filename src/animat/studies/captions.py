@@ -37,13 +37,9 @@ CULTURE: dict[str, tuple[str, str]] = {
     "responses": (
         "responses to each stimulus",
         "How large the responses to each stimulus are, bursts left out (n: how many). The further the histograms lie "
-        "apart, the more a controller can do. The line is P50, the median over all stimuli. The first recording: the "
-        "neuron simulators are made of these numbers.",
-    ),
-    "first-and-last": (
-        "responses, first and last",
-        "The same in the first recording (filled) and in the last (outline), with P50 of each: how far the culture "
-        "moved in between. {recordings} recordings from {first_min} to {last_min} min.",
+        "apart, the more a controller can do. The dashed line is P50, the median over all stimuli. The first "
+        "recording: the neuron simulators are made of these numbers. Outlines, with a dotted P50: the last recording, "
+        "where there are several; so far the culture moved in between.",
     ),
     "over-time": (
         "each stimulus over time",

@@ -20,7 +20,6 @@ from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
-from animat.report.first_and_last import draw_first_and_last
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import MOST, Course, Courses, draw_over_time
 from animat.report.psth import draw_psth
@@ -62,7 +61,7 @@ class CulturePictures(StudyTask):
             "raster": draw_raster(first, responses),
             "psth": draw_psth(histogram, responses.window_ms, spontaneous_hz),
             "bursts": draw_burst_separation(responses),
-            "responses": draw_response_histograms(responses),
+            "responses": draw_response_histograms(responses, series[-1] if len(series) > 1 else None),
         }
         tables = [
             figure_tables.write_psth(folder, histogram, responses.window_ms, spontaneous_hz),
@@ -74,7 +73,6 @@ class CulturePictures(StudyTask):
             figures["array"] = draw_array(first)
             tables.append(figure_tables.write_array(folder, first))
         if len(series) > 1:
-            figures["first-and-last"] = draw_first_and_last(series)
             figures["over-time"] = draw_responses_over_time(series)
             figures["drift"] = draw_drift(series)
             tables.append(figure_tables.write_drift(folder, drift_of(series)))

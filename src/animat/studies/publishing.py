@@ -233,7 +233,6 @@ _NUMBERS_OF_CULTURE = {
     "psth": ("tables/culture-psth.csv",),
     "bursts": ("tables/culture-bursts.csv", RESPONSES),
     "responses": (RESPONSES, "tables/culture-conditions.csv"),
-    "first-and-last": (RESPONSES, "tables/culture-conditions.csv"),
     "over-time": (RESPONSES, "tables/culture-conditions.csv"),
     "drift": ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
 }
@@ -264,8 +263,6 @@ def _facts_of_culture(study: Study, folder: Path) -> dict[str, str]:
         "channels": f"{series[0].n_channels:,}",
         "responses": f"{len(series[0]):,}",
         "recordings": f"{len(series)}",
-        "first_min": f"{series[0].start_min:g}",
-        "last_min": f"{series[-1].start_min:g}",
     }
 
 
