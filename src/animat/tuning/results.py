@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,9 +13,7 @@ from typing import Any
 from animat.report.style import save_figure
 from animat.report.tuning import draw_history, draw_importance
 from animat.studies.places import RECORDINGS
-from animat.studies.specification import Arm, Simulators, Study
 from animat.studies.toml import study_to_toml
-from animat.training.settings import SAC
 from animat.tuning.journal import Told
 from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
 from animat.tuning.specification import Tuning
@@ -94,7 +91,7 @@ def write_results(
     study = with_settings(tuning.study, best.settings)
     if study.culture.kind == "files":
         study = replace(study, culture=replace(study.culture, files=(RECORDINGS,)))
-    write_whole(folder / BEST, f"# {train_command(study)}\n# animat study {BEST}\n{study_to_toml(study)}")
+    write_whole(folder / BEST, f"# animat study {BEST}\n{study_to_toml(study)}")
     write_whole(folder / RESULTS, json.dumps(tuned.to_dict(), indent=1) + "\n")
     robot, own = tuning.study.robots[0].name, finals[0]
     rungs = [(each.trial, each.chunks, each.means) for each in told]
@@ -106,40 +103,6 @@ def write_results(
         title = f"{robot}: importance for the return after {100 * first:.0f} % of training"
         save_figure(draw_importance(importance, title), folder / IMPORTANCE)
     return tuned
-
-
-def train_command(study: Study) -> str:
-    """The `animat train` with a study's settings, on the recordings beside the file."""
-    spec, arm, simulators = study.robots[0], study.arms[0], study.simulators
-    words = ["animat", "train", spec.kind or spec.name, "--mapping", arm.mapping]
-    if arm.through_neurons:
-        words += ["--recordings", RECORDINGS, "--simulator", simulators.kind]
-        words += ["--duration-min", f"{study.training_min:g}"]
-        if simulators.kind == "histogram":
-            words += _unusual(simulators, Simulators(), "bins")
-        words += _unusual(simulators, Simulators(), "range_hz", "conditions", "readouts", "window_ms")
-        words += _unusual(simulators, Simulators(), "burst_threshold", "allow")
-    words += ["--policies", str(study.policies), "--iterations", str(spec.trained_for)]
-    words += ["--seed", str(study.seed)] * (study.seed != 1)
-    words += ["--shadowing", "off"] * (not arm.shadowing)
-    words += _unusual(arm, Arm("usual"), "percentiles", "delivery")
-    if spec.parameters:
-        words += ["--parameters", *(f"{name}={value!r}" for name, value in spec.parameters.items())]
-    defaults = asdict(SAC())
-    given = {name: value for name, value in study.algorithm.items() if value != defaults[name]}
-    if given:
-        words += ["--sac", *(f"{name}={value!r}" for name, value in given.items())]
-    return shlex.join(words)
-
-
-def _unusual(given: Any, usual: Any, *names: str) -> list[str]:
-    """The options of settings that are not the usual ones."""
-    words = []
-    for name in names:
-        if (value := getattr(given, name)) != getattr(usual, name):
-            values = value if isinstance(value, tuple) else (value,)
-            words += [f"--{name.replace('_', '-')}", *(f"{x:g}" if isinstance(x, float) else str(x) for x in values)]
-    return words
 
 
 def settings_in_words(settings: Mapping[str, Any]) -> str:
