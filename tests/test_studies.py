@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 import os
 import random
@@ -677,6 +678,13 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
         told = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
         assert told == pytest.approx(np.quantile(means, [0.25, 0.5, 0.75]))
         assert int(row["policies"]) == len(means) == 2
+
+
+@pytest.mark.oracle
+def test_the_report_ends_with_the_study_as_a_file(finished: Path, tmp_path: Path) -> None:
+    (written,) = re.findall("<pre>(.*?)</pre>", (finished / "report.html").read_text(), re.DOTALL)
+    (tmp_path / "study.toml").write_text(html.unescape(written))
+    assert read_study(tmp_path / "study.toml") == read_study(TINY)
 
 
 @pytest.mark.oracle

@@ -108,13 +108,14 @@ def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: paragraphs, then points of a list, then figures, then tables."""
+    """A section of the page: paragraphs, then points of a list, figures, tables, and a text as it stands in a file."""
 
     title: str
     paragraphs: tuple[str, ...] = ()
     points: tuple[tuple[str, str], ...] = ()
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
+    verbatim: str = ""
 
     @property
     def anchor(self) -> str:

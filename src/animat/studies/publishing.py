@@ -19,7 +19,6 @@ from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.style import FORMATS, save_figure
-from animat.stimulation.protocol import Presentation
 from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
@@ -45,6 +44,7 @@ from animat.studies.simulating import controllability, load_timeline, read_serie
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
+from animat.studies.toml import study_to_toml
 
 
 @final
@@ -72,10 +72,10 @@ class Publish(StudyTask):
             pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(study, folder))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
-        sections.append(_done(study, results))
         if study.paper:
             sections.append(_differences(study, results, kept))
-        sections.append(_noticed(results))
+        settings = "All settings, as in study.toml, with which animat study makes the same study again."
+        sections += [_noticed(results), Section("How it was done", (settings,), verbatim=study_to_toml(study))]
         versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
         colophon = [
             f"Made with {versions}.",
@@ -305,46 +305,6 @@ def _controls(study: Study, results: Results) -> Section:
     )
 
 
-def _done(study: Study, results: Results) -> Section:
-    culture, simulators = study.culture, study.simulators
-    if culture.kind == "files":
-        recorded = f"Recordings from files: {', '.join(culture.files)}."
-    else:
-        recorded = (
-            f"{culture.sessions} recordings, one every {culture.interval_min:g} min, of the {culture.kind} culture of "
-            f"seed {culture.seed}; stimuli {Presentation(culture.order, culture.pulses)}, "
-            f"{culture.trials} trials of each."
-        )
-    points = [
-        ("Recordings", recorded),
-        (
-            "Simulators",
-            f"{simulators.kind}"
-            + (f", {simulators.bins} bins" if simulators.kind == "histogram" else "")
-            + f"; responses from {simulators.window_ms[0]:g} to {simulators.window_ms[1]:g} ms; bursts set apart "
-            + (
-                "by Otsu's method where that finds two groups."
-                if simulators.burst_threshold is None
-                else f"above {simulators.burst_threshold:g}."
-            ),
-        ),
-        (
-            "Training",
-            f"{study.policies} policies of each arm on each robot, each from random numbers of its own; "
-            f"training stands for {study.training_min:g} min of the culture's clock.",
-        ),
-    ]
-    points.append(("Evaluation", _ACTIONS[study.actions]))
-    points += [("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT]
-    return Section("How it was done", points=tuple(points))
-
-
-_ACTIONS = {
-    "most probable": "Policies take their most probable action.",
-    "drawn": "Policies draw their actions, as in training.",
-}
-
-
 def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity]) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
     lost = {at_min: of.largest_loss for at_min, of in kept.items()}
@@ -370,4 +330,5 @@ def _noticed(results: Results) -> Section:
     table: tuple[Any, ...] = (
         (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()
     )
-    return Section("Findings", (said,), tables=table)
+    left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)
+    return Section("Findings", (said,), left_out, table)
