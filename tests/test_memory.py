@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors import safe_open
-from safetensors.numpy import save
 
 import animat.gym  # noqa: F401
 from animat.cli.train import _memories
@@ -447,26 +445,6 @@ def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> N
     for read, written in zip(jax.tree.leaves(loaded.simulators), jax.tree.leaves(timeline.simulators), strict=True):
         np.testing.assert_array_equal(read, written)
     assert Simulators(kind=kind).kind == loaded.fitted["kind"] == kind
-
-
-def test_a_simulator_with_a_memory_of_before_is_read(tmp_path: Path) -> None:
-    """That had no load: what its file lacks."""
-    timeline = fit_timeline([chain(200, after_low=(0.1, 0.5), after_high=(0.3, 0.9))], kind="memory")
-    save_timeline(timeline, path := tmp_path / "timeline.safetensors")
-    with safe_open(path, "np") as file:
-        metadata, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    arrays = {name: arrays[name] for name in arrays.keys() - {"histories", "toward", "kept", "added", "load_s"}}
-    path.write_bytes(save({**arrays, "reach": arrays.pop("neighbour_exponent")}, metadata=metadata))
-    read = load_timeline(path).simulators
-    history = after(jnp.linspace(0, 1, 50))
-    both = [
-        jax.jit(jax.vmap(each.at(0.0).answer, (None, None, 0)))
-        for each in (timeline, replace(timeline, simulators=read))
-    ]
-    for c in (0, 1):
-        ours, theirs = (answer(jnp.int32(c), jnp.float32(0.3), history) for answer in both)
-        np.testing.assert_array_equal(ours.rate_hz, theirs.rate_hz)
-        np.testing.assert_array_equal(ours.history, theirs.history)
 
 
 @pytest.mark.parametrize("kind", get_args(Kind))

@@ -13,8 +13,8 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.session import read_session
-from animat.differences import fingerprint_of
 from animat.errors import InvalidFile, Mismatch
+from animat.goals.robot import robot_of
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Protocol
@@ -23,7 +23,6 @@ from animat.studies.run import run_study
 from animat.studies.toml import read_study
 from animat.training.folder import describe, expect_folder_for, is_ours
 from animat.training.policy import Policy
-from animat.training.settings import FORMER, SAC
 from animat.training.specification import Training
 from test_studies import Halts
 
@@ -143,20 +142,14 @@ mapping = "linear"
         read_study(former)
 
 
-def test_a_trainings_folder_goes_on_by_the_former_names_of_its_settings(tmp_path: Path) -> None:
-    training = Training("cartpole", None, policies=1, iterations=100)
-    manifest = describe(training, None)
-    settings = manifest["training"]["algorithm"]
-    former = {before: settings.pop(today) for before, today in FORMER.items()}
-    settings |= former
-    # The fingerprint that 0.1.0 made is over the former names.
-    told = {name: value for name, value in manifest.items() if name not in ("sources", "fingerprint")}
-    assert manifest["fingerprint"] == fingerprint_of(told)
-    (tmp_path / "training.json").write_text(json.dumps(manifest))
-    expect_folder_for(training, tmp_path)
-    assert is_ours(tmp_path, describe(training, None))
-    with pytest.raises(Mismatch, match=r"training\.algorithm\.tau: 0\.005 there, 0\.1 now"):
-        expect_folder_for(replace(training, algorithm=SAC(tau=0.1)), tmp_path)
+def test_a_trainings_folder_is_left_to_the_version_that_began_it(old: Path) -> None:
+    told = json.loads((old / "policies" / "training.json").read_text())["training"]
+    training = Training(robot_of(told), told["mapping"], told["policies"], told["iterations"], told["seed"])
+    training = replace(training, duration_min=told["duration_min"])
+    with pytest.raises(Mismatch, match=r"^[^\n]* got one of another .*; give another folder"):
+        expect_folder_for(training, old / "policies")
+    with pytest.raises(Mismatch, match=r"^[^\n]* got one of another .*; give another folder"):
+        is_ours(old / "policies", describe(training, None))
 
 
 def test_a_protocol_of_presentations_is_one_of_trials() -> None:

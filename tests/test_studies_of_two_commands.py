@@ -159,12 +159,6 @@ def test_it_is_written_as_toml_and_read_as_the_same(tmp_path: Path) -> None:
     assert read_study(tmp_path / "study.toml") == STUDY
 
 
-def test_studies_of_before_are_described_as_they_were() -> None:
-    told = Study().to_dict()
-    assert "readouts" not in told["simulators"] and "lessons" not in told["robots"][0]
-    assert not {"places", "frequencies_hz"} & set(told["culture"])
-
-
 def test_tuning_searches_readouts_and_teaches_no_lessons() -> None:
     plain = replace(STUDY, robots=(RobotSpec("wheels", iterations=3000),), arms=(Arm("in turn"),), comparisons=())
     groups = '{"left": [1, 2], "right": [3]}'

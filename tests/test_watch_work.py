@@ -58,7 +58,7 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     curve[:3, :, 2] = np.nan
     curve[:, :, 3] = 1.0 + np.arange(30)[:, None] + [0.0, 1.0]
     curve[:, :, 4:] = [0.25, 0.5]
-    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve, done=np.array(30))
+    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve, members=np.arange(2), done=np.array(30))
     (told / "p0 to p1.json").write_text(json.dumps([0.55, "return 31.0"]))
     with exclusive_lock(tmp_path):
         found = TrainingView(tmp_path).view(None, 8.0)
@@ -97,8 +97,8 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
         ["p1", "55 %", 39.0],
         ["p2", "0 %", "none yet"],
     ]
-    # As a checkpoint of before has it.
-    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve[:, :, :3], done=np.array(30))
+    # Of the first columns alone, as in policies of before.
+    np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve[:, :, :3], members=np.arange(2), done=np.array(30))
     before = TrainingView(tmp_path).view(None, 8.0)
     assert block(before, "Learning curves")["series"] == [*policies, mean]
     assert block(before, "Entropy")["words"].startswith("Not in these files")

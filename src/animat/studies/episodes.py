@@ -39,10 +39,6 @@ SUCCEEDED, MARGIN, SATISFACTION = "succeeded", "margin", "satisfaction_"
 POLICY = "policy"
 RANDOM = "random"
 COUPLING = "coupling"
-FORMER_AGENTS = {"made by hand": "heuristic"}
-"""What files of before call agents."""
-FORMER_MAPPING = ", percentiles held", ", percentiles fixed"
-"""How files of before name mappings, and how they are named now."""
 
 
 def tabulated(
@@ -91,9 +87,7 @@ def read_episodes(paths: Iterable[Path]) -> DataFrame:
     files = [read_arrays(path) for path in paths]
     of_goals = [name for arrays in files for name in arrays if name.startswith((SUCCEEDED, MARGIN, SATISFACTION))]
     parts = [pd.DataFrame(arrays, columns=list(dict.fromkeys((*COLUMNS, *of_goals)))) for arrays in files]
-    table = pd.concat(parts, ignore_index=True).replace({"agent": FORMER_AGENTS})
-    table["arm"] = table["arm"].str.replace(*FORMER_MAPPING, regex=False)
-    return table
+    return pd.concat(parts, ignore_index=True)
 
 
 def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.ndarray, " actors"]:

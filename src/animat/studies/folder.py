@@ -7,6 +7,7 @@ import json
 import platform
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
         versions["device"] = device
     return with_fingerprint(
         {
-            "study": study.to_dict(),
+            "study": asdict(study),
             "sources": sources,
             # Another version may round otherwise, or draw other figures.
             "versions": {"python": platform.python_version(), "learner": f"revision {LEARNER}", **versions},

@@ -11,10 +11,9 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
-from animat.neurons.history import AT_FIRST
 from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, placed
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, placed
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
@@ -31,8 +30,6 @@ from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.writing import write_whole
 
-_FORMER = {"reach": "neighbour_exponent"}
-"""What files of before call arrays of simulators."""
 _KINDS = {
     kind.__name__: kind for kind in (HistogramSimulator, JointHistogramSimulator, EmpiricalSimulator, MemorySimulator)
 }
@@ -158,14 +155,14 @@ def load_timeline(path: Path) -> SimulatorTimeline:
     try:
         with safe_open(path, framework="numpy") as file:
             told: dict[str, Any] = json.loads(file.metadata()["animat"])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dictionary
+            arrays = {name: placed(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
         conditions = tuple(Condition(**each) for each in told["conditions"])
         labels = tuple(condition.label for condition in conditions)
         presentation = told["presentation"]
         kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
         readouts = Readouts.from_dict(told.get("readouts"))
         return SimulatorTimeline(
-            simulators=_simulators(told["kind"], arrays),
+            simulators=_KINDS[told["kind"]](**arrays),
             start_min=np.array(told["start_min"], np.float64),
             conditions=conditions,
             window_ms=tuple(told["window_ms"]),
@@ -177,15 +174,3 @@ def load_timeline(path: Path) -> SimulatorTimeline:
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
         raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error
-
-
-def _simulators(kind: str, arrays: dict[str, np.ndarray]) -> NeuronSimulator:
-    """From a file's arrays; a memory of before had no load."""
-    arrays = {_FORMER.get(name, name): array for name, array in arrays.items()}
-    if kind == MemorySimulator.__name__ and "load_s" not in arrays:
-        before, decay = arrays["before"], arrays["decay"]
-        arrays["histories"] = np.stack([before, np.full_like(before, AT_FIRST[1])], axis=-1)
-        arrays["toward"] = np.tile(np.array([1.0, 0.0], np.float32), (*before.shape[:2], 1))
-        arrays["kept"] = np.ones(before.shape[:2], np.float32)
-        arrays["added"] = arrays["load_s"] = np.zeros_like(decay)
-    return _KINDS[kind](**{name: placed(array, None) for name, array in arrays.items()})

@@ -6,7 +6,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
@@ -377,21 +377,6 @@ class Study:
     def needs_neurons(self) -> bool:
         """Whether any arm has neurons in it."""
         return any(arm.through_neurons for arm in self.arms)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        plain = asdict(self)
-        for robot in plain["robots"]:
-            # Studies of before have none, and go on.
-            for name in ("goal", "lessons"):
-                if not robot[name]:
-                    del robot[name]
-        for name in ("seeds", "folders", "places", "frequencies_hz"):
-            if plain["culture"][name] is None:
-                del plain["culture"][name]
-        if plain["simulators"]["readouts"] == "all":
-            del plain["simulators"]["readouts"]
-        return plain
 
 
 def _expect_unlike(what: str, names: Sequence[str]) -> None:

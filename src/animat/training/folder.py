@@ -27,7 +27,7 @@ from animat.robots.registry import REGISTRY as ROBOTS
 from animat.training.course import ASSESSED
 from animat.training.group import Group, split_groups
 from animat.training.policy import Policy
-from animat.training.settings import FORMER, LEARNER
+from animat.training.settings import LEARNER
 from animat.training.specification import CHUNKS, Training
 from animat.training.varied import expect_varied, varying_in
 from animat.writing import atomic_write
@@ -104,10 +104,8 @@ def describe(
     }
     # By way of JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))
-    # By former names: fingerprints of before are of the same bytes, and their folders go on.
-    former = _renamed(manifest, {today: former for former, today in FORMER.items()}, ("a trial", "a presentation"))
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    fingerprint = fingerprint_of(former, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    fingerprint = fingerprint_of(manifest, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # Names of files are told but do not decide: the same recordings in another place are the same.
     beside = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
     return manifest | beside | {"fingerprint": fingerprint}
@@ -121,8 +119,7 @@ def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
         "window_ms": timeline.window_ms,
         "presentation": None if timeline.presentation is None else str(timeline.presentation),
         "recorded_at_min": timeline.start_min.tolist(),
-        # Folders of before have none, and go on.
-        **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
+        "readouts": timeline.readouts.to_dict(),
     }
 
 
@@ -183,23 +180,12 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
 def _description_in(folder: Path) -> dict[str, Any] | None:
     """What a folder says it holds; None if it is free."""
     if (found := description_in(folder / MANIFEST, "training")) is not None:
-        return _renamed(found, FORMER, ("a presentation", "a trial"))
+        return found
     expect_no_file(folder, "the policies")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     expect_no_other(folder, "training")
     return None
-
-
-def _renamed(manifest: dict[str, Any], names: dict[str, str], pulses: tuple[str, str]) -> dict[str, Any]:
-    """A description with other names for the settings of the algorithm, and for what the pulses are counted by."""
-    training, simulators = manifest.get("training"), manifest.get("simulators")
-    if isinstance(training, dict) and isinstance(training.get("algorithm"), dict):
-        algorithm = {names.get(name, name): value for name, value in training["algorithm"].items()}
-        manifest = {**manifest, "training": {**training, "algorithm": algorithm}}
-    if isinstance(simulators, dict) and isinstance(presented := simulators.get("presentation"), str):
-        manifest = {**manifest, "simulators": {**simulators, "presentation": presented.replace(*pulses)}}
-    return manifest
 
 
 def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:

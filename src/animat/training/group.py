@@ -27,7 +27,7 @@ from animat.training.course import Course
 from animat.training.diagnosis import diagnosing
 from animat.training.host import programs_on_host
 from animat.training.networks import Network
-from animat.training.policy import CURVE, Policy, whole_curve
+from animat.training.policy import CURVE, Policy
 from animat.training.sac import Learner, begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
@@ -344,12 +344,10 @@ def _read_checkpoint(
             kept = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]
             done, curve = int(file["done"]), file["curve"]
             forms = [[(a.shape, a.dtype) for a in arrays] for arrays in (kept, leaves)]
-            # Checkpoints of before have three columns of the curve.
-            curve = whole_curve(curve)
             if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, len(leaves[0]), len(CURVE)):
                 raise InvalidFile(
                     f"{path}: expected a checkpoint as this animat writes it, of {len(leaves[0])} policies together, "
-                    f"got another's (a former version grouped 2 to 5 otherwise); to begin these anew: rm '{path}'"
+                    f"got another's; to begin these anew: rm '{path}'"
                 )
             # What is not on its way to JAX stays numpy's, of 64 bits.
             n = len(leaves) - n_standing

@@ -271,8 +271,7 @@ class Policy:
             "provenance": dict(self.provenance),
             "readouts": self.readouts.to_dict(),
             "neural_observation": self.neural_observation,
-            # Files of before have none, and those without a cost are as theirs.
-            **({"pulse_cost": self.pulse_cost} if self.pulse_cost else {}),
+            "pulse_cost": self.pulse_cost,
         }
         # One entry only: safetensors writes several in random order, and a policy's file has one form.
         metadata = {"animat": json.dumps(described, sort_keys=True)}

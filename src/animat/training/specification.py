@@ -230,14 +230,10 @@ class Training:
     def to_dict(self) -> dict[str, Any]:
         """The same as plain data, for a file."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        # Folders of before have none of these, and go on.
-        for name in ("neural_observation", "lessons", "assess", "pulse_cost"):
-            if not plain[name]:
-                del plain[name]
         return plain | {
             **body_and_goal(self.robot),
             "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "algorithm": asdict(self.algorithm),
+            "lessons": [asdict(lesson) for lesson in self.lessons],
             "chunks": CHUNKS,
-            **({"lessons": [asdict(lesson) for lesson in self.lessons]} if self.lessons else {}),
         }

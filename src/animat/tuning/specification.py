@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -76,7 +76,7 @@ class Tuning:
             for name, among in self.space.items()
         }
         tune = {name: getattr(self.tune, name) for name in self.tune.__dataclass_fields__}
-        return {"study": self.study.to_dict(), "tune": {**tune, "search": space}}
+        return {"study": asdict(self.study), "tune": {**tune, "search": space}}
 
 
 def tuning_of(study: Study, tune: Tune) -> Tuning:

@@ -52,12 +52,7 @@ def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks co
             curve = _whole(_array_in(archive, "curve.npy"))
             if curve is None or curve.ndim != 3:
                 return {}
-            if "members.npy" in archive.namelist():
-                members = _array_in(archive, "members.npy").tolist()
-            else:
-                # Written before the numbers were kept: those of one group, from that in the file's name on.
-                first = int(path.stem.removeprefix("from-p"))
-                members = list(range(first, first + curve.shape[1]))
+            members = _array_in(archive, "members.npy").tolist()
             return {int(member): curve[:, row] for row, member in enumerate(members)}
     except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive
         return {}
