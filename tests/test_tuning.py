@@ -22,15 +22,18 @@ import pytest
 from animat.cli import main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.neurons.synthetic import synthetic_simulator
+from animat.neurons.timeline import fit_timeline
+from animat.recordings.synthetic import synthetic_recording
+from animat.responses.extraction import extract_responses
 from animat.studies.toml import read_study
 from animat.training.group import programs
 from animat.training.settings import SAC
-from animat.training.specification import Training
+from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
 from animat.tuning.journal import JOURNAL, Told, read_journal
 from animat.tuning.results import BEST, HISTORY, RESULTS, Tuned
 from animat.tuning.run import tune
-from animat.tuning.side_by_side import SideBySide
+from animat.tuning.side_by_side import Trials
 from animat.tuning.space import Range, first_settings, with_settings
 from animat.tuning.specification import Tuning, read_tuning, tuning_of
 from animat.tuning.tasks import Trial, same_shapes
@@ -102,15 +105,15 @@ def test_a_trial_that_was_stopped_between_two_chunks_goes_on_from_there(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tasks, "CHECKPOINT_S", -1.0)
-    trained, train = [], SideBySide.train
+    trained, train = [], Trials.train
 
-    def fails_now_and_then(self: SideBySide, first: int, last: int, simulator: Any) -> None:
-        trained.append(first)
+    def fails_now_and_then(self: Trials, index: int, *simulators: Any) -> float:
+        trained.append(index)
         if len(trained) in (7, 40, 90):
             raise AnimatError("out of power")
-        train(self, first, last, simulator)
+        return train(self, index, *simulators)
 
-    monkeypatch.setattr(SideBySide, "train", fails_now_and_then)
+    monkeypatch.setattr(Trials, "train", fails_now_and_then)
     for _ in range(3):
         with pytest.raises(AnimatError, match="out of power"):
             run(tmp_path / "out")
@@ -192,15 +195,14 @@ def test_settings_as_arrays_train_as_those_that_are_compiled_in(mapping: str | N
         replace(SMALL, learning_rate=3e-3, discount=0.7, tau=0.2, reward_scale=0.5),
         replace(SMALL, initial_alpha=0.7, target_entropy_ratio=0.6, entropy_nats=-0.3),
     ]
-    training = Training("navigation", mapping, policies=2, iterations=8 * 40, seed=4)
+    training = Training("navigation", mapping, policies=2, iterations=8 * 12 * CHUNKS, seed=4)
     simulator = None if mapping is None else synthetic_simulator()
-    n_conditions = 0 if mapping is None else 5
-    together = SideBySide(training, n_conditions, algorithms, (0, 1))
-    together.begin()
-    together.train(0, 12, simulator)
+    timeline = None if mapping is None else fit_timeline([extract_responses(synthetic_recording(1, patterns=40))])
+    together = Trials(training, timeline, algorithms, (0, 1))
+    together.train(0, simulator)
     found = []
     for i, algorithm in enumerate(algorithms):
-        beginning, chunk = programs(training.environment(n_conditions), algorithm)
+        beginning, chunk = programs(training.environment_on(timeline), algorithm)
         keys = jnp.stack([jax.random.fold_in(jax.random.key(4), member) for member in (0, 1)])
         learners, _ = chunk(beginning(keys), simulator, jnp.int32(0), jnp.int32(12))
         networks = together.networks(i, greedy=True)

@@ -28,7 +28,7 @@ from animat.training.diagnosis import diagnosing
 from animat.training.host import programs_on_host
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
-from animat.training.sac import Learner, begin, train_chunk
+from animat.training.sac import begin, train_chunk
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.wrappers import EpisodeLimit
@@ -192,16 +192,19 @@ class SideBySide:
         group: the policies; of its timeline only what all simulators of it share is used.
         others: trained with them by the same program, the same number of rounds. Where any is of another training,
             none has lessons or is stepped outside JAX.
+        own_programs: `begin` and `train_chunk` for all of them, in place of `programs`.
     """
 
-    def __init__(self, group: Group, *others: Group) -> None:
+    def __init__(self, group: Group, *others: Group, own_programs: Sequence[Callable[..., Any]] = ()) -> None:
         training = group.training
         self._groups = groups = (group, *others)
         self._places = [(each, member) for each in groups for member in each.members]
         self._own_simulators = len({each.fingerprint for each in groups}) > 1
         self._environment = training.environment_on(group.timeline)
         self._course = None
-        if training.is_varied:
+        if own_programs:
+            beginning, self._chunk = own_programs
+        elif training.is_varied:
             self._course = Course(training, self._environment, group.timeline, len(self._places))
             beginning, self._chunk = self._course.begin, self._course.train
         elif isinstance(training.robot, HostRobot):
@@ -241,12 +244,7 @@ class SideBySide:
         episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
         iterations = np.full(len(episodes), last * algorithm.environments)
         # Before a checkpoint is written, from which no training would recover.
-        robot, deployed = training.robot, jax.tree.leaves(self._learners.deployed)
-        if not all(np.isfinite(leaf).all() for leaf in deployed):
-            raise UnusableData(
-                f"{robot.name}: expected finite rewards and observations, got NaN or infinite ones "
-                f"within {iterations[0]:,} iterations"
-            )
+        self._expect_finite(within=iterations[0])
         available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
         diagnosis = map(np.asarray, self._diagnose(self._learners, available))
         with np.errstate(invalid="ignore"):
@@ -254,6 +252,14 @@ class SideBySide:
         if self._course is not None:
             self._course.assess(index, self._learners.deployed, simulator)
         return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")
+
+    def _expect_finite(self, within: int) -> None:
+        robot, deployed = self._groups[0].training.robot, jax.tree.leaves(self._learners.deployed)
+        if not all(np.isfinite(leaf).all() for leaf in deployed):
+            raise UnusableData(
+                f"{robot.name}: expected finite rewards and observations, got NaN or infinite ones "
+                f"within {within:,} iterations"
+            )
 
     def note(self) -> str:
         """What there is to tell beside returns: how far the policies are in their lessons."""
@@ -294,21 +300,31 @@ class SideBySide:
             learning_curve=curve,
         )
 
-    def keep(self, checkpoint: Path) -> None:
-        """Write a checkpoint."""
+    def keep(self, checkpoint: Path, group: int | None = None) -> None:
+        """Write a checkpoint, of all policies or of those of one group, by its place."""
         learners = self._learners._replace(key=jax.random.key_data(self._learners.key))
         leaves = jax.tree.leaves((learners, self._standing))
-        arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+        members = np.array([member for _, member in self._places])
+        ours = slice(None) if group is None else self.split(np.arange(len(members)))[group]
+        arrays: dict[str, Any] = {f"leaf{i}": np.asarray(leaf)[ours] for i, leaf in enumerate(leaves)}
         arrays |= {"fingerprint": np.array(self.fingerprint), "done": np.array(len(self.curve))}
         with atomic_write(checkpoint) as beside, beside.open("wb") as file:
             # Whose curves they are is for the live page alone.
-            np.savez(file, curve=np.stack(self.curve), members=[member for _, member in self._places], **arrays)
+            np.savez(file, curve=np.stack(self.curve)[:, ours], members=members[ours], **arrays)
 
-    def resume(self, checkpoint: Path) -> int:
-        """Go on from a checkpoint; returns how many chunks are done."""
-        done, self._learners, standing, curve = _read_checkpoint(
-            checkpoint, self.fingerprint, self._learners, self._standing
+    def resume(self, *checkpoints: Path) -> int:
+        """Go on from a checkpoint, or from one of each group, of as many policies; returns how many chunks are done."""
+        like: Any = self._learners._replace(key=jax.random.key_data(self._learners.key)), self._standing
+        if checkpoints[1:]:
+            n = len(self._places) // len(checkpoints)
+            like = jax.eval_shape(lambda: jax.tree.map(lambda leaf: leaf[:n], like))
+        (done, (learners, standing), curve), *others = (
+            _read_checkpoint(each, self.fingerprint, like) for each in checkpoints
         )
+        if others:
+            learners = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), learners, *(each[1][0] for each in others))
+            curve = np.concatenate([curve, *(each[2] for each in others)], axis=1)
+        self._learners = learners._replace(key=jax.random.wrap_key_data(learners.key))
         if self._course is not None:
             self._course.standing = standing
         self.curve = list(curve[:done])
@@ -324,17 +340,16 @@ class SideBySide:
         return () if self._course is None else self._course.standing
 
 
-def _read_checkpoint(
-    path: Path, fingerprint: str, like: Learner, standing: Any
-) -> tuple[int, Learner, Any, np.ndarray]:
-    leaves, structure = jax.tree.flatten((like._replace(key=jax.random.key_data(like.key)), standing))
-    n_standing = len(jax.tree.leaves(standing))
+def _read_checkpoint(path: Path, fingerprint: str, like: Any) -> tuple[int, Any, np.ndarray]:
+    """Of a checkpoint: how many chunks are done, learners with how far they stand, as in `like`, and the curve."""
+    leaves, structure = jax.tree.flatten(like)
+    n_standing, policies = len(jax.tree.leaves(like[1])), leaves[0].shape[0]
     try:
         # Opened here, as numpy leaves a file open that it cannot read.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             # Before anything is read of it: an archive of some kilobytes can unpack to any size.
             unpacked = sum(member.file_size for member in file.zip.infolist())
-            most = 2 * sum(leaf.nbytes for leaf in leaves) + 2**22
+            most = 2 * sum(leaf.size * leaf.dtype.itemsize for leaf in leaves) + 2**22
             if unpacked > most:
                 raise InvalidFile(
                     f"{path}: expected a checkpoint of at most {most:,} bytes, got {unpacked:,}; remove it"
@@ -344,9 +359,9 @@ def _read_checkpoint(
             kept = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]
             done, curve = int(file["done"]), file["curve"]
             forms = [[(a.shape, a.dtype) for a in arrays] for arrays in (kept, leaves)]
-            if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, len(leaves[0]), len(CURVE)):
+            if forms[0] != forms[1] or not 0 < done <= CHUNKS or curve.shape != (done, policies, len(CURVE)):
                 raise InvalidFile(
-                    f"{path}: expected a checkpoint as this animat writes it, of {len(leaves[0])} policies together, "
+                    f"{path}: expected a checkpoint as this animat writes it, of {policies} policies together, "
                     f"got another's; to begin these anew: rm '{path}'"
                 )
             # What is not on its way to JAX stays numpy's, of 64 bits.
@@ -358,8 +373,7 @@ def _read_checkpoint(
         raise InvalidFile(
             f"{path}: expected a checkpoint, got a file that cannot be read ({error}); remove it"
         ) from error
-    learners, standing = jax.tree.unflatten(structure, read)
-    return done, learners._replace(key=jax.random.wrap_key_data(learners.key)), standing, curve
+    return done, jax.tree.unflatten(structure, read), curve
 
 
 def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:

@@ -23,7 +23,7 @@ from animat.studies.training import training_of
 from animat.training.group import CHECKPOINT_S
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS
-from animat.tuning.side_by_side import SideBySide
+from animat.tuning.side_by_side import Trials
 from animat.tuning.space import NUMBERS, Settings, with_settings
 from animat.writing import write_whole
 
@@ -101,28 +101,24 @@ class TrainTrials(StudyTask):
         studies = [with_settings(self.study, trial.settings) for trial in self.trials]
         algorithms = [SAC(**study.algorithm) for study in studies]  # type: ignore[arg-type]
         training = training_of(studies[0], self.study.robots[0], studies[0].arms[0])
-        training = replace(training, seed=self.seeds[0], policies=len(self.members), algorithm=algorithms[0])
+        training = replace(training, seed=self.seeds[0], policies=len(self.members))
         taught = _timeline(folder, studies[0])
         judged = _timeline(folder, replace(studies[0], simulators=_judge(self.study, studies[0])))
-        together = SideBySide(training, 0 if taught is None else len(taught.conditions), algorithms, self.members)
+        together = Trials(training, taught, algorithms, self.members)
 
         checkpoint = place / f"{self._name}.npz"
-        if checkpoint.exists():
-            done = together.resume([checkpoint])
-        elif first:
-            done = together.resume([kept_file(place, trial, first, self.members[0]) for trial in self.trials])
-        else:
-            together.begin()
-            done = 0
+        kept = [kept_file(place, trial, first, self.members[0]) for trial in self.trials if first]
+        left = [checkpoint] if checkpoint.exists() else kept
+        done = together.resume(*left) if left else 0
         written = time.monotonic()
         for index in range(done, last):
-            together.train(*training.chunk(index), _at(taught, training.minute(index)))
+            together.train(index, _at(taught, training.minute(index)))
             progress.update(index + 1 - first, last - first + 1)
             if index + 1 < last and time.monotonic() - written > CHECKPOINT_S:
-                together.keep(checkpoint, index + 1)
+                together.keep(checkpoint)
                 written = time.monotonic()
 
-        environment = training.environment(0 if taught is None else len(taught.conditions))
+        environment = training.environment_on(taught)
         files = []
         for i, trial in enumerate(self.trials):
             networks = together.networks(i, greedy=self.study.actions == "most probable")
@@ -138,7 +134,7 @@ class TrainTrials(StudyTask):
             files.append(write_whole(file, json.dumps(returns) + "\n"))
             if self.goes_on:
                 files.append(kept_file(place, trial, last, self.members[0]))
-                together.keep(files[-1], last, i)
+                together.keep(files[-1], i)
         checkpoint.unlink(missing_ok=True)
         return files
 
