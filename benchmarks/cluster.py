@@ -31,6 +31,7 @@ from animat.studies.cultures import run_over_cultures
 from animat.studies.places import RECEIPTS
 from animat.studies.plan import plan_study
 from animat.studies.run import run_study
+from animat.studies.source import Source
 from animat.studies.toml import read_study
 
 STUDY = Path(__file__).parents[1] / "tests" / "tiny_study.toml"
@@ -70,7 +71,8 @@ def study(scheduler: Path, rounds: int) -> dict[str, Any]:
     """The same study on both, in turns, after one that fills the cache of compiled programs."""
 
     def work(folder: Path, cluster: Any) -> None:
-        run_study(read_study(STUDY), folder, workers=None if cluster else WORKERS, executor=cluster)
+        here = None if cluster else WORKERS
+        run_study(read_study(STUDY), folder, base=STUDY.parent, workers=here, executor=cluster)
 
     work_s: dict[str, list[float]] = {"pinned": [], "cluster": []}
     for turn in range(-1, rounds):
@@ -108,8 +110,8 @@ def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         the_study = read_study(STUDY)
-        run_study(the_study, folder, workers=WORKERS)
-        for job in plan_study(the_study, folder):
+        run_study(the_study, folder, base=STUDY.parent, workers=WORKERS)
+        for job in plan_study(the_study, STUDY.parent):
             receipt = Receipt.load(folder / RECEIPTS, job.name)
             assert receipt is not None
             notice = receipt_path(folder / RECEIPTS, job.name)
@@ -124,8 +126,8 @@ def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
 def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
     """Seconds for 10, 100 and 1,000 policies of 10,000 iterations, and for a small study on 1, 10 and 100 cultures.
 
-    The study is the tiny one with its first two arms. On pinned processes, once each, after one of each kind that fills
-    the cache of compiled programs.
+    The study is the tiny one with its first two arms, and each culture has its recordings. On pinned processes, once
+    each, after one of each kind that fills the cache of compiled programs.
     """
     from training import timeline, training
 
@@ -135,9 +137,13 @@ def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
 
     def cultures(many: int) -> float:
         study = read_study(STUDY)
-        culture = replace(study.culture, seeds=f"1-{many}")
-        study = replace(study, culture=culture, arms=study.arms[:2], optimum_resolution=0.1)
-        return timed(lambda folder, _: run_over_cultures(study, folder, workers=WORKERS), None)
+        with tempfile.TemporaryDirectory() as base:
+            names = tuple(f"{i}" for i in range(many))
+            for name in names:
+                (Path(base) / name).symlink_to(STUDY.parent / study.culture.files[0])
+            culture = Source("files", folders=names)
+            study = replace(study, culture=culture, arms=study.arms[:2], optimum_resolution=0.1)
+            return timed(lambda folder, _: run_over_cultures(study, folder, base=Path(base), workers=WORKERS), None)
 
     told = {}
     for name, work, most in (("policies", policies, 1000), ("cultures", cultures, 100)):

@@ -23,7 +23,6 @@ from animat.errors import AnimatError
 from animat.recordings.apart import end_reader
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.inspection import inspect_recording
 from rig_files import (
     BITS,
@@ -37,6 +36,7 @@ from rig_files import (
     write_maxwell,
     write_old_maxwell,
 )
+from synthetic_recordings import synthetic_recording
 
 GIGABYTE = 2**30
 SECONDS = 10

@@ -8,9 +8,9 @@ import pytest
 
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import fit_timeline
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
+from synthetic_recordings import synthetic_recording
 
 
 @pytest.mark.parametrize("kind", ["histogram", "empirical", "memory"])

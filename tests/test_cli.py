@@ -30,13 +30,13 @@ from animat.evaluation.resampling import with_intervals
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
-from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.series import extract_series
 from animat.robots import Cartpole
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.watch.training import TrainingView
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
+from synthetic_recordings import write_synthetic_series
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -175,14 +175,12 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
     assert {file: file.read_bytes() for file in policies.iterdir()} == files
 
 
-def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_whole_way(recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     series, trained, figures = tmp_path / "recordings", tmp_path / "policies", tmp_path / "figures"
-    record = ["record", "--culture", "synthetic", "--sessions", "2", "--out", str(series)]
-    assert main([*record, "--json"]) == 0
+    replay = ["--culture", "replay", "--recordings", str(recordings), "--trials", "100"]
+    assert main(["record", *replay, "--out", str(series), "--json"]) == 0
     printed = capsys.readouterr().out
     assert len(last_json(printed)["recordings"]) == 2 and "there already" not in printed  # type: ignore[arg-type]
-    assert main(record) == 0
-    assert f"2 recordings in {series}; all were there already" in capsys.readouterr().out
 
     assert main(["inspect", str(series), "--out", str(figures), "--json"]) == 0
     told = last_json(capsys.readouterr().out)["recordings"]
@@ -198,6 +196,20 @@ def test_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     told = last_json(capsys.readouterr().out)
     assert told["recorded_at_min"] == 0.0
     assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
+
+
+def test_recordings_that_were_there_already_are_said_to_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def recorded(_: object, __: object, folder: Path, **___: object) -> list[Path]:
+        folder.mkdir(exist_ok=True)
+        (folder / "recording_0000_min.nwb").touch()
+        return [*folder.iterdir()]
+
+    monkeypatch.setattr("animat.cultures.series.record_virtual_series", recorded)
+    for were_there in ("", "; all were there already"):
+        assert main(["record", "--out", str(tmp_path / "out")]) == 0
+        assert capsys.readouterr().out == f"1 recording in {tmp_path / 'out'}{were_there}\n"
 
 
 @pytest.mark.oracle
@@ -443,7 +455,6 @@ BAD = {
         )
         for command, more, option in (
             ("record", [], "--sessions"),
-            ("record", ["--culture", "synthetic"], "--sessions"),
             ("record", [], "--trials"),
             ("record", [], "--pulses"),
             ("train", ["cartpole", "--recordings", "{recordings}"], "--policies"),
@@ -478,28 +489,28 @@ BAD = {
         f"a name that is too long for {command}": (nothing, [command, *arguments, "a" * 300], ["File name too long"])
         for command, arguments in (
             ("replay", []),
-            ("record", ["--culture", "synthetic", "--out"]),
+            ("record", ["--out"]),
             ("train", ["cartpole", "--recordings", "{recordings}", "--out"]),
         )
     },
     "an empty text for a folder": (
         nothing,
-        ["record", "--culture", "synthetic", "--out", ""],
+        ["record", "--out", ""],
         ["--out: expected a value after it, got an empty text"],
     ),
     "a folder of others' recordings": (
         lambda folder, *_: (folder / "mine.nwb").write_text("x"),
-        ["record", "--culture", "synthetic", "--out", "{folder}"],
+        ["record", "--out", "{folder}"],
         ["expected no recordings but those of this series, got mine.nwb; choose another --out"],
     ),
     "a file for a folder": (
         lambda folder, *_: (folder / "taken").write_text("x"),
-        ["record", "--culture", "synthetic", "--out", "{folder}/taken"],
+        ["record", "--out", "{folder}/taken"],
         ["taken: cannot be made or read: it is no folder; choose another --out"],
     ),
     "zero sessions": (
         nothing,
-        ["record", "--culture", "synthetic", "--sessions", "0", "--out", "{folder}/r"],
+        ["record", "--sessions", "0", "--out", "{folder}/r"],
         ["sessions"],
     ),
 }

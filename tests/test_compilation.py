@@ -70,7 +70,7 @@ from animat.compilation import keep_compilations
 keep_compilations()
 import jax
 print(jax.jit(lambda x: x + 1)(1), jax.config.jax_compilation_cache_dir)
-from animat.recordings.synthetic import synthetic_recording
+from synthetic_recordings import synthetic_recording
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 recording = synthetic_recording(1)
@@ -89,6 +89,7 @@ def test_a_home_that_is_a_file_keeps_nothing_and_says_nothing(tmp_path: Path) ->
     language = "C" if sys.prefix.isascii() and animat.__file__.isascii() else "C.UTF-8"
     done = subprocess.run(
         [sys.executable, "-c", COMPILING, str(tmp_path / "für mich.nwb")],
+        cwd=Path(__file__).parent,
         env=without | {"HOME": str(home), "LC_ALL": language},
         capture_output=True,
         text=True,

@@ -14,9 +14,9 @@ from animat.cultures.replay import ReplayCulture
 from animat.cultures.safety import SIMULATED_LIMITS
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.synthetic import synthetic_recording
 from cultures import small_culture
 from fake_culture import FakeCulture
+from synthetic_recordings import synthetic_recording
 
 
 class TestVirtualCulture(CultureContract):

@@ -13,8 +13,8 @@ import pytest
 from animat.errors import InvalidFile
 from animat.recordings import apart
 from animat.recordings.formats.nwb import read_nwb, write_nwb
-from animat.recordings.synthetic import synthetic_recording
 from damaging import KINDS
+from synthetic_recordings import synthetic_recording
 
 
 def damage(kind: str, seed: int, count: int, folder: Path) -> None:

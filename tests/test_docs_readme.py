@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from animat.cli import _parse
-from animat.recordings.synthetic import write_synthetic_series
+from synthetic_recordings import write_synthetic_series
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -13,8 +13,8 @@ import pytest
 
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.neurons.synthetic import synthetic_simulator
-from animat.recordings.synthetic import write_synthetic_series
 from animat.robots.registry import REGISTRY
+from synthetic_recordings import write_synthetic_series
 
 DOCS = Path(__file__).parents[1] / "docs"
 

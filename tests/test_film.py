@@ -20,7 +20,6 @@ from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.reading import read_sources
-from animat.recordings.synthetic import write_synthetic_series
 from animat.report.film.frame import HEIGHT_PX, WIDTH_PX
 from animat.report.film.session import scene_of_session
 from animat.report.film.simulated import scene_of_policies
@@ -30,6 +29,7 @@ from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.training.policy import Policy, load_policies
 from fake_culture import CHANNELS, FakeCulture, OneCondition
+from synthetic_recordings import write_synthetic_series
 
 HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 AGENTS = [Agent("random", "any", AnyCondition(5)), Agent("silent", "", OneCondition(0), "silent")]

@@ -13,9 +13,9 @@ from animat.errors import DeviceFailed, Mismatch
 from animat.live.plan import Timetable
 from animat.live.shadowing import live
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.writing import LOCK, exclusive_lock
 from fake_culture import FakeCulture
+from synthetic_recordings import synthetic_recording
 from test_live import ONE, PROTOCOL
 from test_run_on_recordings import policy_of
 
@@ -31,7 +31,6 @@ def command(name: str, folder: Path) -> list[str]:
     if name in ("record replay", "run"):
         write_nwb(synthetic_recording(1, patterns=40, channels=32), synthetic)
     return {
-        "record synthetic": ["record", "--culture", "synthetic", "--sessions", "1"],
         "record cl1": ["record", "--culture", "cl1"],
         "record replay": ["record", "--culture", "replay", "--recordings", str(synthetic)],
         "run": ["run", str(folder / "p0.safetensors"), "--recordings", str(synthetic)],
@@ -39,7 +38,7 @@ def command(name: str, folder: Path) -> list[str]:
     }[name] + ["--out", str(folder / "in" / "out")]
 
 
-@pytest.mark.parametrize("name", [*OPENING, "record synthetic"])
+@pytest.mark.parametrize("name", OPENING)
 def test_a_second_run_is_refused_before_a_culture_is_opened(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,18 +75,6 @@ def test_a_session_that_still_runs_is_not_recovered(tmp_path: Path, capsys: pyte
     assert (session / "session.nwb").stat().st_mtime_ns == before
     assert main(["recover", str(session)]) == 0
     assert "session.nwb and ticks.csv: " in capsys.readouterr().out
-
-
-def test_a_synthetic_series_is_written_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def noted(*given: Any, **more: Any) -> list[Path]:
-        with pytest.raises(Mismatch, match="another run is at work"), exclusive_lock(tmp_path / "in" / "out"):
-            pass
-        return write_synthetic_series(*given, **more)
-
-    monkeypatch.setattr("animat.recordings.synthetic.write_synthetic_series", noted)
-    for _ in range(2):
-        assert main(command("record synthetic", tmp_path)) == 0
-    assert [file.name for file in (tmp_path / "in" / "out").iterdir()] == ["recording_0000_min.nwb"]
 
 
 @pytest.mark.oracle

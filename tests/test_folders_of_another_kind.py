@@ -13,17 +13,17 @@ from animat.errors import Mismatch
 from animat.live.plan import LOG_FILE as LIVE
 from animat.marks import MARKS, Kind, expect_no_other
 from animat.recordings.formats.nwb import recording_name, write_nwb
-from animat.recordings.synthetic import synthetic_recording
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
 from animat.tuning.run import MANIFEST as TUNING
+from synthetic_recordings import synthetic_recording
 from test_run_on_recordings import policy_of
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 
 COMMANDS: dict[Kind, tuple[str, list[str]]] = {
-    "recording": ("recordings", ["record", "--culture", "synthetic", "--sessions", "1"]),
+    "recording": ("recordings", ["record", "--sessions", "1"]),
     "training": ("policies", ["train", "cartpole", "--mapping", "none", "--policies", "1", "--iterations", "1000"]),
     "session": ("a session", ["run", "{beside}/p0.safetensors", "--recordings", "{beside}/synthetic.nwb"]),
     "cultures": ("a study of many cultures", ["study", "{beside}/many.toml"]),
@@ -53,7 +53,7 @@ def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
     if kind == "session":
         write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
     policy_of(0).save(tmp_path / "p0.safetensors")
-    (tmp_path / "many.toml").write_text(TINY.read_text().replace("[culture]\n", '[culture]\nseeds = "1-2"\n'))
+    (tmp_path / "many.toml").write_text(TINY.read_text().replace("files = [", "folders = ["))
     out = tmp_path / "out"
     out.mkdir()
     (out / mark).write_bytes(b"somebody's")

@@ -24,13 +24,13 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import UnsafeStimulus
-from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.array import MAXONE
 from animat.stimulation.pulse import Phase, Pulse
 from animat.stimulation.selection import Selection
 from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from stand_in_maxlab import LSB_MV
+from synthetic_recordings import synthetic_recording
 
 BACKENDS = ("virtual", "replay", "cl1", "maxone")
 FEW: dict[str, Any] = {"stimuli_per_s": 60, "stimuli_per_electrode_s": 9}

@@ -393,17 +393,17 @@ def test_a_study_tells_its_device_and_is_not_gone_on_with_on_another(
     (tmp_path / "jobs").mkdir()
     (tmp_path / "jobs" / "fit.json").write_text("{}")
     with pytest.raises(Mismatch, match=r"versions\.device: 'NVIDIA H100' there, nothing now"):
-        studies.run_study(study, tmp_path)
+        studies.run_study(study, tmp_path, base=TINY.parent)
     monkeypatch.setattr(studies, "find_gpu", lambda: "NVIDIA A100")
     with pytest.raises(Mismatch, match=r"versions\.device: 'NVIDIA H100' there, 'NVIDIA A100' now"):
-        studies.run_study(study, tmp_path)
+        studies.run_study(study, tmp_path, base=TINY.parent)
 
 
 @pytest.mark.oracle
 def test_arms_trained_at_once_are_those_of_a_study_on_cores_where_none_shares_a_program(tmp_path: Path) -> None:
     study = read_study(TINY)
     for name in ("gpu", "cores"):
-        plan = [job for job in plan_study(study, tmp_path) if job.name.split("/")[0] in ("record", "fit", "train")]
+        plan = [job for job in plan_study(study, TINY.parent) if job.name.split("/")[0] in ("record", "fit", "train")]
         jobs = Jobs(plan, tmp_path / name, tmp_path / name / "jobs", "the study")
         assert len(jobs.run(workers=1, executor=None, progress=Silent(), has_gpu=name == "gpu")) == 6
     policies = [sorted((tmp_path / name / "policies").rglob("*.safetensors")) for name in ("gpu", "cores")]

@@ -24,9 +24,9 @@ from animat.gym import IDS, register_environments
 from animat.neurons.simulator import silenced
 from animat.neurons.synthetic import LABELS, synthetic_simulator
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.robots import Cartpole, robot_named
 from animat.wrappers import EpisodeLimit
+from synthetic_recordings import synthetic_recording, write_synthetic_series
 
 assert animat.__doc__  # importing animat registers the environments
 

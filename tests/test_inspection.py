@@ -13,7 +13,6 @@ from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.synthetic import SyntheticCulture
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.inspection import draw_inspection, inspection_text
 from animat.report.psth import draw_psth
@@ -27,6 +26,7 @@ from animat.responses.inspection import inspect_recording
 from animat.responses.psth import post_stimulus_histogram
 from animat.responses.quality.responses import _difference
 from animat.responses.responses import Responses
+from synthetic_recordings import SyntheticCulture
 from test_responses import names, recording
 
 

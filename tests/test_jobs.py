@@ -25,7 +25,7 @@ from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import Task, carry_out, carry_out_alone, reported
 from animat.progress import Silent
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.synthetic import synthetic_recording
+from synthetic_recordings import synthetic_recording
 from worker_tasks import Die, Fail, Join, Killed, Starve, Stumble
 
 CORE = min(os.sched_getaffinity(0))

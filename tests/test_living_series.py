@@ -30,7 +30,6 @@ from animat.cultures.replay import ReplayCulture
 from animat.cultures.series import record_series
 from animat.errors import DeviceFailed, InvalidArgument, Mismatch
 from animat.recordings.reading import read_recording, read_recordings
-from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.protocol import Protocol
@@ -38,6 +37,7 @@ from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.selection import Selection
 from animat.writing import exclusive_lock
 from fake_culture import FakeCulture
+from synthetic_recordings import synthetic_recording, write_synthetic_series
 
 SHORT = Protocol((20.0, 80.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 

@@ -32,7 +32,6 @@ from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
@@ -47,6 +46,7 @@ from animat.studies.simulating import load_timeline, save_timeline
 from animat.studies.specification import Simulators
 from animat.training.specification import Training
 from animat.wrappers import ShuffledDelivery
+from synthetic_recordings import synthetic_recording
 from test_optimum import STEPS, Stairs, coins
 from test_responses import recording
 from test_simulator import responses_of

@@ -110,7 +110,6 @@ def test_a_studys_former_keys_are_read_by_their_names_of_today(tmp_path: Path) -
     text = """optimum_resolution = 0.5
 optimum_episodes = 7
 [culture]
-kind = "synthetic"
 trials = 40
 [simulators]
 allow = ["dead-window"]
@@ -131,7 +130,6 @@ mapping = "linear"
         ("arms", "conditions"),
         ("gradient_steps", "updates"),
         ("tau", "follow"),
-        ("synthetic", "made-up"),
         ("trials", "presentations"),
     ):
         text = text.replace(now, before)
@@ -139,6 +137,15 @@ mapping = "linear"
     assert read_study(former) == read_study(today)
     former.write_text("limit_resolution = 0.5\noptimum_resolution = 0.5\n")
     with pytest.raises(InvalidFile, match="limit_resolution: no such setting at the top"):
+        read_study(former)
+
+
+def test_channels_are_read_and_a_culture_that_was_made_up_is_refused(old: Path, tmp_path: Path) -> None:
+    written = old / "study" / "study.toml"
+    assert "channels = 256\n" in written.read_text()
+    assert read_study(written) == read_study(old / "study.toml")
+    (former := tmp_path / "former.toml").write_text('[culture]\nkind = "made-up"\nchannels = 32\n')
+    with pytest.raises(InvalidFile, match=r"toml: culture\.kind: expected 'virtual' or 'files', got 'made-up'"):
         read_study(former)
 
 

@@ -24,13 +24,13 @@ from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole
 from animat.robots.grid import grid_for
+from synthetic_recordings import synthetic_recording
 
 ROBOT = Cartpole(episode_limit=60)
 

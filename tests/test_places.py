@@ -139,8 +139,6 @@ def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixtur
     file.write_text("[[1, 2]")
     assert main(["record", "--places", str(file), "--out", str(out)]) == 1
     assert "places.json: places: expected JSON" in capsys.readouterr().err
-    assert main(["record", "--culture", "synthetic", "--places", "halves", "--out", str(out)]) == 1
-    assert "no places; --culture virtual takes others" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -12,10 +12,10 @@ from animat.recordings.findings import Finding
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.synthetic import SyntheticCulture
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.stimulation.protocol import Order, Presentation
+from synthetic_recordings import SyntheticCulture
 from test_inspection import answering
 from test_responses import recording
 

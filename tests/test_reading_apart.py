@@ -13,7 +13,7 @@ from animat.recordings import apart
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import synthetic_recording
+from synthetic_recordings import synthetic_recording
 
 
 @pytest.fixture(scope="module")

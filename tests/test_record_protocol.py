@@ -18,10 +18,10 @@ from animat.cultures.kinds import pulse_for
 from animat.cultures.series import Series, check_interval
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.schedule import make_schedule
+from synthetic_recordings import synthetic_recording
 
 PATTERNS = np.arange(500).reshape(100, 5)
 MINE = Protocol((5.0, 40.0), "mixed", 3, patterns=4, trials=2, setup_s=1.0, pause_s=3.0, tail_s=0.5)
@@ -160,7 +160,6 @@ def test_pulses_faster_than_the_response_window_are_warned_of(
         ({"protocol": Path("mine.json")}, 10.0),
         ({"trials": 800}, 10.0),
         ({"places": "halves"}, 10.0),
-        ({"culture": "synthetic"}, 10.0),
     ],
 )
 def test_recordings_are_as_far_apart_as_the_usual_ones_take(options: dict[str, Any], interval_min: float) -> None:
@@ -170,14 +169,6 @@ def test_recordings_are_as_far_apart_as_the_usual_ones_take(options: dict[str, A
 def test_halves_fit_into_the_usual_interval() -> None:
     record = Record(places="halves")
     check_interval(record._protocol(), 2, record._interval_min)
-
-
-def test_synthetic_recordings_have_a_protocol_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "mine.json").write_text(MINE.to_json())
-    command = ["record", "--culture", "synthetic", "--out", str(tmp_path / "out")]
-    for more in (["--protocol", str(tmp_path / "mine.json")], ["--pulses", "0"], ["--order", "mixed"]):
-        assert main([*command, *more]) == 1
-        assert "--protocol: synthetic recordings are blocked" in capsys.readouterr().err
 
 
 def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Path) -> None:

@@ -18,10 +18,10 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
+from synthetic_recordings import synthetic_recording
 
 TEXT = st.text(st.characters(blacklist_characters="\0", blacklist_categories=("Cs",)), max_size=8)
 FEW = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -253,7 +253,7 @@ SAVE_ON_A_FULL_DISK = """
 import resource, signal, sys
 from animat.errors import InvalidFile
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.synthetic import synthetic_recording
+from synthetic_recordings import synthetic_recording
 recording = synthetic_recording(4)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
@@ -272,7 +272,11 @@ def test_a_full_disk_leaves_the_old_file_whole(synthetic: Recording, tmp_path: P
     before = path.read_bytes()
     assert len(before) > 100_000
     done = subprocess.run(
-        [sys.executable, "-c", SAVE_ON_A_FULL_DISK, str(path)], capture_output=True, text=True, check=False
+        [sys.executable, "-c", SAVE_ON_A_FULL_DISK, str(path)],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 3, done.stderr
     assert "a.nwb: cannot be written: File too large; what stood there before is unchanged" in done.stdout
@@ -288,7 +292,7 @@ import hdmf
 from importlib.metadata import version
 from platformdirs import PlatformDirs
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.synthetic import synthetic_recording
+from synthetic_recordings import synthetic_recording
 own = PlatformDirs(appname="pynwb-hdmf", version=f"{version('pynwb')}-{hdmf.__version__}", ensure_exists=True)
 (own.user_cache_path / "pynwb_core_typemap.pkl").write_bytes(b"")
 write_nwb(synthetic_recording(4), sys.argv[1])
@@ -301,6 +305,7 @@ def test_a_cache_that_another_process_is_writing_is_not_read(tmp_path: Path) -> 
     environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")
     done = subprocess.run(
         [sys.executable, "-c", WRITE_BESIDE_A_HALF_WRITTEN_CACHE, str(tmp_path / "a.nwb")],
+        cwd=Path(__file__).parent,
         env=environment,
         capture_output=True,
         text=True,

@@ -20,13 +20,13 @@ from animat.coding.mapping import REGISTRY, mapping_from_data, mapping_named, ma
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.recordings.synthetic import write_synthetic_series
 from animat.studies.run import run_study
 from animat.studies.source import Source
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training
+from synthetic_recordings import write_synthetic_series
 from test_training import SMALL, timeline_of
 
 DOCS = Path(__file__).parents[1] / "docs" / "robots.md"
@@ -119,7 +119,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 @pytest.mark.oracle
 def test_a_study_has_conditions_with_it(package: Path) -> None:
     study = Study(
-        culture=Source("synthetic", sessions=1, trials=40, channels=16),
+        culture=Source("files", files=("data/tiny/recording_0000_min.npz",)),
         robots=(RobotSpec("cartpole", iterations=240),),
         arms=(Arm("steep", mapping=STEEP), Arm("one threshold")),
         policies=1,
@@ -129,7 +129,7 @@ def test_a_study_has_conditions_with_it(package: Path) -> None:
     )
     (package / "study.toml").write_text(study_to_toml(study))
     assert read_study(package / "study.toml") == study
-    ran = run_study(study, package / "study", workers=1)
+    ran = run_study(study, package / "study", base=Path(__file__).parent, workers=1)
     assert STEEP in ran.report.read_text()
 
 

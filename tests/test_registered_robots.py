@@ -22,7 +22,6 @@ from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.recordings.synthetic import write_synthetic_series
 from animat.robots import (
     ROBOTS,
     Cartpole,
@@ -46,6 +45,7 @@ from animat.studies.specification import RobotSpec, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.training.policy import load_policies
 from animat.training.specification import Training
+from synthetic_recordings import write_synthetic_series
 from test_training import SMALL, timeline_of
 
 DOCS = Path(__file__).parents[1] / "docs" / "robots.md"
@@ -147,7 +147,7 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
 def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None:
     robot_named(ROVER)
     study = Study(
-        culture=Source("synthetic", sessions=1, trials=40, channels=16),
+        culture=Source("files", files=("data/tiny/recording_0000_min.npz",)),
         robots=(RobotSpec("rover", iterations=240),),
         policies=1,
         episodes=2,
@@ -156,7 +156,7 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
     )
     (package / "study.toml").write_text(study_to_toml(study))
     assert read_study(package / "study.toml") == study and study.robots[0].kind == ROVER
-    ran = run_study(study, package / "study", workers=1)
+    ran = run_study(study, package / "study", base=Path(__file__).parent, workers=1)
     page = ran.report.read_text()
     for message in lacking(robot_named("rover")).values():
         assert message in page

@@ -14,12 +14,12 @@ from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording, read_source, read_sources
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
-from animat.recordings.synthetic import synthetic_recording
 from animat.report.inspection import inspection_text
 from animat.responses.conditions import ByInterval, ByPattern, Conditions
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.responses.windows import spikes_in
+from synthetic_recordings import synthetic_recording
 from test_responses import recording as of_spikes
 
 

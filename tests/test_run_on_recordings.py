@@ -21,7 +21,6 @@ from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, Neu
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.series import extract_series
@@ -30,6 +29,7 @@ from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
+from synthetic_recordings import synthetic_recording
 
 pytestmark = pytest.mark.usefixtures("few_bootstraps")
 

@@ -12,7 +12,6 @@ from matplotlib.colors import to_hex
 
 from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.recording import Recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.report.array import draw_array, draw_selection
 from animat.report.drift import draw_drift
 from animat.report.response_histograms import draw_response_histograms
@@ -24,6 +23,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.stimulation.array import MAXONE
 from animat.stimulation.selection import Selection
+from synthetic_recordings import synthetic_recording
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,6 @@ from animat.neurons.timeline import fit_timeline
 from animat.progress import Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording, read_recordings
-from animat.recordings.synthetic import synthetic_recording, write_synthetic_series
 from animat.report.html import cell, with_error
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
@@ -62,6 +61,7 @@ from animat.studies.training import training_of
 from animat.training.policy import Policy
 from animat.writing import LOCK, exclusive_lock
 from cultures import small_culture
+from synthetic_recordings import synthetic_recording, write_synthetic_series
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 CONTROLS = [arm.name for arm in read_study(TINY).arms if arm.delivery == "shuffled"]
@@ -169,20 +169,20 @@ def test_what_is_lost_or_damaged_is_made_again_by_workers(
 def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) -> None:
     before = files(finished)
     with pytest.raises(Mismatch, match=r"another \(study\.policies: 2 there, 3 now\)"):
-        run_study(replace(read_study(TINY), policies=3), finished)
+        run_study(replace(read_study(TINY), policies=3), finished, base=TINY.parent)
     assert files(finished) == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")
     with pytest.raises(Mismatch, match="other files in it"):
-        run_study(read_study(TINY), tmp_path / "full")
+        run_study(read_study(TINY), tmp_path / "full", base=TINY.parent)
     (tmp_path / "a-file").write_text("mine")
     with pytest.raises(InvalidFile, match="got a file"):
-        run_study(read_study(TINY), tmp_path / "a-file")
+        run_study(read_study(TINY), tmp_path / "a-file", base=TINY.parent)
 
 
 def test_a_folder_of_before_results_were_typed_is_refused_with_what_to_do(tmp_path: Path) -> None:
     """Its fingerprint knew neither pandas nor pillow; what its jobs handed each other was CSV."""
-    study = read_study(TINY)
+    study = replace(read_study(TINY), culture=Source())
     manifest = describe_study(study, {})
     for name in ("pandas", "pillow"):
         del manifest["versions"][name]
@@ -208,7 +208,7 @@ def test_nothing_of_another_s_folder_is_touched(tmp_path: Path) -> None:
         (home / name).write_text("mine")
     before = files(home)
     with pytest.raises(Mismatch, match="other files in it"):
-        run_study(read_study(TINY), home)
+        run_study(read_study(TINY), home, base=TINY.parent)
     assert files(home) == before
 
 
@@ -289,7 +289,7 @@ def test_a_file_that_is_there_to_be_locked_is_nobody_s(tmp_path: Path) -> None:
     study = replace(read_study(TINY), seed=1)
     for seed in (1, 2):
         with pytest.raises(AnimatError, match="halted"):
-            run_study(replace(study, seed=seed), tmp_path, executor=Halts())
+            run_study(replace(study, seed=seed), tmp_path, base=TINY.parent, executor=Halts())
     assert read_study(tmp_path / "study.toml").seed == 2
 
 
@@ -297,7 +297,7 @@ def test_a_specification_can_be_corrected_before_anything_is_made(tmp_path: Path
     study = replace(read_study(TINY), seed=1)
     for seed in (1, 2):
         with pytest.raises(AnimatError, match="halted"):
-            run_study(replace(study, seed=seed), tmp_path / "study", executor=Halts())
+            run_study(replace(study, seed=seed), tmp_path / "study", base=TINY.parent, executor=Halts())
     assert read_study(tmp_path / "study" / "study.toml").seed == 2
     assert json.loads((tmp_path / "study" / "study.json").read_text())["study"]["seed"] == 2
 
@@ -374,11 +374,13 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
         assert record("killed") == undisturbed
 
 
-@pytest.mark.parametrize("kind", ["virtual", "synthetic"])
+@pytest.mark.parametrize("kind", ["virtual", "files"])
 def test_a_study_of_a_virtual_culture_is_one_of_its_tissue_s_revision(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = replace(read_study(TINY), culture=Source(kind=kind))  # type: ignore[arg-type]
+    study = read_study(TINY)
+    if kind == "virtual":
+        study = replace(study, culture=Source())
     now = describe_study(study, {})
     monkeypatch.setattr("animat.cultures.tissue.parameters.REVISION", 1)
     before = describe_study(study, {})
@@ -561,6 +563,7 @@ def test_the_example_of_the_page_runs(
     plain, lent = blocks
     # The paper's study takes minutes; whether its example is right is seen on one that is there.
     shutil.copytree(finished, tmp_path / "study-2")
+    shutil.copytree(TINY.parent / "data" / "tiny", tmp_path / "data" / "tiny")
     monkeypatch.chdir(tmp_path)
     asked: dict[str, Any] = {}
     monkeypatch.setattr("animat.studies.paper.paper_study", lambda **given: asked.update(given) or read_study(TINY))
@@ -796,7 +799,7 @@ COMPARED = (
         ),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the arms"),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another arm"),
-        ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual', 'synthetic' or 'files', got 'alive'"),
+        ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual' or 'files', got 'alive'"),
         ("[culture]\nkind = 'files'", "culture.files, folders: expected some"),
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
         ("[culture]\ninterval_min = inf", "culture.interval_min: expected a finite number, got inf"),
@@ -830,7 +833,6 @@ COMPARED = (
                 ("", "optimum_episodes"),
                 ("[culture]\n", "sessions"),
                 ("[culture]\n", "trials"),
-                ("[culture]\nkind = 'synthetic'\n", "channels"),
                 ("[[robots]]\nname = 'cartpole'\n", "iterations"),
                 ("[algorithm]\n", "hidden"),
                 ("[algorithm]\n", "environments"),
@@ -845,7 +847,7 @@ COMPARED = (
         ),
         ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2.0, got 3.0"),
         ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
-        ("[culture]\nkind = 'synthetic'\npresentations = 20000", "culture.patterns: expected 1 to 10,000"),
+        ("[culture]\nchannels = 32", "channels: no such setting in [culture]; expected some of kind, files"),
         (f"policies = {'9' * 5000}", "expected TOML, got a mistake: Exceeds the limit (4300 digits)"),
         (f"policies = 0x{'f' * 5000}", "policies: expected at most 1,000, got a number of 20,000 bits"),
         (f"training_min = 0x{'f' * 5000}", "training_min: expected a number, got a number of 20,000 bits"),

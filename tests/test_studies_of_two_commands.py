@@ -35,9 +35,10 @@ from animat.tuning.space import with_settings
 from animat.tuning.specification import Tune, tuning_of
 
 NEAR = Lesson(starts={"x_m": (0.4, 0.6)}, until_return=45)
+HERE = Path(__file__).parent
 SMALL = {"environments": 8, "gradient_steps": 1, "batch": 16, "replay": 1024, "hidden": 8}
 STUDY = Study(
-    culture=Source("synthetic", sessions=2, trials=40, channels=32),
+    culture=Source("files", files=("data/tiny",)),
     simulators=Simulators(readouts="halves"),
     robots=(RobotSpec("wheels", iterations=3000, lessons=(NEAR,)),),
     arms=(Arm("in turn"), Arm("drawn", shadowing="drawn")),
@@ -52,7 +53,7 @@ STUDY = Study(
 
 
 def fitted(folder: Path) -> Path:
-    Record(STUDY, folder).run(folder, Silent())
+    Record(STUDY, HERE).run(folder, Silent())
     return Fit(STUDY).run(folder, Silent())[0]
 
 
@@ -104,7 +105,7 @@ def test_responses_and_controllability_are_told_of_each_readout(tmp_path: Path) 
 
 @pytest.mark.long
 def test_it_runs_to_its_report(tmp_path: Path) -> None:
-    ran = run_study(STUDY, tmp_path / "study", workers=1)
+    ran = run_study(STUDY, tmp_path / "study", base=HERE, workers=1)
     page = ran.report.read_text()
     assert "in turn and drawn" in page
     assert (tmp_path / "study/policies/wheels/drawn/best/p0.safetensors").exists()
@@ -149,9 +150,9 @@ def test_a_virtual_culture_is_stimulated_at_places() -> None:
     assert (corners.places, corners.frequencies_hz) == ("corners", TWO_COMMANDS.frequencies_hz)
     assert Source(places="halves", frequencies_hz=(5, 80)).protocol().frequencies_hz == (5, 80)
     assert Source().protocol().places == ()
-    for kind, key in ((Source, "places"), (Source, "frequencies_hz")):
-        with pytest.raises(InvalidArgument, match="synthetic culture"):
-            kind("synthetic", **{key: "halves" if key == "places" else (5.0,)})
+    for stimuli in ({"places": "halves"}, {"frequencies_hz": (5.0,)}):
+        with pytest.raises(InvalidArgument, match="expected only for a culture that is recorded"):
+            Source("files", files=("a",), **stimuli)  # type: ignore[arg-type]
 
 
 def test_it_is_written_as_toml_and_read_as_the_same(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import threading
 import time
@@ -33,6 +34,7 @@ from animat.studies.specification import Study
 from animat.studies.tabulating import NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.writing import exclusive_lock
+from synthetic_recordings import write_synthetic_series
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 
@@ -77,12 +79,12 @@ def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], told: str)
 
 
 def test_each_culture_has_the_study_that_it_would_have_alone(tmp_path: Path) -> None:
-    study = replace(read_study(TINY), culture=replace(read_study(TINY).culture, seeds="2-3, 9"))
+    study = replace(read_study(TINY), culture=Source(sessions=2, interval_min=140, seeds="2-3, 9"))
     (file := tmp_path / "study.toml").write_text(study_to_toml(study))
     study = read_study(file)
     assert list(studies_of(study)) == ["culture-2", "culture-3", "culture-9"]
     for seed, each in zip((2, 3, 9), studies_of(study).values(), strict=True):
-        alone = replace(study, culture=replace(read_study(TINY).culture, seed=seed))
+        alone = replace(study, culture=Source(sessions=2, interval_min=140, seed=seed))
         assert each == alone and asdict(each) == asdict(alone)
         assert studies_of(each) == {}
     with pytest.raises(InvalidArgument, match="expected one culture, got many"):
@@ -259,22 +261,23 @@ def test_scores_of_all_cultures_are_one_table_the_same_in_parquet(
 def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "many.toml").write_text(TINY.read_text().replace("sessions = 2", 'sessions = 2\nseeds = "1-2"', 1))
+    shutil.copytree(TINY.parent / "data" / "tiny", tmp_path / "one")
+    write_synthetic_series(2, tmp_path / "other", sessions=2, interval_min=140, patterns=40, channels=32)
+    files = 'files = ["data/tiny"]'
+    (tmp_path / "many.toml").write_text(TINY.read_text().replace(files, 'folders = ["one", "other"]'))
     assert main(["study", str(tmp_path / "many.toml"), "--out", str(tmp_path / "many"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["cultures"] == ["culture-1", "culture-2"]
+    assert told["cultures"] == ["culture-one", "culture-other"]
     assert {row["cultures"] for row in told["over_cultures"]} == {2}
-    alone = replace(read_study(TINY), culture=replace(read_study(TINY).culture, seed=2))
-    run_study(alone, tmp_path / "alone")
-    results = [results_file(folder).read_bytes() for folder in (tmp_path / "many" / "culture-2", tmp_path / "alone")]
+    alone = replace(read_study(TINY), culture=Source("files", files=("other",)))
+    run_study(alone, tmp_path / "alone", base=tmp_path)
+    both = (tmp_path / "many" / "culture-other", tmp_path / "alone")
+    results = [results_file(folder).read_bytes() for folder in both]
     assert results[0] == results[1]
     page = (tmp_path / "many" / "report.html").read_text()
-    assert "better in" in page and "culture-1/report.html" in page
+    assert "better in" in page and "culture-one/report.html" in page
     (tmp_path / "files.toml").write_text(
-        TINY.read_text().replace(
-            'kind = "synthetic"\nsessions = 2\ninterval_min = 140\ntrials = 40\nchannels = 32',
-            'kind = "files"\nfolders = ["many/culture-1/recordings", "missing"]',
-        )
+        TINY.read_text().replace(files, 'folders = ["many/culture-one/recordings", "missing"]')
     )
     assert main(["study", str(tmp_path / "files.toml"), "--out", str(tmp_path / "files")]) != 0
     err = capsys.readouterr().err

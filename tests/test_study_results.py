@@ -43,6 +43,7 @@ from animat.wrappers import ShuffledDelivery
 
 # --- which side is better -------------------------------------------------------------------------------------------
 
+HERE, RECORDED = Path(__file__).parent, Source("files", files=("data/tiny",))
 WORSE = Arm("worse", mapping="none", trained=False)
 BETTER = Arm("better", mapping="none", trained=False)
 LIKE = Arm("like", mapping="none", trained=False)
@@ -155,7 +156,7 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
 def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(tmp_path: Path, delivery: Any) -> None:
     arm = Arm("control", delivery=delivery, trained=False)
     study = Study(
-        culture=Source("synthetic", sessions=2, interval_min=140.0, trials=20, channels=32),
+        culture=RECORDED,
         robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
         arms=(arm, Arm("other")),
         comparisons=(Compared("with another", "control", "other", at_min=0.0, episodes=7),),
@@ -166,7 +167,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     )
     (spec,) = study.robots
     for task in (
-        Record(study, tmp_path),
+        Record(study, HERE),
         Fit(study),
         TrainGroup(study, spec, arm, (0, 1)),
         Evaluate(study, spec, arm),
@@ -198,7 +199,7 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
 # --- the optimal returns --------------------------------------------------------------------------------------
 
 FEW = Study(
-    culture=Source(kind="synthetic", sessions=2, interval_min=140, trials=40, channels=32),
+    culture=RECORDED,
     robots=(RobotSpec("navigation", parameters={"episode_limit": 60}),),
     arms=(Arm("1 threshold", trained=False), Arm("without neurons", mapping="none")),
     comparisons=(Compared("c", "without neurons", "1 threshold", at_min=0.0, episodes=2),),
@@ -210,7 +211,7 @@ FEW = Study(
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("few")
-    Record(FEW, folder).run(folder, Silent())
+    Record(FEW, HERE).run(folder, Silent())
     Fit(FEW).run(folder, Silent())
     return folder
 

@@ -9,7 +9,7 @@ import pytest
 
 from animat.errors import InvalidArgument
 from animat.neurons.synthetic import LABELS, MEANS_HZ, synthetic_simulator
-from animat.recordings.synthetic import SyntheticCulture
+from synthetic_recordings import SyntheticCulture
 
 
 def test_percentiles_are_those_of_pooled_samples() -> None:

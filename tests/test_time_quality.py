@@ -17,9 +17,9 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Order, Protocol
+from synthetic_recordings import synthetic_recording
 from test_inspection import answering
 from test_responses import recording as of_spikes
 

@@ -23,8 +23,8 @@ from animat.cli import main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
-from animat.recordings.synthetic import synthetic_recording
 from animat.responses.extraction import extract_responses
+from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.training.group import programs
 from animat.training.settings import SAC
@@ -145,7 +145,8 @@ def test_the_best_is_a_study_of_the_settings_that_won(finished: Path) -> None:
     assert results["best"] == {"trial": best["trial"], "settings": best["settings"]}
     assert {row["trial"] for row in results["finals"]} >= {0}
     study = read_study(finished / BEST)
-    assert study == with_settings(read_tuning(TINY).study, best["settings"])
+    tiny = with_settings(read_tuning(TINY).study, best["settings"])
+    assert study == replace(tiny, culture=Source("files", files=("recordings",)))
     assert (finished / BEST).read_text().startswith("# animat study best.toml\n")
 
 
@@ -237,7 +238,7 @@ def test_after_a_study_s_own_settings_the_defaults_are_tried_and_both_go_to_the_
     file = tmp_path / "tune.toml"
     own = TINY.read_text().replace("hidden = 8 }", "hidden = 8, learning_rate = 1e-4, discount = 0.95 }")
     file.write_text(own.replace("trials = 7", "trials = 4").replace("3000", "240").replace("rungs = 2", "rungs = 3"))
-    tuned = tune(read_tuning(file), tmp_path / "out")
+    tuned = tune(read_tuning(file), tmp_path / "out", base=TINY.parent)
     kind = {"simulator": "histogram"}
     assert tuned.told[0].settings == {"learning_rate": 1e-4, "discount": 0.95, **kind}
     assert tuned.told[1].settings == {"learning_rate": SAC().learning_rate, "discount": SAC().discount, **kind}

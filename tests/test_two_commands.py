@@ -35,7 +35,6 @@ from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.answered import answered
 from animat.recordings.recording import Recording
-from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.series import extract_series
@@ -46,6 +45,7 @@ from animat.stimulation.protocol import Protocol
 from animat.training.policy import Policy
 from animat.training.specification import Training
 from fake_culture import CHANNELS, FakeCulture, OneCondition
+from synthetic_recordings import write_synthetic_series
 from test_training import SMALL
 from two_wheels import FILE, Wheels
 

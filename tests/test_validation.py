@@ -29,13 +29,13 @@ from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.prediction import halved, predict
 from animat.neurons.validation import MARGINAL, Validation, correlations, validate
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import write_synthetic_series
 from animat.report.validation import draw_validation, validation_text
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Presented, Responses
 from animat.stimulation.protocol import Presentation, Protocol
+from synthetic_recordings import write_synthetic_series
 from test_simulator import responses_of
 
 

@@ -17,7 +17,6 @@ from animat.errors import InvalidFile
 from animat.execution.jobs import PLANNED, Job
 from animat.execution.receipts import Receipt
 from animat.recordings.reading import read_recording
-from animat.recordings.synthetic import write_synthetic_series
 from animat.responses.inspection import inspect_recording
 from animat.studies.context import plan_context_study
 from animat.studies.context_tasks import ContextStudy
@@ -30,6 +29,7 @@ from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
 from animat.writing import exclusive_lock
+from synthetic_recordings import write_synthetic_series
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 

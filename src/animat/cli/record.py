@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument, Mismatch
 from animat.marks import expect_no_other
-from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.progress import Progress
@@ -24,9 +23,8 @@ _PRESENTED = ("order", "pulses", "trials", "places")
 class Record:
     """Record a culture: one NWB file a recording. Goes on where it stopped."""
 
-    culture: Literal["virtual", "synthetic", "replay", "cl1", "maxone"] = "virtual"
-    """virtual: simulated neurons on a simulated array; synthetic: responses of known distributions, no neurons; replay:
-    answers from recordings; cl1 and maxone: the devices"""
+    culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
+    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1 and maxone: the devices"""
     recordings: tuple[Path, ...] = ()
     """For a replay: what it answers from"""
     selection: Path | None = None
@@ -80,10 +78,10 @@ class Record:
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
-        protocol = None if self.culture == "synthetic" else self._protocol()
-        if protocol is not None and self.protocol is not None:
+        protocol = self._protocol()
+        if self.protocol is not None:
             _say_too_fast(protocol)
-        if protocol is not None and protocol.is_rest:
+        if protocol.is_rest:
             print(
                 'warning: the only place is "none", so nothing is ever delivered, and no robot can be driven by '
                 "such recordings; to stimulate, add groups of electrodes",
@@ -92,33 +90,18 @@ class Record:
         _expect_no_others(self.out)
         there = set(self.out.glob("*"))
         with Bar("recording") as progress:
-            files = self._synthetic(progress) if self.culture == "synthetic" else self._series(progress)
+            files = self._series(progress)
         were_there = "; all were there already" if files and there.issuperset(files) else ""
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{were_there}")
-        if protocol is not None and protocol.places:
+        if protocol.places:
             print("each place is a condition; --conditions frequency mixes the places")
         return {"recordings": [str(file) for file in files]}
-
-    def _synthetic(self, progress: Progress) -> list[Path]:
-        from animat.recordings.synthetic import write_synthetic_series
-
-        usual = self.order in (None, "blocked") and self.pulses in (None, 1) and self.trials in (None, 100)
-        if not usual or self.places is not None or self.protocol is not None:
-            raise InvalidArgument(
-                "--order, --pulses, --trials, --places, --protocol: synthetic recordings are blocked, with one "
-                "pulse, 100 trials and no places; --culture virtual takes others"
-            )
-        with exclusive_lock(self.out):
-            return write_synthetic_series(
-                self.seed, self.out, sessions=self._sessions, interval_min=self._interval_min, progress=progress
-            )
 
     def _series(self, progress: Progress) -> list[Path]:
         from animat.cultures.kinds import culture_of
         from animat.cultures.series import record_series
         from animat.recordings.reading import read_recordings
 
-        assert self.culture != "synthetic"
         recordings = read_recordings(self.recordings) if self.recordings else []
         given: dict[str, Any] = {"recordings": recordings, "selection": self.selection, "progress": progress}
         make_culture = partial(culture_of, self.culture, seed=self.seed, **given)
@@ -140,15 +123,14 @@ class Record:
     def _sessions(self) -> int:
         if self.sessions is not None:
             return self.sessions
-        # Synthetic recordings are the paper's.
-        return 15 if self.paper or self.culture == "synthetic" else 2
+        return 15 if self.paper else 2
 
     @property
     def _interval_min(self) -> float:
         if self.interval_min is not None:
             return self.interval_min
         # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
-        usual = not self.paper and self.culture != "synthetic" and self.protocol is None
+        usual = not self.paper and self.protocol is None
         asked = [getattr(self, name) for name in _PRESENTED]
         return 5.0 if usual and set(asked) <= {None, "corners"} else 10.0
 
@@ -158,7 +140,6 @@ class Record:
         from animat.stimulation.places import read_places
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER, TWO_COMMANDS, read_protocol
 
-        assert self.culture != "synthetic"
         # What a file leaves out is the paper's: it stands alone.
         paper = self.paper or self.protocol is not None
         living = TWO_COMMANDS if self.places == "corners" else CLOSED_LOOP

@@ -28,7 +28,7 @@ REFUSING = (
 )
 """Names of the findings that make training pointless; a user may go on in spite of them."""
 _SIMULATED = ("virtual culture", "synthetic", "made up")
-"""How the source of a recording begins whose culture is known by its seed."""
+"""How the source of a recording begins whose culture is known by its seed; the last two are of before."""
 
 
 def extract_series(

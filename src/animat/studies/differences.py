@@ -16,7 +16,6 @@ AIM = 0.97
 _CULTURES = {
     "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
     "to the paper's results. How large its responses are and how they tire differ from the paper's.",
-    "synthetic": "Here responses are synthetic: drawn from distributions that were written down, for trials.",
     "files": "Here recordings at hand are used.",
 }
 

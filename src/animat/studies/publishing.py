@@ -88,9 +88,7 @@ class Publish(StudyTask):
 
 def _lead(study: Study) -> str:
     robots = _and([spec.name for spec in study.robots])
-    neurons = {"virtual": "a virtual culture", "synthetic": "synthetic responses", "files": "recordings"}[
-        study.culture.kind
-    ]
+    neurons = {"virtual": "a virtual culture", "files": "recordings"}[study.culture.kind]
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
     return f"{robots.capitalize()}, driven through {neurons}. {many_arms(study)}, trained for {trained}."
 

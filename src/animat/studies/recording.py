@@ -24,7 +24,7 @@ JOB = "record"
 class Record(StudyTask):
     """Make the recordings, as NWB; a specification's file names are relative to `base`."""
 
-    sizes = ("culture.trials", "culture.pulses", "culture.channels")
+    sizes = ("culture.trials", "culture.pulses")
 
     base: Path
 
@@ -38,7 +38,7 @@ class Record(StudyTask):
         for name in () if receipt is None else receipt.changed(folder):
             (folder / name).unlink(missing_ok=True)
         kind = self.study.culture.kind
-        make = {"virtual": _virtual, "synthetic": _synthetic, "files": self._copies}[kind]
+        make = {"virtual": _virtual, "files": self._copies}[kind]
         files = make(self.study, out, progress)
         kept = (SELECTION_FILE, STATE_FILE) if kind == "virtual" else ()
         return [*files, *(out / name for name in kept)]
@@ -73,18 +73,3 @@ def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
         seed=culture.seed,
         progress=progress,
     ).files
-
-
-def _synthetic(study: Study, out: Path, progress: Progress) -> list[Path]:
-    from animat.recordings.synthetic import write_synthetic_series
-
-    culture = study.culture
-    return write_synthetic_series(
-        culture.seed,
-        out,
-        sessions=culture.sessions,
-        interval_min=culture.interval_min,
-        progress=progress,
-        patterns=culture.trials,
-        channels=culture.channels,
-    )

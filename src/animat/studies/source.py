@@ -11,7 +11,6 @@ from pydantic import Field
 
 from animat.cultures.series import LONGEST_MIN
 from animat.errors import InvalidArgument, shown
-from animat.recordings.synthetic import SyntheticCulture
 from animat.records import Positive, Seed, Whole, record
 from animat.stimulation.protocol import TWO_COMMANDS, Protocol
 
@@ -26,19 +25,18 @@ class Source:
     """Where the recordings come from: files, or a culture that is recorded for the study.
 
     Attributes:
-        kind: `"virtual"`, simulated neurons; `"synthetic"`, responses of known distributions, to try things; `"files"`.
+        kind: `"virtual"`, simulated neurons, or `"files"`.
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
-        seed: which virtual or synthetic culture.
+        seed: which virtual culture.
         seeds, folders: of a study over many cultures (`animat.studies.cultures`): seeds such as `"1-5, 8"` in place of
             `seed`, or folders of recordings, one a culture, in place of `files`.
         sessions, interval_min: how many recordings, and the minutes from one to the next.
         order, pulses, trials: how stimuli are presented (`animat.stimulation.protocol`).
         places, frequencies_hz: of a virtual culture, `"corners"`, `"halves"` or `"quadrants"`, each a condition of its
             own, and the frequencies; None: the paper's patterns, and its frequencies, but 20 Hz alone at corners.
-        channels: of a synthetic culture.
     """
 
-    kind: Literal["virtual", "synthetic", "files"] = "virtual"
+    kind: Literal["virtual", "files"] = "virtual"
     files: Annotated[tuple[str, ...], LISTED] = ()
     seed: Seed = 1
     sessions: Annotated[Whole, Field(ge=1, le=MOST_SESSIONS)] = 15
@@ -46,7 +44,6 @@ class Source:
     order: Literal["blocked", "mixed"] = "blocked"
     pulses: Annotated[Whole, Field(ge=1, le=MOST_TRIALS)] = 1
     trials: Annotated[Whole, Field(ge=2, le=MOST_TRIALS)] = 100
-    channels: Annotated[Whole, Field(ge=1, le=1024)] = 256
     places: Literal["corners", "halves", "quadrants"] | None = None
     frequencies_hz: Annotated[tuple[Positive, ...], LISTED] | None = None
     seeds: str | None = None
@@ -79,15 +76,9 @@ class Source:
                     raise InvalidArgument(
                         f"{each.name}: expected only for a culture that is recorded, got one of files"
                     )
-        if self.kind == "synthetic" and (self.order, self.pulses) != ("blocked", 1):
-            raise InvalidArgument("order: a synthetic culture is recorded blocked with one pulse, got otherwise")
-        if self.kind == "synthetic" and (self.places, self.frequencies_hz) != (None, None):
-            raise InvalidArgument("places: expected none for a synthetic culture, nor frequencies_hz")
         # What the recordings themselves refuse is refused before there is a folder.
         if self.kind == "virtual":
             self.protocol()
-        elif self.kind == "synthetic":
-            SyntheticCulture(self.seed, patterns=self.trials, channels=self.channels)
 
     def protocol(self) -> Protocol:
         """Of every recording of a virtual culture; raises InvalidArgument for one that cannot be."""

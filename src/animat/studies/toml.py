@@ -27,8 +27,8 @@ FORMER = {
     "algorithm": FORMER_SETTINGS,
 }
 """What keys are called in files of before, table by table (at the top: none)."""
-FORMER_KINDS = {"made-up": "synthetic"}
-"""Of cultures."""
+FORMER_CHANNELS = 256
+"""Of a synthetic culture; files of before have them for every other, too."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
@@ -74,8 +74,8 @@ def _in_todays_words(data: dict[str, Any]) -> dict[str, Any]:
         elif isinstance(table, list):
             data[name] = [_renamed(each, names) if isinstance(each, dict) else each for each in table]
     culture = data.get("culture")
-    if isinstance(culture, dict) and isinstance(kind := culture.get("kind"), str):
-        data["culture"] = {**culture, "kind": FORMER_KINDS.get(kind, kind)}
+    if isinstance(culture, dict) and culture.get("channels") == FORMER_CHANNELS:
+        data["culture"] = {key: value for key, value in culture.items() if key != "channels"}
     return data
 
 

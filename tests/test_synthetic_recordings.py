@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,11 @@ import pytest
 from scipy import stats
 from skimage.filters import threshold_otsu
 
-from animat.errors import InvalidArgument, Mismatch
-from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.noticed import noticed
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
-from animat.recordings.synthetic import FORMER_SOURCE, SyntheticCulture, synthetic_recording, write_synthetic_series
 from animat.stimulation.protocol import Presentation
+from synthetic_recordings import synthetic_recording, write_synthetic_series
 
 MEANS_HZ = {5: 30.0, 10: 36.0, 20: 42.0, 40: 48.0, 80: 54.0}
 
@@ -101,7 +98,7 @@ def test_the_same_seed_is_the_same_recording_and_the_culture_tires() -> None:
 
 
 @pytest.mark.oracle
-def test_a_series_is_written_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_a_series_is_written(tmp_path: Path) -> None:
     few = {"patterns": 5, "channels": 16}
     files = write_synthetic_series(1, tmp_path / "series", sessions=3, **few)
     assert [file.name for file in files] == [
@@ -111,37 +108,3 @@ def test_a_series_is_written_and_goes_on_where_it_stopped(tmp_path: Path) -> Non
     ]
     assert [recording.start_min for recording in read_recordings(tmp_path / "series")] == [0.0, 10.0, 20.0]
     assert read_recording(files[1]).equals(synthetic_recording(1, start_min=10.0, **few))
-    files[1].unlink()
-    kept = files[0].stat().st_mtime_ns
-    assert write_synthetic_series(1, tmp_path / "series", sessions=3, **few) == files
-    assert files[0].stat().st_mtime_ns == kept
-    assert files[1].exists()
-    # A series that is told by the former name of its source goes on too.
-    there = read_recording(files[0])
-    write_nwb(replace(there, provenance={**there.provenance, "source": FORMER_SOURCE}), files[0])
-    kept = files[0].stat().st_mtime_ns
-    assert write_synthetic_series(1, tmp_path / "series", sessions=3, **few) == files
-    assert files[0].stat().st_mtime_ns == kept
-    with pytest.raises(Mismatch, match=r"recording_0000_min.nwb: expected a recording of the same synthetic culture"):
-        write_synthetic_series(2, tmp_path / "series", sessions=3, **few)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"seed": -1}, "seed: expected 0 or more, got -1"),
-        ({"means_hz": (1.0,)}, "means_hz: expected one a frequency"),
-        ({"means_hz": (1.0, 2.0, 3.0, 4.0, 500.0)}, "means_hz: expected 0 to 150 Hz"),
-        ({"frequencies_hz": (5.0, 5.0, 1.0, 2.0, 3.0)}, "frequencies_hz: expected each once"),
-        ({"frequencies_hz": (-5.0, 1.0, 2.0, 3.0, 4.0)}, "frequencies_hz: expected 0 to 100 Hz"),
-        ({"shape": 0.0}, "shape: expected more than 0"),
-        ({"patterns": 0}, "patterns: expected 1 to 10,000"),
-        ({"channels": 1}, "channels: expected 16 to 1,024"),
-        ({"burst_share": 1.0}, "burst_share: expected 0 to less than 1"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(InvalidArgument, match=message):
-        SyntheticCulture(**({"seed": 0} | settings))
-    with pytest.raises(InvalidArgument, match="start_min: expected 0 minutes or more"):
-        synthetic_recording(0, start_min=-1.0)
