@@ -33,6 +33,7 @@ from animat.robots import Cartpole
 from animat.studies import run as studies
 from animat.studies.folder import describe_study
 from animat.studies.plan import plan_study
+from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.studies.training import TrainGroup as TrainArm
 from animat.training import memory
@@ -386,17 +387,17 @@ def test_a_training_with_a_gpu_comes_from_one_process_of_its_own(
 def test_a_study_tells_its_device_and_is_not_gone_on_with_on_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = read_study(TINY)
+    study = replace(read_study(TINY), culture=Source())
     told = describe_study(study, {}, "NVIDIA H100")
     assert told["fingerprint"] != describe_study(study, {})["fingerprint"]
     (tmp_path / "study.json").write_text(json.dumps(told))
     (tmp_path / "jobs").mkdir()
     (tmp_path / "jobs" / "fit.json").write_text("{}")
     with pytest.raises(Mismatch, match=r"versions\.device: 'NVIDIA H100' there, nothing now"):
-        studies.run_study(study, tmp_path, base=TINY.parent)
+        studies.run_study(study, tmp_path)
     monkeypatch.setattr(studies, "find_gpu", lambda: "NVIDIA A100")
     with pytest.raises(Mismatch, match=r"versions\.device: 'NVIDIA H100' there, 'NVIDIA A100' now"):
-        studies.run_study(study, tmp_path, base=TINY.parent)
+        studies.run_study(study, tmp_path)
 
 
 @pytest.mark.oracle
