@@ -23,6 +23,7 @@ from animat.cli import COMMANDS, main
 from animat.cli.responses import say_findings
 from animat.cli.train import Train
 from animat.coding.mapping import Thresholds
+from animat.cultures.series import Series
 from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
@@ -201,12 +202,12 @@ def test_the_whole_way(recordings: Path, tmp_path: Path, capsys: pytest.CaptureF
 def test_recordings_that_were_there_already_are_said_to_be(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def recorded(_: object, __: object, folder: Path, **___: object) -> list[Path]:
+    def recorded(_: object, __: object, folder: Path, **___: object) -> Series:
         folder.mkdir(exist_ok=True)
         (folder / "recording_0000_min.nwb").touch()
-        return [*folder.iterdir()]
+        return Series([*folder.iterdir()], [])
 
-    monkeypatch.setattr("animat.cultures.series.record_virtual_series", recorded)
+    monkeypatch.setattr("animat.cultures.series.record_series", recorded)
     for were_there in ("", "; all were there already"):
         assert main(["record", "--out", str(tmp_path / "out")]) == 0
         assert capsys.readouterr().out == f"1 recording in {tmp_path / 'out'}{were_there}\n"

@@ -16,18 +16,15 @@ from scipy.special import log_softmax, ndtri
 from scipy.stats import norm
 
 from animat.environment import Environment, WithoutNeurons
-from animat.errors import UnusableData
-from animat.progress import Silent
 from animat.robots import Cartpole, Navigation
 from animat.training.diagnosis import Diagnosis, diagnose
-from animat.training.group import Group, train_group
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
 from animat.training.sac import Learner
 from animat.training.specification import CHUNKS
 from test_sac_learning import SMALL as TINY
 from test_sac_learning import explored, start, trained_for
-from test_training import SHORT, timeline_of, trained, weights_after
+from test_training import SHORT, timeline_of, trained
 
 compiled_diagnose = jax.jit(diagnose, static_argnums=(0, 1))
 
@@ -129,27 +126,6 @@ def test_policies_of_before_are_read_without_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(of_before.learning_curve[:, :3], policy.learning_curve[:, :3])
     assert of_before.learning_curve.shape == (CHUNKS, len(CURVE))
     assert np.isnan(of_before.learning_curve[:, 3:]).all()
-
-
-def test_a_training_of_before_goes_on(tmp_path: Path) -> None:
-    checkpoint = tmp_path / "checkpoint.npz"
-    short = replace(SHORT, policies=1, iterations=500)
-    group = Group(short, (0,), timeline_of(), "f", {})
-
-    class Stop:
-        def update(self, done: float, total: float, note: str = "") -> None:
-            if done == 30:
-                raise UnusableData("enough")
-
-    with pytest.raises(UnusableData, match="enough"):
-        train_group(group, checkpoint, Stop(), checkpoint_s=0.0)
-    with np.load(checkpoint) as kept:
-        arrays = dict(kept)
-    arrays["curve"] = arrays["curve"][:, :, :3]
-    np.savez(checkpoint, **arrays)
-    (policy,) = train_group(group, checkpoint, Silent(), checkpoint_s=float("inf"))
-    np.testing.assert_array_equal(np.isnan(policy.learning_curve[:, 3]), np.arange(CHUNKS) < 30)
-    assert policy.weights[0].tobytes() == weights_after(short, timeline_of(), tmp_path / "none.npz")
 
 
 def test_before_training_actions_are_all_but_random_and_alpha_is_the_initial_one() -> None:

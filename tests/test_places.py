@@ -145,7 +145,7 @@ def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_the_command_says_how_to_train_on_places(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(Record, "_virtual", lambda *_: [])
+    monkeypatch.setattr(Record, "_series", lambda *_: [])
     assert main(["record", "--places", "halves"]) == 0
     assert "each place is a condition; --conditions frequency mixes the places" in capsys.readouterr().out
     assert main(["record"]) == 0
