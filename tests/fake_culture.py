@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,16 +18,6 @@ STRENGTH = {5.0: 0.5, 10.0: 1.0, 20.0: 1.5, 40.0: 2.0, 80.0: 2.5}
 
 Fault = Callable[["FakeCulture", Observed], Observed]
 """Given what would be answered, answers something else, or raises, or never returns."""
-
-
-@dataclass(frozen=True)
-class OneCondition:
-    """Chooses one condition always."""
-
-    condition: int
-
-    def act(self, observation: Any, rng: np.random.Generator) -> int:
-        return self.condition
 
 
 class FakeCulture(Culture):

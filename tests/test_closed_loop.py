@@ -25,6 +25,7 @@ from animat.closed_loop.agents import (
     Agent,
     AnyCondition,
     InTurn,
+    OneCondition,
     interleaved,
 )
 from animat.closed_loop.loop import Loop
@@ -53,7 +54,7 @@ from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
-from fake_culture import CHANNELS, FakeCulture, OneCondition
+from fake_culture import CHANNELS, FakeCulture
 
 HZ = (5.0, 10.0, 20.0, 40.0, 80.0)
 CONDITIONS = tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ)

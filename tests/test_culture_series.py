@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -38,8 +37,8 @@ record(sys.argv[2], sessions=int(sys.argv[3]))
 
 
 def record(folder: str | Path, *, sessions: int = 3, seed: int = 1, protocol: Protocol = SHORT) -> list[Path]:
-    settings: dict[str, Any] = {"sessions": sessions, "interval_min": 1.0, "seed": seed}
-    return record_series(lambda: small_culture(seed), protocol, folder, **settings).files
+    # Its orders are of the culture's own seed.
+    return record_series(lambda: small_culture(seed), protocol, folder, sessions=sessions, interval_min=1.0).files
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +50,11 @@ def same(files: list[Path], others: list[Path]) -> bool:
     return len(files) == len(others) and all(
         a.name == b.name and read_recording(a).equals(read_recording(b)) for a, b in zip(files, others, strict=True)
     )
+
+
+def test_the_orders_of_stimuli_are_of_the_culture_s_own_seed(undisturbed: list[Path], tmp_path: Path) -> None:
+    files = [*undisturbed[:2], *record(tmp_path, sessions=1, seed=2)]
+    assert [read_recording(file).provenance["protocol_seed"] for file in files] == ["10000", "10001", "20000"]
 
 
 def copied(files: list[Path], to: Path) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stand_in_maxlab
-from animat.closed_loop.agents import Agent
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import Thresholds
@@ -24,7 +24,6 @@ from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.selection import Selection
-from fake_culture import OneCondition
 from stand_in_cl import install
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from animat.closed_loop.agents import Agent, AnyCondition
+from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.encoder import Dealer, Encoder
@@ -22,7 +22,7 @@ from animat.responses.conditions import All, ByBoth, ByElectrode, ByFrequency, B
 from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
 from animat.stimulation.stimulus import Stimuli
-from fake_culture import FakeCulture, OneCondition
+from fake_culture import FakeCulture
 
 PATTERNS = np.array([[1, 2, -1], [3, 4, 5], [6, 1, -1], [2, 5, 6]])
 SETS = [(1, 2), (3, 4, 5), (1, 6), (2, 5, 6)]

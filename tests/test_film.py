@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from animat.cli import main
-from animat.closed_loop.agents import Agent, AnyCondition
+from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -28,7 +28,7 @@ from animat.responses.condition import Condition
 from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.training.policy import Policy, load_policies
-from fake_culture import CHANNELS, FakeCulture, OneCondition
+from fake_culture import CHANNELS, FakeCulture
 from synthetic_recordings import write_synthetic_series
 
 HZ = (5.0, 10.0, 20.0, 40.0, 80.0)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.agents import ActorController, Agent, AnyCondition, InTurn, agent_of
+from animat.closed_loop.agents import ActorController, Agent, AnyCondition, InTurn, OneCondition, agent_of
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.closed_loop.tick import Tick
@@ -22,7 +22,7 @@ from animat.evaluation.controls import controls_of, interventions_of
 from animat.evaluation.rollouts import Actor
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Robot, Shuttle
-from fake_culture import FakeCulture, OneCondition
+from fake_culture import FakeCulture
 from test_closed_loop import loop_of
 from test_whose_work import linear_networks
 
@@ -38,6 +38,13 @@ def changed(robot: Robot[Any]) -> list[Agent]:
     found = interventions_of(environment, SIMULATOR, networks, 1, switch_at=5)
     asked = ("random spikes", "yoked", "turned round", "goal switched")
     return [agent_of(each, environment, POLICIES, POOL_HZ) for each in found if each.name in asked]
+
+
+def test_what_moves_the_robot_without_responses_is_no_agent_of_a_loop() -> None:
+    environment, networks = Animat(ROBOT, Thresholds(1), 5), linear_networks(np.zeros((len(ROBOT.observation_spec), 5)))
+    ideal = interventions_of(environment, SIMULATOR, networks, 1)[0]
+    with pytest.raises(InvalidArgument, match="expected one whose commands come from responses, got ideal actuator"):
+        agent_of(ideal, environment, POLICIES, POOL_HZ)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 
 import stand_in_cl
 import stand_in_maxlab
-from animat.closed_loop.agents import Agent
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
@@ -27,7 +27,6 @@ from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import BALANCED_PULSE, Pulse
 from animat.stimulation.selection import Selection
-from fake_culture import OneCondition
 
 HZ = (5.0, 20.0)
 BY_FREQUENCY = tuple(Condition(f"{f:g} Hz", f, "Hz") for f in HZ)

@@ -42,6 +42,16 @@ def test_errors_come_through_as_they_are(path: Path) -> None:
         apart.read_hdf5_apart(path.with_name("b.nwb"))
 
 
+def fail(*_: object) -> None:
+    raise SystemError("of the library")
+
+
+def test_whatever_is_raised_in_reading_is_of_the_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "_read", fail)
+    with pytest.raises(InvalidFile, match=r"a\.nwb: expected a recording, but it cannot be read \(of the library\)"):
+        apart.read_hdf5_apart(path)
+
+
 def test_a_process_that_died_is_started_anew(path: Path) -> None:
     before = read_recording(path)
     assert apart._reader is not None

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from animat.cli import main
-from animat.closed_loop.agents import Agent
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
@@ -28,7 +28,7 @@ from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import Stimuli
-from fake_culture import FakeCulture, OneCondition
+from fake_culture import FakeCulture
 from test_closed_loop import RANDOM, loop_of
 
 

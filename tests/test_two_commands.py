@@ -20,7 +20,7 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import ActorController, Agent, random_control
+from animat.closed_loop.agents import ActorController, Agent, OneCondition, random_control
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -44,7 +44,7 @@ from animat.robots.registry import REGISTRY
 from animat.stimulation.protocol import Protocol
 from animat.training.policy import Policy
 from animat.training.specification import Training
-from fake_culture import CHANNELS, FakeCulture, OneCondition
+from fake_culture import CHANNELS, FakeCulture
 from synthetic_recordings import write_synthetic_series
 from test_training import SMALL
 from two_wheels import FILE, Wheels

@@ -10,14 +10,14 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from animat.closed_loop.agents import Agent, AnyCondition
+from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.coding.mapping import Thresholds
 from animat.responses.condition import Condition
 from animat.robots import Navigation
-from fake_culture import FakeCulture, OneCondition
+from fake_culture import FakeCulture
 
 AGENTS = [Agent("random", "any", AnyCondition(5)), Agent("silent", "", OneCondition(0), "silent")]
 PORT, TOKEN = 8123, "a-token"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -91,7 +90,7 @@ class Record:
         there = set(self.out.glob("*"))
         with Bar("recording") as progress:
             files = self._series(progress)
-        were_there = "; all were there already" if files and there.issuperset(files) else ""
+        were_there = "; all were there already" if files and there.issuperset(self.out.glob("*")) else ""
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{were_there}")
         if protocol.places:
             print("each place is a condition; --conditions frequency mixes the places")
@@ -103,10 +102,10 @@ class Record:
         from animat.recordings.reading import read_recordings
 
         recordings = read_recordings(self.recordings) if self.recordings else []
-        given: dict[str, Any] = {"recordings": recordings, "selection": self.selection, "progress": progress}
-        make_culture = partial(culture_of, self.culture, seed=self.seed, **given)
         series = record_series(
-            make_culture,
+            lambda: culture_of(
+                self.culture, seed=self.seed, recordings=recordings, selection=self.selection, progress=progress
+            ),
             # A virtual culture has as many patterns as are usual.
             self._protocol() if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
             self.out,

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64
 
-from animat.environment import Environment
+from animat.environment import Animat, Environment
+from animat.errors import InvalidArgument
 from animat.evaluation.controls import RANDOM, Control, Delivered
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
@@ -35,6 +36,17 @@ class AnyCondition:
 
 
 @dataclass(frozen=True)
+class OneCondition:
+    """One condition always: the constant control."""
+
+    condition: int
+
+    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
+        """That one."""
+        return self.condition
+
+
+@dataclass(frozen=True)
 class Greedy:
     """A policy's most probable condition, where the policy itself would draw one."""
 
@@ -53,7 +65,7 @@ class ActorController:
         environment: that it acts in on the simulator, without what policies see of the neurons.
     """
 
-    def __init__(self, actor: Actor, environment: Environment[Any]) -> None:
+    def __init__(self, actor: Actor, environment: Animat[Any]) -> None:
         self._actor: Actor = jax.tree.map(lambda x: x[0], actor)
         self._environment = environment
         # Now: what JAX compiles for a first call would come late in a loop.
@@ -141,7 +153,7 @@ def random_control(n_conditions: int) -> Agent:
 
 def agent_of(
     control: Control,
-    environment: Environment[Any],
+    environment: Animat[Any],
     policies: Mapping[str, Controller],
     responses_hz: Float64[np.ndarray, "responses *readouts"],
 ) -> Agent:
@@ -151,13 +163,22 @@ def agent_of(
         environment: robot and mapping.
         policies: by name.
         responses_hz: non-burst responses of all conditions, for random spikes.
+
+    Raises:
+        InvalidArgument: for a control that moves the robot by commands of its own: no loop can.
     """
+    if control.commands is not None:
+        raise InvalidArgument(
+            f"control: expected one whose commands come from responses, got {control.name}; it runs on a simulator only"
+        )
     actor = control.actor
     controller: Controller
     if isinstance(actor, Networks):
         controller = InTurn(dict(policies))
     elif isinstance(actor, Uniform):
-        controller = AnyCondition(environment.n_actions or 0)
+        controller = AnyCondition(environment.n_conditions)
+    elif isinstance(actor, Constant):
+        controller = OneCondition(int(actor.action[0]))
     else:
         controller = ActorController(actor, environment)
     return Agent(

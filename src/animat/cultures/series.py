@@ -53,7 +53,7 @@ def record_series(
     *,
     sessions: int = 15,
     interval_min: float = 10.0,
-    seed: int = 1,
+    seed: int | None = None,
     progress: Progress | None = None,
 ) -> Series:
     """Record a culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
@@ -75,7 +75,7 @@ def record_series(
         folder: where the files go; made if it is missing.
         sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
-        seed: of the orders of stimuli; zero or more.
+        seed: of the orders of stimuli; zero or more. None: a virtual culture's own, 1 for any other.
         progress: told after each block.
 
     Raises:
@@ -86,15 +86,18 @@ def record_series(
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
-    if seed < 0:
+    if seed is not None and seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     folder, progress = Path(folder), progress or Silent()
     with exclusive_lock(folder), ExitStack() as opened:
         culture, recorded, zero_s = make_culture(), 0, 0.0
         if not isinstance(protocol, Protocol):
             protocol = protocol(culture)
+        if seed is None:
+            seed = culture.seed if isinstance(culture, VirtualCulture) else 1
         virtual = culture if isinstance(culture, VirtualCulture) and not culture.is_open else None
-        check_interval(protocol, sessions, interval_min, None if virtual is None else virtual.n_patterns)
+        n_patterns = len(culture.patterns) if virtual is None else virtual.n_patterns
+        check_interval(protocol, sessions, interval_min, n_patterns)
         files, interval_s = series_files(folder, sessions, interval_min), 60 * interval_min
         if virtual is not None:
             Guard(virtual.limits, ()).check_pulse(protocol.pulse)
@@ -173,7 +176,7 @@ def series_files(folder: Path, sessions: int, interval_min: float) -> list[Path]
 def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_patterns: int | None = None) -> None:
     """Raise unless there are sessions, each is over when the next one is due, and there are patterns enough.
 
-    How many patterns a culture has is known of some before they are opened; of others it is None.
+    How many patterns a culture has is None where there is no culture yet.
     """
     if sessions < 1:
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")

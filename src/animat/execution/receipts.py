@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from animat.errors import AnimatError, InvalidFile
+from animat.recordings.recording import Recording
+from animat.recordings.told import in_words
 from animat.writing import write_whole
 
 
@@ -81,9 +86,24 @@ def digest_of(path: Path) -> str:
     if path.suffix != ".nwb":
         return sha256(path)
     from animat.recordings.apart import read_hdf5_apart
-    from animat.recordings.told import packed
 
-    return hashlib.sha256(packed(read_hdf5_apart(path))).hexdigest()
+    return hashlib.sha256(_packed(read_hdf5_apart(path))).hexdigest()
+
+
+def _packed(recording: Recording) -> bytes:
+    """All of a recording as bytes, the same for recordings that are equal."""
+    arrays = {name: getattr(recording, name) for name in ("spike_times_s", "spike_channels")}
+    for name, table in (("channels", recording.channels), ("stimuli", recording.stimuli)):
+        arrays |= {f"{name}_{field.name}": getattr(table, field.name) for field in fields(table)}
+    numbers = ("sampling_rate_hz", "start_s", "duration_s", "start_min")
+    words = {
+        "numbers": {name: float(getattr(recording, name)) for name in numbers},
+        "presentation": None if recording.presentation is None else asdict(recording.presentation),
+        "told": list(in_words(recording).items()),
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)
+    return buffer.getvalue()
 
 
 def _is_file_of(path: Path, sum_: str) -> bool:

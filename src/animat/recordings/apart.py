@@ -18,6 +18,7 @@ from pathlib import Path
 
 from animat.errors import AnimatError, InvalidFile
 from animat.process import Process
+from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 
 PROCESSOR_S, PROCESSOR_S_PER_MB = 2.0, 0.2
@@ -46,11 +47,15 @@ def read_hdf5_apart(path: Path, *, part: str | None = None, stimuli: str | None 
         reader = _reader if _reader is not None and not _reader.is_spent else _start()
         try:
             recording: Recording = reader.answer(call, wait_s)
+        except AnimatError:
+            raise
         except (BrokenExecutor, TimeoutError) as error:
             raise InvalidFile(
                 f"{path}: expected a whole HDF5 recording, but it is damaged: the HDF5 library crashed on it, or took "
                 "more time or memory than its size allows; copy or record it again"
             ) from error
+        except Exception as error:
+            raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
     return recording
 
 
@@ -80,17 +85,11 @@ def _get_ready() -> None:
 
 
 def _read(folder: Path, path: Path, part: str | None, stimuli: str | None) -> Recording:
-    from animat.recordings.formats.hdf5 import DAMAGE, first_line
     from animat.recordings.formats.hdf5_formats import read_hdf5
 
-    try:
-        os.chdir(folder)
-        _limit(path)
-        return read_hdf5(path, part=part, stimuli=stimuli)
-    except AnimatError:
-        raise
-    except (*DAMAGE, RecursionError, AssertionError) as error:
-        raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
+    os.chdir(folder)
+    _limit(path)
+    return read_hdf5(path, part=part, stimuli=stimuli)
 
 
 def _limit(path: Path) -> None:

@@ -1,14 +1,9 @@
-"""A recording told: in words by their keys, as a file has it beside its arrays, and all of it in bytes."""
+"""What a recording tells of itself in words, by their keys, as a file has it beside its arrays."""
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields
 from typing import Any, get_args
-
-import numpy as np
 
 from animat.recordings.findings import Finding, Severity
 from animat.recordings.recording import RecordedCulture, Recording
@@ -43,19 +38,3 @@ def from_words(words: Mapping[str, str]) -> dict[str, Any]:
         if words.get("source", "").startswith(begins) and words.get(seed, "").isdecimal() and len(words[seed]) <= 20:
             culture = RecordedCulture(kind, int(words[seed]))
     return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}
-
-
-def packed(recording: Recording) -> bytes:
-    """All of a recording as bytes, the same for recordings that are equal."""
-    arrays = {name: getattr(recording, name) for name in ("spike_times_s", "spike_channels")}
-    for name, table in (("channels", recording.channels), ("stimuli", recording.stimuli)):
-        arrays |= {f"{name}_{field.name}": getattr(table, field.name) for field in fields(table)}
-    numbers = ("sampling_rate_hz", "start_s", "duration_s", "start_min")
-    words = {
-        "numbers": {name: float(getattr(recording, name)) for name in numbers},
-        "presentation": None if recording.presentation is None else asdict(recording.presentation),
-        "told": list(in_words(recording).items()),
-    }
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)
-    return buffer.getvalue()

@@ -115,7 +115,6 @@ class RecordCulture(ContextTask):
             out,
             sessions=2,
             interval_min=5.0,
-            seed=self.culture,
             progress=progress,
         ).files
         return [*files, out / STATE_FILE, out / SELECTION_FILE]

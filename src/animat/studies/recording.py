@@ -13,7 +13,6 @@ from animat.progress import Progress
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.folder import source_files
 from animat.studies.places import RECEIPTS, RECORDINGS
-from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 
 JOB = "record"
@@ -37,17 +36,15 @@ class Record(StudyTask):
         # Recordings that are no longer as they were left: nobody else can tell, as they may still be good ones.
         for name in () if receipt is None else receipt.changed(folder):
             (folder / name).unlink(missing_ok=True)
-        kind = self.study.culture.kind
-        make = {"virtual": _virtual, "files": self._copies}[kind]
-        files = make(self.study, out, progress)
-        kept = (SELECTION_FILE, STATE_FILE) if kind == "virtual" else ()
-        return [*files, *(out / name for name in kept)]
+        if self.study.culture.kind == "files":
+            return self._copies(out, progress)
+        return [*self._virtual(out, progress), out / SELECTION_FILE, out / STATE_FILE]
 
-    def _copies(self, study: Study, out: Path, progress: Progress) -> list[Path]:
+    def _copies(self, out: Path, progress: Progress) -> list[Path]:
         from animat.recordings.reading import read_recordings
 
         copies: list[Path] = []
-        recordings = read_recordings(source_files(study, self.base))
+        recordings = read_recordings(source_files(self.study, self.base))
         for i, recording in enumerate(recordings):
             copy = out / recording_name(recording.start_min)
             if copy in copies:
@@ -59,17 +56,15 @@ class Record(StudyTask):
             progress.update(i + 1, len(recordings))
         return copies
 
+    def _virtual(self, out: Path, progress: Progress) -> list[Path]:
+        from animat.cultures.virtual import VirtualCulture
 
-def _virtual(study: Study, out: Path, progress: Progress) -> list[Path]:
-    from animat.cultures.virtual import VirtualCulture
-
-    culture = study.culture
-    return record_series(
-        lambda: VirtualCulture(culture.seed),
-        culture.protocol(),
-        out,
-        sessions=culture.sessions,
-        interval_min=culture.interval_min,
-        seed=culture.seed,
-        progress=progress,
-    ).files
+        culture = self.study.culture
+        return record_series(
+            lambda: VirtualCulture(culture.seed),
+            culture.protocol(),
+            out,
+            sessions=culture.sessions,
+            interval_min=culture.interval_min,
+            progress=progress,
+        ).files

@@ -140,7 +140,7 @@ class TrainTrials(StudyTask):
 
     @property
     def _name(self) -> str:
-        numbers = "+".join(str(trial.number) for trial in self.trials)
+        numbers = ",".join(str(trial.number) for trial in self.trials)
         return f"t{numbers}-p{self.members[0]}-to-{self.chunks[1]}-of-{CHUNKS}"
 
 
