@@ -18,13 +18,11 @@ from animat.execution.cluster import Cluster
 from animat.execution.gpu import WithGpu
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.receipts import Receipt, digest_of, receipt_path
-from animat.execution.task import UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
+from animat.execution.task import PLANNED, UNFINISHED, Done, Task, carry_out_alone, memory_of, reported
 from animat.progress import Progress
 from animat.writing import write_whole
 
 _LOOK_EVERY_S = 0.2
-PLANNED = ".planned.json"
-"""Of all jobs what they cost, by name, for whoever looks how far it is; as what is unfinished it goes in the end."""
 
 
 @dataclass(frozen=True)

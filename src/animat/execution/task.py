@@ -24,6 +24,8 @@ SILENT_S = 60.0
 """After which a process is taken for frozen."""
 UNFINISHED = ".unfinished"
 """Of a folder: checkpoints, and what tasks report while they run; gone when everything is done."""
+PLANNED = ".planned.json"
+"""In there, of all jobs what they cost, by name, for whoever looks how far it is."""
 
 
 class Task(abc.ABC):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from animat.execution.task import PLANNED, UNFINISHED
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, mean_of_episodes, newest_s, told_by_jobs
 from animat.watch.held import state_of
 from animat.watch.plain import listed, mapped, number, text
 from animat.watch.view import View, in_blocks, titled
 
-_UNFINISHED = ".unfinished"
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
 _CONTEXT = "context study"
 _FAILED = "A job that fails ends the study, and its command says which: the folder does not keep it."
@@ -36,8 +36,8 @@ class StudyView(View):
         worked, costs = _work(self.folder, done, told)
         self._speed.see(worked)
         # Whoever has come to an end leaves nothing unfinished.
-        is_done = bool(done) and not (self.folder / _UNFINISHED).exists()
-        changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / _UNFINISHED).glob("*/*.json")])
+        is_done = bool(done) and not (self.folder / UNFINISHED).exists()
+        changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / UNFINISHED).glob("*/*.json")])
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
         waiting = [name for name in costs if name not in done and name not in told]
@@ -72,7 +72,7 @@ def _work(
     folder: Path, done: dict[str, int], told: dict[str, tuple[float, str, float]]
 ) -> tuple[float, dict[str, float]]:
     """How much of the work is done, and what each job costs, as it is written where jobs run."""
-    found = mapped(json_of(folder / _UNFINISHED / ".planned.json"))
+    found = mapped(json_of(folder / UNFINISHED / PLANNED))
     costs = {text(name): float(cost) for name, cost in found.items() if number(cost) is not None}
     worked = sum(costs.get(name, 0.0) for name in done)
     return worked + sum(share * costs.get(name, 0.0) for name, (share, *_) in told.items()), costs
@@ -96,7 +96,7 @@ def done_jobs(folder: Path) -> dict[str, int]:
 
 def running_jobs(folder: Path, done: dict[str, int]) -> dict[str, tuple[float, str, float]]:
     """What jobs without a receipt told last."""
-    told = told_by_jobs(folder / _UNFINISHED / ".told")
+    told = told_by_jobs(folder / UNFINISHED / ".told")
     return {name: each for name, each in told.items() if name not in done and each[0] < 1}
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.execution.task import UNFINISHED
 from animat.watch.blocks import facts, table, time_left
 from animat.watch.files import curve_of_policy, curves_of_checkpoint, json_of, newest_s, told_by_jobs
 from animat.watch.held import state_of
@@ -16,7 +17,6 @@ from animat.watch.learning import learning_charts, levels_of
 from animat.watch.plain import mapped, number, numbers, short, text, whole
 from animat.watch.view import View, in_blocks, titled
 
-_UNFINISHED = ".unfinished"
 _MOST_POLICIES = 1000
 
 
@@ -43,8 +43,8 @@ class TrainingView(View):
         self._speed.see(done * iterations)
         left = (planned - done) * iterations
         is_done = planned > 0 and done >= planned
-        told = told_by_jobs(self.folder / _UNFINISHED / ".told")
-        changed_s = max([newest_s([self.folder, self.folder / _UNFINISHED]), *(when for *_, when in told.values())])
+        told = told_by_jobs(self.folder / UNFINISHED / ".told")
+        changed_s = max([newest_s([self.folder, self.folder / UNFINISHED]), *(when for *_, when in told.values())])
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
         share = max(shares.values(), default=0.0)
@@ -74,11 +74,11 @@ class TrainingView(View):
         curves: dict[int, Any] = {}
         shares = dict.fromkeys(range(planned), 0.0)
         # Of groups on cores, and of all that are trained at once on a GPU.
-        unfinished = self.folder / _UNFINISHED
+        unfinished = self.folder / UNFINISHED
         for path in (*unfinished.glob("from-p*.npz"), *unfinished.glob("at-once-*.npz")):
             for i, curve in (self._kept(path, curves_of_checkpoint) or {}).items():
                 curves[i], shares[i] = curve, min(1.0, len(curve) / 60)
-        for name, (share, _, _) in told_by_jobs(self.folder / _UNFINISHED / ".told").items():
+        for name, (share, _, _) in told_by_jobs(self.folder / UNFINISHED / ".told").items():
             members = re.fullmatch(r"p(\d{1,6})(?: to p(\d{1,6}))?", name)
             if members is not None:
                 last = min(int(members[2] or members[1]), planned - 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
+from animat.execution.task import UNFINISHED
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import chart, curve, facts, table, time_left
 from animat.watch.files import json_of, newest_s
@@ -35,7 +36,7 @@ class TuningView(View):
         trials = self._trials()
         self._speed.see(len(trials))
         is_done = (self.folder / "results.json").exists()
-        changed_s = newest_s([self.folder, *(self.folder / ".unfinished").glob("**/*.json")])
+        changed_s = newest_s([self.folder, *(self.folder / UNFINISHED).glob("**/*.json")])
         state = state_of(self.folder, changed_s, is_done=is_done)
         told = running_jobs(self.folder, {}) if state["state"] == "running" else {}
         states = [trial["state"] for trial in trials]
