@@ -27,6 +27,7 @@ from animat.responses.extraction import extract_responses
 from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.training.group import programs
+from animat.training.policy import CURVE
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
@@ -37,6 +38,7 @@ from animat.tuning.side_by_side import Trials
 from animat.tuning.space import Range, first_settings, with_settings
 from animat.tuning.specification import Tuning, read_tuning, tuning_of
 from animat.tuning.tasks import Trial, same_shapes
+from synthetic_recordings import synthetic_recording
 
 pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")
 
@@ -201,6 +203,8 @@ def test_settings_as_arrays_train_as_those_that_are_compiled_in(mapping: str | N
     timeline = None if mapping is None else fit_timeline([extract_responses(synthetic_recording(1, patterns=40))])
     together = Trials(training, timeline, algorithms, (0, 1))
     together.train(0, simulator)
+    # The diagnosis would be by the usual settings.
+    assert np.isnan(together.curve[0][:, CURVE.index("entropy") :]).all() and np.isfinite(together.curve[0][:, 0]).all()
     found = []
     for i, algorithm in enumerate(algorithms):
         beginning, chunk = programs(training.environment_on(timeline), algorithm)

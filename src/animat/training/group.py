@@ -24,7 +24,7 @@ from animat.progress import Progress
 from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
 from animat.training.course import Course
-from animat.training.diagnosis import diagnosing
+from animat.training.diagnosis import Diagnosis, diagnosing
 from animat.training.host import programs_on_host
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
@@ -193,9 +193,17 @@ class SideBySide:
         others: trained with them by the same program, the same number of rounds. Where any is of another training,
             none has lessons or is stepped outside JAX.
         own_programs: `begin` and `train_chunk` for all of them, in place of `programs`.
+        is_followed: whether they are diagnosed after each chunk, and expected to be finite numbers. Without, the
+            learning curves have NaN in place of the diagnosis.
     """
 
-    def __init__(self, group: Group, *others: Group, own_programs: Sequence[Callable[..., Any]] = ()) -> None:
+    def __init__(
+        self,
+        group: Group,
+        *others: Group,
+        own_programs: Sequence[Callable[..., Any]] = (),
+        is_followed: bool = True,
+    ) -> None:
         training = group.training
         self._groups = groups = (group, *others)
         self._places = [(each, member) for each in groups for member in each.members]
@@ -212,7 +220,7 @@ class SideBySide:
         else:
             beginning, self._chunk = programs(self._environment, training.algorithm, self._own_simulators)
         keys = [jax.random.fold_in(jax.random.key(each.training.seed), member) for each, member in self._places]
-        self._diagnose = diagnosing(self._environment, training.algorithm)
+        self._diagnose = diagnosing(self._environment, training.algorithm) if is_followed else None
         self._learners = beginning(jnp.stack(keys))
         self.curve: list[Float64[np.ndarray, "policies columns"]] = []
         """The learning curves so far: of each part, a row a policy."""
@@ -232,7 +240,7 @@ class SideBySide:
             simulators: of each group; None without neurons.
 
         Raises:
-            UnusableData: if what was learned is no longer a finite number.
+            UnusableData: if what was learned is no longer a finite number, where it is followed.
         """
         training, simulator = self._groups[0].training, simulators[0]
         algorithm = training.algorithm
@@ -243,10 +251,12 @@ class SideBySide:
         self._learners, finished = self._chunk(self._learners, simulator, jnp.int32(first), jnp.int32(last))
         episodes, returns = np.asarray(finished.episodes, float), np.asarray(finished.returns, float)
         iterations = np.full(len(episodes), last * algorithm.environments)
-        # Before a checkpoint is written, from which no training would recover.
-        self._expect_finite(within=iterations[0])
-        available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
-        diagnosis = map(np.asarray, self._diagnose(self._learners, available))
+        diagnosis: Sequence[Any] = [np.full(len(episodes), np.nan)] * len(Diagnosis._fields)
+        if self._diagnose is not None:
+            # Before a checkpoint is written, from which no training would recover.
+            self._expect_finite(within=iterations[0])
+            available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
+            diagnosis = self._diagnose(self._learners, available)
         with np.errstate(invalid="ignore"):
             self.curve.append(np.stack([iterations, episodes, returns / episodes, *diagnosis], axis=1))
         if self._course is not None:

@@ -88,10 +88,9 @@ class Trials(SideBySide):
             )
         )
         ours = [partial(each, numbers) for each in programs(training.environment_on(timeline), training.algorithm)]
-        super().__init__(*[Group(training, tuple(members), timeline, "", {})] * len(algorithms), own_programs=ours)
-
-    def _expect_finite(self, within: int) -> None:
-        """A trial that diverges leaves those beside it alone."""
+        groups = [Group(training, tuple(members), timeline, "", {})] * len(algorithms)
+        # Nobody reads their curves, and a trial that diverges leaves those beside it alone.
+        super().__init__(*groups, own_programs=ours, is_followed=False)
 
     def networks(self, trial: int, *, greedy: bool) -> Networks | None:
         """The policies of a trial as they would be deployed; None where what was learned is no finite number."""
