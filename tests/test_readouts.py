@@ -146,7 +146,9 @@ def test_names_of_readouts_are_known_or_refused(recording: Recording) -> None:
         readouts_on("thirds", recording.channels)
     with pytest.raises(InvalidArgument, match=r"^electrodes: expected a list, got 1$"):
         Readouts(("a", "b"), (1, 2))  # type: ignore[arg-type]
-    with pytest.raises(InvalidArgument, match=r"^names: expected one .*of 0 groups of .*, got \('a',\)$"):
+    with pytest.raises(
+        InvalidArgument, match=r"^electrodes: expected a group of them for each of the names \('a',\), got none$"
+    ):
         Readouts(("a",))
 
 
@@ -174,7 +176,7 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
         ('{"a": 1}', ".a: expected a list, got 1"),
         ('{"": [1]}', ".names: expected at least 1 character, got ''"),
         ('{"a": [1], "a": [2]}', ": expected each name once, got a twice"),
-        ('{"\\n": [1]}', ".names: expected one in letters"),
+        ('{"\\n": [1]}', ".names: expected a printable name for each group of electrodes (1 in all)"),
     ],
 )
 def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) -> None:
@@ -190,7 +192,7 @@ def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) ->
     ("data", "told"),
     [
         (5, ": expected a table, got 5"),
-        ({"names": ["a"]}, ".names: expected one in letters for each of 0 groups"),
+        ({"names": ["a"]}, r".electrodes: expected a group of them for each of the names \('a',\), got none"),
         ({"names": "ab", "electrodes": [[1], [2]]}, ".names: expected a list, got 'ab'"),
         ({"names": ["a"], "electrodes": [1]}, ".electrodes: expected a list, got 1"),
     ],

@@ -250,6 +250,8 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     ]
     (tmp_path / "results.json").write_text(json.dumps({"best": {"trial": 1}, "finals": finals}))
     found = TuningView(tmp_path).view(None, 8.0)
+    # Another than that of best.toml.
+    assert facts(found, "Trials")["best of the search"] == "trial 0, 4"
     assert block(found, "Retrained")["rows"] == [
         [1, 6.25, 0.5, "batch 64"],
         [2, -10.0, None, ""],

@@ -19,7 +19,8 @@ from animat.goals.region import Ball, Range
 
 _TOKEN = re.compile(r"\.\.|,|[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?|[^\W\d][^\s,;]*|\S")
 _N = r"[-+]?\.?\d\S*"
-_QUANTITY = r"(?!(?:in|outside|above|below|around|and|within|weight) )[^\W\d]\S*"
+_RELATIONS = ("in", "outside", "above", "below", "around")
+_QUANTITY = rf"(?!(?:{'|'.join(_RELATIONS)}|and|within|weight) )[^\W\d]\S*"
 _UNIT = r"(?: (?!(?:and|within|weight)$)(\S+))?"
 _BETWEEN = re.compile(rf"({_QUANTITY}) (in|outside) ({_N}) \.\. ({_N}){_UNIT}")
 _BEYOND = re.compile(rf"({_QUANTITY}) (above|below) ({_N}){_UNIT}")
@@ -79,7 +80,10 @@ def _part(text: str) -> Range | Ball:
     if found := _AROUND.fullmatch(text):
         names, centre, radius, unit = found.groups("")
         return Ball(tuple(names.split(" , ")), tuple(map(float, centre.split(" , "))), float(radius), unit)
+    misspelt = re.match(rf"{_QUANTITY}(?: , {_QUANTITY})* (?!(?:{'|'.join(_RELATIONS)})\b)([^\W\d]\S*)", text)
+    meant = did_you_mean(misspelt[1], _RELATIONS) if misspelt else ""
     raise InvalidArgument(
         f"expected a region: QUANTITY in LOW..HIGH UNIT, or outside; QUANTITY above NUMBER UNIT, or below; QUANTITY, "
-        f"QUANTITY around NUMBER, NUMBER radius NUMBER UNIT; several joined by and; got {shown(text)}"
+        f"QUANTITY around NUMBER, NUMBER radius NUMBER UNIT; several joined by and, then within NUMBER, weight NUMBER; "
+        f"got {shown(text)}{meant}"
     )

@@ -49,10 +49,14 @@ class Readouts:
         if self.electrodes is None and self.names == ("all",):
             return
         groups = [tuple(sorted(set(group))) for group in self.electrodes or ()]
+        if not groups:
+            raise InvalidArgument(
+                f"electrodes: expected a group of them for each of the names {shown(self.names)}, got none"
+            )
         if not len(set(self.names)) == len(self.names) == len(groups) or not all(map(str.isprintable, self.names)):
             raise InvalidArgument(
-                f"names: expected one in letters for each of {len(groups)} groups of electrodes, each once, got "
-                f"{shown(self.names)}"
+                f"names: expected a printable name for each group of electrodes ({len(groups)} in all), each once, "
+                f"got {shown(self.names)}"
             )
         object.__setattr__(self, "electrodes", tuple(groups))
 

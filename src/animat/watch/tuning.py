@@ -49,7 +49,10 @@ class TuningView(View):
             ("diverged", states.count("diverged")),
             ("running", len(told)),
             ("time left for the trials", time_left(self._speed.left_s(planned - len(trials)), state)),
-            ("best so far", "none yet" if best is None else f"trial {best['trial']}, {short(best['last'])}"),
+            (
+                f"best {'of the search' if is_done else 'so far'}",
+                "none yet" if best is None else f"trial {best['trial']}, {short(best['last'])}",
+            ),
         ]
         below = _finals(self.folder) if is_done else running_table(told, "whole")
         chart = _chart(trials, planned if state["state"] == "running" else 0)
@@ -72,7 +75,9 @@ def _finals(folder: Path) -> dict[str, Any]:
     results = mapped(json_of(folder / "results.json"))
     finals = [each for each in map(mapped, listed(results.get("finals"))) if whole(each.get("trial")) is not None]
     # One that diverged has no mean.
-    finals.sort(key=lambda each: -math.inf if (mean := number(each.get("mean_return"))) is None else mean, reverse=True)
+    finals.sort(
+        key=lambda each: (math.inf if (mean := number(each.get("mean_return"))) is None else -mean, each["trial"])
+    )
     rows = [
         [each["trial"], number(each.get("mean_return")), number(each.get("standard_error")), _settings(each)]
         for each in finals
