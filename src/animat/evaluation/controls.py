@@ -158,7 +158,12 @@ def interventions_of(
             "each condition's mean command, stretched to the full range, in place of the response",
             commands=ideal,
         ),
-        control("random spikes", "no pulse; any recorded response", delivery="silent", is_drawn=True),
+        control(
+            "random spikes",
+            "no pulse; any recorded response in place of the neurons' own",
+            delivery="silent",
+            is_drawn=True,
+        ),
         *_without_effect(policies, n_policies),
     ]
     if not isinstance(environment.robot, HostRobot):
@@ -171,7 +176,7 @@ def interventions_of(
 
 def _without_effect(policies: Networks, n_policies: int) -> list[Control]:
     """Policies whose choices decide nothing."""
-    silent = "no pulse; the culture's own activity is read (on its simulator 0)"
+    silent = "no pulse; what is there without stimuli is read (0 on a simulator)"
     return [
         Control("silent", silent, policies, n_policies, "silent"),
         Control("shuffled", "the delivered condition is drawn anew", policies, n_policies, "shuffled"),

@@ -39,7 +39,7 @@ CULTURE: dict[str, tuple[str, str]] = {
         "How large the responses to each stimulus are, bursts left out (n: how many). The further the histograms lie "
         "apart, the more a controller can do. The dashed line is P50, the median over all stimuli. The first "
         "recording: the neuron simulators are made of these numbers. Outlines, with a dotted P50: the last recording, "
-        "where there are several; so far the culture moved in between.",
+        "where there are several; this is how far the culture moved in between.",
     ),
     "over-time": (
         "each stimulus over time",

@@ -289,7 +289,7 @@ def _controls(study: Study, results: Results) -> Section:
             "A rule instead of learning: the stimulus whose mean command is nearest to a push to the side where the "
             "pole will lean in 0.1 s, to a turn towards the goal, or to what another robot's rule wants.",
         ),
-        ("silent", "The trained policies on a culture that always answers 0."),
+        ("silent", "The trained policies, but no pulse; what is there without stimuli is read (0 on a simulator)."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
         ("coupling", "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and goal."),
     )

@@ -28,7 +28,7 @@ FORMER = {
 }
 """What keys are called in files of before, table by table (at the top: none)."""
 FORMER_CHANNELS = 256
-"""Of a synthetic culture; files of before have them for every other, too."""
+"""Former files name that many channels of every culture, which only synthetic recordings used; it is ignored."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
