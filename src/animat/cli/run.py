@@ -95,17 +95,17 @@ class Run(Stimulating):
         from animat.robots.host import HostRobot
 
         # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
-        if not self.recordings:
-            raise InvalidArgument(
-                "--recordings: expected those that the policies were trained on, got none: record first with "
-                "`animat record`, and train on that"
-            )
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         self._expect_culture_seed()
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)
+        if not self.recordings:
+            raise InvalidArgument(
+                "--recordings: expected those that the policies were trained on, got none: record first with "
+                "`animat record`, and train on that"
+            )
         if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
             raise InvalidArgument(
                 f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
