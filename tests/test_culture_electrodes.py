@@ -15,6 +15,7 @@ from animat.cultures.replay import ReplayCulture
 from animat.cultures.tissue import Pulse as TissuePulse
 from animat.cultures.tissue import Tissue, TissueParameters
 from animat.cultures.tissue.parameters import ShortTerm
+from animat.cultures.tissue.tissue import Spikes
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
 from animat.cultures.visibility import NOISE_UV
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
