@@ -273,6 +273,13 @@ def test_a_pulse_beyond_the_limits_is_refused_before_anything_is_written(tmp_pat
     assert not (tmp_path / "recordings").exists()
 
 
+def test_electrodes_that_do_not_stimulate_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    elsewhere = replace(SHORT, places=((0, 1), (99_999,)))
+    with pytest.raises(InvalidArgument, match=r"places: expected .* the 16 that stimulate .*, got 0, 1, 99999$"):
+        record(tmp_path / "recordings", protocol=elsewhere)
+    assert not (tmp_path / "recordings").exists()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_killed_at_any_moment_it_goes_on_to_the_same_bits(undisturbed: list[Path], tmp_path: Path, seed: int) -> None:

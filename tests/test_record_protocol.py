@@ -70,6 +70,20 @@ def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path
     assert recording.protocol == Protocol(patterns=6, trials=6, pulse=pulse_for("replay"))
 
 
+def test_electrodes_that_the_culture_does_not_have_are_told_with_their_file(
+    replayed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.json"
+    file.write_text("[[1], [99999]]")
+    assert main([*replayed, "--places", str(file), "--trials", "2"]) == 1
+    told = r"expected electrodes among the \d+ that stimulate this culture \(.*\), got .*99999\n"
+    assert re.fullmatch(rf"animat: --places {re.escape(str(file))}: {told}", capsys.readouterr().err)
+    file.write_text('{"places": [[1], [99999]]}')
+    assert main([*replayed, "--protocol", str(file)]) == 1
+    assert re.fullmatch(rf"animat: {re.escape(str(file))}: places: {told}", capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
 

@@ -176,13 +176,23 @@ class Culture(Openable):
 
     @final
     def schedule(self, protocol: Protocol, seed: int = 0) -> Schedule:
-        """The stimuli that `record` would deliver."""
+        """The stimuli that `record` would deliver.
+
+        Raises:
+            InvalidArgument: for places with electrodes that do not stimulate it, or more patterns than it has.
+        """
         table, electrodes = self.channels, np.array(self.stimulation_electrodes, np.int64)
         row_of = {electrode: row for row, electrode in enumerate(table.electrode.tolist())}
         rows = [row_of.get(electrode, UNKNOWN) for electrode in electrodes.tolist()]
         # One that is not recorded has no position here.
         x_um, y_um = (np.append(each, np.nan)[rows] for each in (table.x_um, table.y_um))
         places = electrodes_of(protocol.places, electrodes, x_um, y_um)
+        if strange := sorted({each for place in places for each in place} - {*electrodes.tolist()}):
+            there, got = (", ".join(map(str, each)) for each in (sorted(electrodes.tolist()), strange[:8]))
+            raise InvalidArgument(
+                f"places: expected electrodes among the {len(electrodes)} that stimulate this culture ({there}), got "
+                f"{got}{', ...' if len(strange) > 8 else ''}"
+            )
         return make_schedule(protocol, self.patterns, seed, places=places)
 
     @final

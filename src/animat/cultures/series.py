@@ -79,8 +79,8 @@ def record_series(
         progress: told after each block.
 
     Raises:
-        InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or more patterns than
-            the culture has.
+        InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or more patterns or
+            other electrodes than the culture has.
         Mismatch: if recordings are there that another culture, protocol or version made, or that lie ahead of the
             culture's clock, or another run is at work in the folder.
         InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
@@ -106,6 +106,9 @@ def record_series(
             culture = virtual
         if not culture.is_open and recorded < sessions:
             opened.enter_context(culture)
+        if culture.is_open:
+            # What this culture cannot be given is refused before anything is written.
+            culture.schedule(protocol, seed)
         if virtual is None:
             zero_s = _beginning_s(files, culture, protocol, interval_s)
         # No reader takes what a killed run was just writing for whole files.
