@@ -34,6 +34,7 @@ from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.answered import answered
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts
@@ -352,6 +353,16 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     )
     assert ran.returncode == 0, ran.stderr
     assert "two-wheels, 9-thresholds" in ran.stdout and (tmp_path / "session" / "session.nwb").exists()
+
+
+def test_electrodes_of_readouts_that_no_channel_reads_are_told_with_their_file(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, there, out = tmp_path / "groups.json", str(tmp_path / "one.nwb"), str(tmp_path / "out")
+    write_nwb(recording, there)
+    file.write_text('{"left": [1], "right": [99999]}')
+    assert main(["train", "wheels", "--readouts", str(file), "--recordings", there, "--out", out]) == 1
+    assert f"animat: --readouts {file}: expected channels that read all electrodes of" in capsys.readouterr().err
 
 
 @pytest.mark.oracle

@@ -76,12 +76,17 @@ class Readouts:
         """
         if self.electrodes is None:
             return np.ones((1, len(channels)), np.bool_)
+        read = set(channels.electrode.tolist()) - {UNKNOWN}
         for name, group in zip(self.names, self.electrodes, strict=True):
-            if missing := sorted(set(group) - set(channels.electrode.tolist())):
-                told = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+            if missing := set(group) - read:
+                told, there = (
+                    ", ".join(map(str, sorted(each)[:5])) + (", ..." if len(each) > 5 else "")
+                    for each in (missing, read)
+                )
                 raise Mismatch(
-                    f"readouts: expected channels that read all {len(group)} electrodes of the readout {name!r}, got "
-                    f"none that read {len(missing)} of them ({told})"
+                    f"readouts: expected channels that read all electrodes of the readout {name!r}, got none that read "
+                    f"{len(missing)} of its {len(group)} ({told}): choose among the {len(read):,} that are read "
+                    f"({there or 'the recording does not say which'})"
                 )
         return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
 

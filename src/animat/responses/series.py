@@ -74,7 +74,8 @@ def extract_series(
             readouts = readouts_on(readouts, recording.channels)
             responses = extract_responses(recording, by, window_ms, burst_threshold, readouts)
         except (UnusableData, Mismatch) as error:
-            raise type(error)(f"the recording at {recording.start_min:g} min: {error}") from error
+            # The argument that it begins with stays at the front.
+            raise type(error)(f"{error} (the recording at {recording.start_min:g} min)") from error
         for finding in (*noticed(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
                 raise UnusableData(
