@@ -20,7 +20,7 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms, rate_edges
 from animat.report.style import condition_colours, save_figure
 from animat.responses.condition import Condition
-from animat.responses.conditions import All, ByFrequency, ByInterval, ByPattern
+from animat.responses.conditions import All, ByElectrode, ByFrequency, ByInterval, ByPattern
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.responses.psth import post_stimulus_histogram
@@ -148,6 +148,10 @@ def test_stimuli_without_a_condition_are_counted() -> None:
     found = {f.name: f for f in extract_responses(source, ByPattern((0,))).findings}
     assert (found["no-condition"].severity, found["no-condition"].value) == ("note", 1)
     assert names(extract_responses(source, ByPattern((7,))))["no-condition"] == "refuse"
+    none = message(source, "no-condition", by=ByPattern((7,)))
+    assert "one of the conditions pattern:7; the recording has pattern 0, pattern 1: choose others" in none
+    none = message(source, "no-condition", by=ByElectrode())
+    assert "the recording has none of this kind: choose others (--conditions" in none
 
 
 def test_empty_and_thin_conditions() -> None:

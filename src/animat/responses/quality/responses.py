@@ -13,7 +13,7 @@ from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import LEAST_RESPONSES, BurstSeparation
 from animat.responses.condition import RESTING
-from animat.responses.conditions import NO_CONDITION, Assignment
+from animat.responses.conditions import NO_CONDITION, Assignment, conditions_named
 from animat.responses.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.quality.drift import drift_findings
 from animat.responses.quality.memory import memory_findings
@@ -61,7 +61,7 @@ def findings_on(
     else:
         found = [*_timing(responses, source, assignment), *artefact_findings(source, responses.window_ms)]
     return (
-        *_left_out(source.stimuli, assignment, inside),
+        *_left_out(source.stimuli, assignment, str(responses.by), inside),
         *found,
         *_conditions(responses),
         *_bursts(responses, bursts),
@@ -72,16 +72,19 @@ def findings_on(
 
 
 def _left_out(
-    stimuli: Stimuli, assignment: Assignment, inside: Bool[np.ndarray, " stimuli"] | None
+    stimuli: Stimuli, assignment: Assignment, by: str, inside: Bool[np.ndarray, " stimuli"] | None
 ) -> Iterator[Finding]:
     read = stimuli.is_last_of_presentation
     n_read = int(np.count_nonzero(read))
     has_condition = assignment.condition != NO_CONDITION
     without = int(np.count_nonzero(read & ~has_condition))
     if without == n_read:
+        kind = by.partition(":")[0]
+        there = conditions_named("frequency" if kind == "interval" else kind).assign(stimuli).conditions
+        listed = ", ".join(each.label for each in there[:8]) + (", ..." if len(there) > 8 else "")
         message = (
-            f"none of the {n_read} stimuli belongs to a condition: choose other conditions "
-            "(by frequency, interval, electrode or pattern)"
+            f"none of the {n_read} stimuli belongs to one of the conditions {by}; the recording has "
+            f"{listed or 'none of this kind'}: choose others (--conditions frequency, interval, electrode or pattern)"
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
@@ -193,7 +196,7 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
         if not n:
             all_bursts = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
             what = all_bursts if n_all else "no stimulus"
-            message = f"condition {condition.label}: {what}; leave it out or choose other conditions"
+            message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
             message = (
