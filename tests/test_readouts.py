@@ -13,6 +13,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.extraction import extract_responses
+from animat.responses.quality.responses import _readouts
 from animat.responses.readouts import ALL, Readouts, count_readouts, read_readouts, readouts_on
 from animat.responses.series import extract_series
 from animat.responses.windows import read_windows
@@ -109,6 +110,19 @@ def test_responses_that_are_chosen_keep_their_readouts(recording: Recording, hal
         replace(responses, readout_hz=responses.rate_hz)
     with pytest.raises(Mismatch, match="readout_hz: expected some where"):
         replace(responses, readout_hz=None)
+
+
+@pytest.mark.parametrize("part", [0.05, 0.9])
+def test_conditions_that_move_readouts_together_are_warned_of(part: float) -> None:
+    """Of two readouts one follows the condition; the other does the same, or the opposite with some probability."""
+    rng, source = np.random.default_rng(0), SyntheticCulture(1, channels=2, patterns=200).record()
+    responses = extract_responses(source, burst_threshold=1, readouts=readouts_on("halves", source.channels))
+    left = responses.condition % 2 + rng.normal(0, 0.3, len(responses))
+    opposite = rng.random(len(responses)) < part
+    both_hz = np.stack([left, np.where(opposite, 1 - left, left)], axis=-1)
+    found = list(_readouts(replace(responses, readout_hz=both_hz)))
+    assert [finding.name for finding in found] == (["readouts-alike"] if part < 0.5 else [])
+    assert all("animat record --places corners" in finding.message for finding in found)
 
 
 def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, halves: Readouts) -> None:

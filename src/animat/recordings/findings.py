@@ -10,6 +10,8 @@ from animat.errors import did_you_mean
 
 Severity = Literal["note", "warning", "refuse"]
 
+_FEW_IS_BAD = ("few-samples", "no-difference", "readouts-alike")
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -66,5 +68,5 @@ def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:
     for name, alike in warnings.items():
         # The number that is farthest from 0, or the nearest where few is bad.
         sizes = [abs(finding.value or 0.0) for finding in alike]
-        worst = alike[sizes.index(min(sizes) if name in ("few-samples", "no-difference") else max(sizes))]
+        worst = alike[sizes.index(min(sizes) if name in _FEW_IS_BAD else max(sizes))]
         yield worst.message + (f" (and {len(alike) - 1} more like it)" if len(alike) > 1 else "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool
@@ -31,6 +32,8 @@ LITTLE_DIFFERENCE = 0.2
 (docs/evidence/optimal-return.md)."""
 
 _WINDOW_PARTS = 8
+_PLACES = {2: "corners", 4: "quadrants"}
+"""What to record for so many readouts."""
 
 
 def findings_on(
@@ -66,6 +69,7 @@ def findings_on(
         *_conditions(responses),
         *_bursts(responses, bursts),
         *_difference(responses),
+        *_readouts(responses),
         *drift_findings(responses),
         *memory_findings(responses),
     )
@@ -273,3 +277,34 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     else:
         message = f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance"
         yield Finding("difference", "note", message, spread)
+
+
+def _readouts(responses: Responses) -> Iterator[Finding]:
+    """Whether conditions separate the readouts, so that an agent can give their commands apart; the worst pair is told.
+
+    P(x >= P50) of one less that of the other must differ between two conditions, by two standard errors more than what
+    hardly steers a robot.
+    """
+    names, conditions = responses.readouts.names, responses.conditions
+    enough = [i for i in range(len(conditions)) if len(responses.rates_of(i)) >= FEW_SAMPLES]
+    if len(names) < 2 or len(enough) < 2:
+        return
+    median_hz = np.median(responses.read_hz[~responses.is_burst], axis=0)
+    above = [(responses.read_of(i) >= median_hz).astype(np.float64) for i in enough]
+    alike = []
+    for a, b in combinations(range(len(names)), 2):
+        apart = np.array([(each[:, a] - each[:, b]).mean() for each in above])
+        errors = [(each[:, a] - each[:, b]).std() / math.sqrt(len(each)) for each in above]
+        low, high = int(apart.argmin()), int(apart.argmax())
+        spread = float(apart[high] - apart[low])
+        if spread - 2 * math.hypot(errors[low], errors[high]) < LITTLE_DIFFERENCE:
+            ends = (f"{apart[end]:+.2f} ({conditions[enough[end]].label})" for end in (low, high))
+            alike.append((spread, f"{names[a]} and {names[b]}", " to ".join(ends)))
+    if alike:
+        spread, pair, between = min(alike)
+        message = (
+            f"the conditions hardly separate the readouts {pair}: P(x >= P50) of the first less that of the second is "
+            f"{between}, so a policy can hardly give one command without the other: record at places that differ "
+            f"(animat record --places {_PLACES.get(len(names), 'FILE')})"
+        )
+        yield Finding("readouts-alike", "warning", message, spread)
