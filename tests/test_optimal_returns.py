@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -119,7 +120,12 @@ def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     responses = answers([60, 60, 60, 60, 3], 2)
     # The three responses to 80 Hz are lucky: believed, they would make the best condition there is.
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
-    (found,) = optimal_returns(lucky, SHORT, [Thresholds(1)], resolution=0.25, episodes=2, resamples=3)
+    told: list[float] = []
+    progress = SimpleNamespace(update=lambda done, total, note="": told.append(done / total))
+    few = {"resolution": 0.25, "episodes": 2, "resamples": 3}
+    (found,) = optimal_returns(lucky, SHORT, [Thresholds(1)], progress=progress, **few)  # type: ignore[arg-type]
+    # Every iteration of each grid, and every generation of the search, which may end early.
+    assert told == sorted(told) and len(told) > 3 * 24 + 60 and 2 / 3 < told[-1] <= 1
     # Of the four others, at the median of all responses: that is the threshold that commands are made by.
     without = fit_histogram(lucky.only([0, 1, 2, 3]))
     held = replace(without, percentiles=jnp.asarray(np.percentile(lucky.rate_hz, np.arange(0, 101, 10)), jnp.float32))

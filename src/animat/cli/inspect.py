@@ -71,6 +71,7 @@ class Inspect(Responding):
     def _inspect(
         self, files: Sequence[Path], by: Conditions | None, window_ms: tuple[float, float], progress: Progress
     ) -> dict[str, Any]:
+        from animat.progress import Part
         from animat.recordings.reading import read_source
         from animat.recordings.recording import Recording
         from animat.report.inspection import draw_inspection, inspection_text
@@ -99,8 +100,9 @@ class Inspect(Responding):
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.optimum is not None:
-                progress.update(steps * number, total, f"{file.name}, optimal return")
-                inspected[-1]["optima"] = _optima(self.optimum, inspection.responses)
+                # Reading is over in no time beside it.
+                part = Part(progress, steps * number, 1, total, f"{file.name}, optimal return")
+                inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
             if self.out is not None:
                 progress.update(steps * number + 1, total, f"{file.name}, figures")
                 figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
@@ -129,7 +131,7 @@ class Inspect(Responding):
         return told
 
 
-def _optima(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
+def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[str, Any]] | None:
     """What a culture could do with a robot, printed; None where that cannot be told."""
     from animat.compilation import keep_compilations
     from animat.evaluation.optimal_returns import optimal_returns
@@ -137,7 +139,8 @@ def _optima(robot: str, responses: Responses) -> list[dict[str, Any]] | None:
 
     keep_compilations()
     try:
-        found = optimal_returns(responses, robot_named(robot))
+        progress.update(0, 1)
+        found = optimal_returns(responses, robot_named(robot), progress=progress)
     except (InvalidArgument, UnusableData) as error:
         print(f"{robot}: no optimal return: {error}\n")
         return None

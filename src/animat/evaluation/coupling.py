@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, final
@@ -20,6 +21,7 @@ from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
 from animat.neurons.simulator import NeuronSimulator
+from animat.progress import Progress
 from animat.robots.host import HostRobot
 
 Kind = Literal["graded", "switch"]
@@ -69,7 +71,13 @@ class Coupling(Actor):
         return wanted if self.means is None else nearest_action(self.actions, self.means, wanted)
 
 
-def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int = 1) -> Coupling:
+def best_coupling(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    *,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 
     Differential evolution, twice for each kind, over weights from -12 to 12. All couplings of a search meet the same
@@ -78,6 +86,7 @@ def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | No
     Args:
         simulator: the neurons' answers; None without neurons.
         seed: decides every random draw.
+        progress: what to report to.
 
     Raises:
         InvalidArgument: for a robot that is stepped outside of JAX: the search takes thousands of episodes.
@@ -105,8 +114,11 @@ def best_coupling(environment: Environment[Any], simulator: NeuronSimulator | No
     def mean_returns(coupling: Coupling, episodes: int, seed: int) -> Float64[np.ndarray, " actors"]:
         n = len(coupling.weights)
         ran = roll_out(environment, simulator, coupling, n, episodes=episodes, seed=seed, alike=True)
+        if progress is not None:
+            progress.update(next(rounds), len(KINDS) * (RESTARTS * (1 + GENERATIONS) + 1))
         return ran.returns.mean(axis=1)  # type: ignore[no-any-return]
 
+    rounds = itertools.count(1)
     size = n_commands * (len(seen) + 1)
     seeds = np.random.default_rng([seed, 31]).integers(2**31, size=(len(KINDS), RESTARTS, 2)).tolist()
     fresh = seeds[0][0][0] + 1

@@ -14,6 +14,7 @@ from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_in
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import HistogramSimulator, fit_histogram, pooled_percentiles
+from animat.progress import Part, Progress, Silent
 from animat.responses.responses import Responses
 from animat.robots.base import Robot
 
@@ -54,6 +55,7 @@ def optimal_returns(
     episodes: int = 1000,
     resamples: int = RESAMPLES,
     seed: int = 1,
+    progress: Progress | None = None,
 ) -> tuple[OptimalReturn, ...]:
     """What the culture of one recording could do at a robot's task, through some mappings.
 
@@ -64,6 +66,7 @@ def optimal_returns(
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`with_intervals`).
         seed: decides every random draw.
+        progress: what to report to; the optima, how well they are known, and the couplings take about as long each.
 
     Raises:
         UnusableData: if no condition has 30 non-burst responses.
@@ -78,14 +81,17 @@ def optimal_returns(
 
     simulator = fit(responses)
     cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
-    best = best_returns(cases, resolution=resolution, episodes=episodes, seed=seed)
+    solving, resampling, searching = (Part(progress or Silent(), third, 1, 3) for third in range(3))
+    best = best_returns(cases, resolution=resolution, episodes=episodes, seed=seed, progress=solving)
     environments = [environment for environment, _ in cases]
-    best = with_intervals(best, environments, responses, fit, resolution=resolution, resamples=resamples, seed=seed)
-    found = []
+    options: dict[str, Any] = {"resolution": resolution, "resamples": resamples, "seed": seed}
+    best = with_intervals(best, environments, responses, fit, progress=resampling, **options)
+    found: list[OptimalReturn] = []
     for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
         returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
         error = standard_error(returns)
-        of_coupling = roll_out(*case, best_coupling(*case, seed=seed), 1, episodes=episodes, seed=seed).returns[0]
+        coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(found), 1, len(cases)))
+        of_coupling = roll_out(*case, coupling, 1, episodes=episodes, seed=seed).returns[0]
         gap = context_gap(of_coupling, returns, of_mapping)
         told = replace(of_mapping, left_out=left_out)
         found.append(OptimalReturn(robot.name, mapping.name, float(returns.mean()), error, told, gap))

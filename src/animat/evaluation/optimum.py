@@ -22,7 +22,7 @@ from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, 
 from animat.neurons.history import AT_FIRST
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.progress import Progress, Silent
+from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
 from animat.wrappers import TrialCosts, net_reward
@@ -182,10 +182,11 @@ def best_returns(
     optima: list[Optimum] = []
     for start in range(0, len(cases), at_once):
         batch = cases[start : start + at_once]
-        rough = _Programme(coarse, batch).run(None, seed)
+        part = Part(progress, start, len(batch), len(cases))
+        rough = _Programme(coarse, batch).run(None, seed, Part(part, 0, 1, 4))
         programme = _Programme(fine, batch)
         tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
-        values = programme.run(tables, seed)
+        values = programme.run(tables, seed, Part(part, 1, 3, 4))
         for case in range(len(batch)):
             run = math.nan, math.nan, math.nan, math.nan
             if tables is not None:
@@ -193,20 +194,20 @@ def best_returns(
                 run = float(known.mean()), standard_error(known), float(unknown.mean()), standard_error(unknown)
             grid_error = float(abs(values[case] - rough[case]))
             optima.append(Optimum(float(values[case]), grid_error, *run, episodes, fine.size))
-            progress.update(len(optima), len(cases), f"optimum {values[case]:.1f}")
+        progress.update(len(optima), len(cases), f"optimum {optima[-1].value:.1f}")
     return tuple(optima)
 
 
 def rough_values(
-    cases: Sequence[Case], grid: Grid, seed: int
+    cases: Sequence[Case], grid: Grid, seed: int, progress: Progress | None = None
 ) -> tuple[Float64[np.ndarray, " cases"], tuple[float, float]]:
     """The values alone, of many cases on a grid of one's own, and what a return can be at least and at most.
 
     Args:
-        cases, grid, seed: as in `best_returns`.
+        cases, grid, seed, progress: as in `best_returns`.
     """
     programme = _Programme(grid, cases)
-    return programme.run(None, seed), programme.bounds
+    return programme.run(None, seed, progress or Silent()), programme.bounds
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -276,7 +277,7 @@ class _Programme:
         self._motion = Motion(robot, grid, nodes, uniforms)
         self.bounds = -math.inf, math.inf
 
-    def run(self, tables: _Tables | None, seed: int) -> Float64[np.ndarray, " cases"]:
+    def run(self, tables: _Tables | None, seed: int, progress: Progress) -> Float64[np.ndarray, " cases"]:
         """Step back from the end of an episode to its start; the value there, and all values into the tables."""
         grid = self._grid
         landings = self._motion.from_grid()
@@ -297,6 +298,7 @@ class _Programme:
             led_to = grid.row_offsets, pairs, weights, costs_of_layers
             bellman_backup(values, *landings, *led_to, remaining, *ends, before)
             values, before = before, values
+            progress.update(remaining + 1, self._robot.episode_limit)
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
         first = np.array([AT_FIRST])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]

@@ -15,6 +15,7 @@ from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
+from animat.progress import Part, Progress, Silent
 from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.responses.responses import Responses
@@ -123,6 +124,7 @@ def with_intervals(
     resolution: float = 1.0,
     resamples: int = RESAMPLES,
     seed: int = 1,
+    progress: Progress | None = None,
 ) -> tuple[Optimum, ...]:
     """Optimal returns with intervals for those that the distributions of all responses would give.
 
@@ -141,6 +143,7 @@ def with_intervals(
         resolution: of the optima's grid, which the rough one is not finer than.
         resamples: how often responses are bootstrapped; 0: there are no intervals.
         seed: decides what is drawn.
+        progress: what to report to.
     """
     from scipy.stats import kruskal
 
@@ -151,9 +154,10 @@ def with_intervals(
     grid = _rough(grid_for(environments[0].robot), resolution)
     rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
     differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE
-    known = []
+    known: list[Optimum] = []
     for optimum, environment in zip(optima, environments, strict=True):
-        values, (least, most) = rough_values([(environment, simulator) for simulator in simulators], grid, seed)
+        part = Part(progress or Silent(), len(known), 1, len(optima))
+        values, (least, most) = rough_values([(environment, each) for each in simulators], grid, seed, part)
         low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
         low, high = min(low, -high, 0.0), max(high, 0.0)
         if not differ:
