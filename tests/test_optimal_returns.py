@@ -71,6 +71,7 @@ def test_inspect_tells_the_optimum(
     assert one["best"]["interval"]["low"] <= one["best"]["value"] <= one["best"]["interval"]["high"]
     told = next(line for line in said if "1-threshold: random" in line)
     assert f"optimal return {one['best']['value']:.1f}" in told
+    assert any("on a histogram of these responses, without memory: " in line for line in said)
 
 
 def test_where_there_is_no_optimum_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

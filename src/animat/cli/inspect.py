@@ -144,6 +144,7 @@ def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[s
     except (InvalidArgument, UnusableData) as error:
         print(f"{robot}: no optimal return: {error}\n")
         return None
+    print(f"{robot}, on a histogram of these responses, without memory: a simulator with memory may allow more")
     for each in found:
         print(each.to_text())
         say_findings(each.best.findings())
