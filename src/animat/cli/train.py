@@ -249,7 +249,8 @@ def _control(timeline: SimulatorTimeline) -> str:
         of_each = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, of, strict=True)) for of in shares)
         told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
     said = next((f.message for f in timeline.findings if f.name == "difference"), None)
-    first = f"P(x >= P50) in the simulator at {timeline.start_min[0]:g} min: {told}"
+    at = f"in the simulator at {timeline.start_min[0]:g} min"
+    first = f"P(x >= P50), the share of responses that reach the median, {at}: {told}"
     return "\n".join([first, *([f"in the recording {said}"] if said else []), *_memories(timeline)])
 
 
@@ -266,9 +267,10 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             decay, weight, _, load_s = memory = simulator.memory
             near, of = (int(np.median(each)) for each in (simulator.nearest, simulator.followers))
             told = (
-                f"a response depends on those before it (decay {decay:.2g} a trial; stimuli count {weight:.2g} where "
-                f"responses count 1; it is drawn from the {near} of {of} with the nearest histories)"
+                f"a response depends on the trials before it; each counts {decay:.2g} times as much as the next one, "
+                f"and its stimulus {weight:.2g} times as much as its response; the simulator draws from the {near} "
+                f"responses with the most similar history, of {of} to a condition"
             )
             if load_s:
-                told += f" and on how much was stimulated in the last {load_s:g} s"
+                told += f"; how much was stimulated in the last {load_s:g} s counts too"
             yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

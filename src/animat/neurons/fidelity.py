@@ -61,7 +61,9 @@ class Fidelity:
             changed = f"changes P(x >= P50) of {of} from {self.in_data[worst]:.2f} to {self.in_simulator[worst]:.2f}"
             value = float(loss[worst])
             if of_memory:
-                message = f"drawing the nearest {changed}: of too few responses some are drawn too often; record more"
+                message = (
+                    f"drawing from similar histories {changed}: some of so few responses come too often; record more"
+                )
                 found.append(Finding("few-neighbours", "warning", message, value))
             else:
                 remedy = (
