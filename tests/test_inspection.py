@@ -270,6 +270,8 @@ def test_brainoware_is_refused_and_shown_the_way(real_data: Path) -> None:
     assert response is not None
     assert 10 <= response.start_ms <= 20 and 400 <= response.end_ms <= 500
     assert f"--window-ms {response.start_ms:g} {response.end_ms:g}" in inspection.findings[0].message
+    # No other finding names another window.
+    assert sum("--window-ms" in finding.message for finding in inspection.findings) == 1
     there = inspect_recording(source, window_ms=(response.start_ms, response.end_ms))
     assert there.verdict != "not usable"
 

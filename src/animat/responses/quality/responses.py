@@ -62,7 +62,10 @@ def findings_on(
         )
         return (Finding("no-stimuli", "refuse", message, 0.0),)
     else:
-        found = [*_timing(responses, source, assignment), *artefact_findings(source, responses.window_ms)]
+        found = [*_timing(responses, source, assignment)]
+        # Two windows to use are one too many: where the response is elsewhere, its own is told.
+        is_elsewhere = any(finding.name in ("dead-window", "response-elsewhere") for finding in found)
+        found += artefact_findings(source, responses.window_ms, is_elsewhere=is_elsewhere)
     return (
         *_left_out(source.stimuli, assignment, str(responses.by), inside),
         *found,

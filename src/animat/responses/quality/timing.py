@@ -30,7 +30,9 @@ ENOUGH = 10.0
 """Spikes expected without a blank, to tell one."""
 
 
-def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
+def artefact_findings(
+    recording: Recording, window_ms: tuple[float, float], *, is_elsewhere: bool = False
+) -> Iterator[Finding]:
     """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
 
     Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around
@@ -45,6 +47,7 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
     Args:
         recording: with stimuli.
         window_ms: of the responses.
+        is_elsewhere: whether they lie outside of the window, which is said with the one to use.
     """
     stimuli = recording.stimuli
     read = stimuli.is_last_of_presentation & ~stimuli.is_rest
@@ -64,9 +67,9 @@ def artefact_findings(recording: Recording, window_ms: tuple[float, float]) -> I
     usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
     artefact = _artefact(histogram, usual, max(spontaneous, 1.0), recording.spike_times_s, stimuli.time_s[chosen])
     if artefact is not None:
-        yield _artefact_finding(histogram, artefact, usual, len(recording.spike_times_s), window_ms)
+        yield _artefact_finding(histogram, artefact, usual, len(recording.spike_times_s), window_ms, is_elsewhere)
     if quiet_s > 0 and spontaneous > 0:
-        yield from _blank(histogram, artefact, spontaneous, window_ms)
+        yield from _blank(histogram, artefact, spontaneous, window_ms, is_elsewhere)
 
 
 def _centre_ms(histogram: PostStimulusHistogram) -> Float64[np.ndarray, " bins"]:
@@ -120,6 +123,7 @@ def _artefact_finding(
     usual: float,
     n_spikes: int,
     window_ms: tuple[float, float],
+    is_elsewhere: bool,
 ) -> Finding:
     first, last = artefact
     centre_ms, count = _centre_ms(histogram), histogram.count[first : last + 1]
@@ -127,7 +131,8 @@ def _artefact_finding(
     spikes, n_stimuli = float(count.sum()), histogram.n_stimuli
     reaches = to_ms > window_ms[0] + 1e-9
     remedy = (
-        f"the window begins at {window_ms[0]:g} ms, inside it: begin it at {to_ms:g} ms or later (--window-ms)"
+        f"the window begins at {window_ms[0]:g} ms, inside it"
+        + ("" if is_elsewhere else f": begin it at {to_ms:g} ms or later (--window-ms)")
         if reaches
         else f"the window from {window_ms[0]:g} ms on does not hold them"
     )
@@ -145,6 +150,7 @@ def _blank(
     artefact: tuple[int, int] | None,
     spontaneous: float,
     window_ms: tuple[float, float],
+    is_elsewhere: bool,
 ) -> Iterator[Finding]:
     centre_ms, is_blank = _centre_ms(histogram), histogram.count < spontaneous / TIMES
     if artefact is not None:
@@ -162,9 +168,9 @@ def _blank(
     if lost <= 1e-9:
         yield Finding("blanked-window", "note", f"{found}; the window from {window_ms[0]:g} ms on is after it", 0.0)
         return
-    remedy = f"use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else "use a window after it"
+    remedy = f": use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else ": use a window after it"
     message = (
         f"{found}: {100 * min(lost, 1):.0f} % of the window from {window_ms[0]:g} to {window_ms[1]:g} ms is lost, and "
-        f"rates are too low by as much: {remedy}"
+        f"rates are too low by as much{'' if is_elsewhere else remedy}"
     )
     yield Finding("blanked-window", "note" if lost <= 0.15 else "warning", message, min(lost, 1.0))
