@@ -117,6 +117,22 @@ def test_the_live_page_has_what_returns_are_compared_with(
     assert capsys.readouterr().err == f"animat: --out: expected a file, got the folder {folder}\n"
 
 
+@pytest.mark.parametrize(
+    ("command", "status"),
+    [
+        (["train", "cartpole", "--iterations", "abc"], 2),
+        (["train", "cartpole", "--iteration", "10"], 2),
+        (["train", "cartpole", "--iterations", "-5"], 1),
+        (["inspect", "no-such-file.nwb"], 1),
+    ],
+)
+def test_the_exit_status_tells_a_command_line_that_cannot_be_read_from_other_errors(
+    command: list[str], status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command) == status
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The optimal return on a coarse grid, and a short search for the coupling; returns the resolutions asked for."""
     asked = []

@@ -75,7 +75,11 @@ _LESS: dict[type, str] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 1 for an error that a line on standard error names, 2 for usage."""
+    """Run one command; returns the exit status.
+
+    0; 1 for an error that a line on standard error names; 2 where the command line cannot be read; 130 after Ctrl-C or
+    a kill; 141 where nobody reads standard output any more.
+    """
     stay_on_cores()
     # Streams that were closed are None, which the parser and others do not expect: what is written goes nowhere.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
