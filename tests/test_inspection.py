@@ -162,6 +162,8 @@ def test_empty_and_thin_conditions() -> None:
     assert np.isnan(responses.shares_above_median()[2])
     thin = extract_responses(answering({5: 10.0, 10: 14.0}, n=29), burst_threshold=1)
     assert names(thin)["few-samples"] == "warning"
+    one = message(answering({5: 10.0, 10: 14.0}, n=1), "few-samples", burst_threshold=1)
+    assert one.endswith("1 non-burst response; a distribution takes 30 or more")
     assert "few-samples" not in names(extract_responses(answering({5: 10.0, 10: 14.0}, n=30), burst_threshold=1))
 
 

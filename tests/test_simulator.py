@@ -188,7 +188,7 @@ def test_a_timelines_edges_are_each_recordings_own_unless_a_range_is_given() -> 
     assert [kept.n_above_range for kept in given.fidelities] == [0, 9]
     above = [f.message for f in given.findings if f.name == "above-range"]
     assert len(above) == 1
-    assert above[0].startswith("at 10 min: 9 responses")
+    assert above[0].startswith("at 10 min: ") and above[0].endswith(" last bin: 9")
 
 
 def test_a_refreshed_simulator_recompiles_nothing() -> None:

@@ -154,7 +154,8 @@ class Evaluation:
         if self.optimum is None:
             for line in (head, *cells):
                 del line[-2]
-        lines = [f"{self.robot}, {on}: {count}, {first.shape[1]} episodes each", *lined_up(head, cells)]
+        episodes = f"{first.shape[1]} episode{'' if first.shape[1] == 1 else 's'}"
+        lines = [f"{self.robot}, {on}: {count}, {episodes} each", *lined_up(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if cost:

@@ -125,7 +125,8 @@ class Jobs:
             n_jobs = len(self._done) + len(running) + len(self.waiting) + len(failed)
             if failed:
                 parts.append(f"{len(failed)} failed")
-            note = f"{len(self._done)} of {n_jobs} jobs; {'; '.join(parts)}" if parts else ""
+            jobs = "1 job" if n_jobs == 1 else f"{n_jobs} jobs"
+            note = f"{len(self._done)} of {jobs}; {'; '.join(parts)}" if parts else ""
             progress.update(done_s, total_s, note)
 
         with _running_on(executor, workers, running, has_gpu) as at:

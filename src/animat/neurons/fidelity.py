@@ -71,7 +71,7 @@ class Fidelity:
                 )
                 found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
-            message = f"{self.n_above_range} responses lie above the histogram's range and count into its last bin"
+            message = f"responses above the histogram's range, which count into its last bin: {self.n_above_range}"
             found.append(Finding("above-range", "warning", message, float(self.n_above_range)))
         return tuple(found)
 

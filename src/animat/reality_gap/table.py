@@ -160,7 +160,7 @@ class RealityGap:
         )
         lines.append(f"  stimulation: {self.account}")
         lines.append(
-            f"  {outline['ticks']} ticks, {outline['bursts']} bursts, {outline['late_pulses']} late pulses"
+            f"  ticks: {outline['ticks']}, bursts: {outline['bursts']}, late pulses: {outline['late_pulses']}"
             f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"
         )
         if self.whose_work:

@@ -144,5 +144,5 @@ def _table(inspection: Inspection) -> list[str]:
         )
         lines.append(f"  {c.label:<{width}}  {c.n_responses:>9,}  {c.n_non_burst:>9,}  {numbers}")
     if len(conditions) > len(shown):
-        lines.append(f"  ... and {len(conditions) - len(shown)} more conditions")
+        lines.append(f"  ... and {len(conditions) - len(shown)} more")
     return lines

@@ -95,10 +95,10 @@ def _left_out(
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
-        message = f"{without} of {n_read} stimuli belong to no condition and are left out"
+        message = f"left out, as they belong to no condition: {without} of {n_read} stimuli"
         yield Finding("no-condition", "note", message, float(without))
     if inside is not None and (late := int(np.count_nonzero(read & has_condition & ~inside))):
-        message = f"the window of {late} of {n_read} stimuli runs past the end of the recording; they are left out"
+        message = f"left out, as their window runs past the end of the recording: {late} of {n_read} stimuli"
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
 
@@ -207,7 +207,8 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
             message = (
-                f"condition {condition.label}: {n} non-burst responses; a distribution takes {FEW_SAMPLES} or more"
+                f"condition {condition.label}: {n} non-burst response{'' if n == 1 else 's'}; a distribution takes "
+                f"{FEW_SAMPLES} or more"
             )
             yield Finding("few-samples", "warning", message, float(n))
 
