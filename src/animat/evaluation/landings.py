@@ -159,7 +159,9 @@ class Outcomes:
         spread = np.array([[commands.onto(nodes, smooth=smooth) for commands in row] for row in after])
         weights = np.moveaxis(np.repeat(spread / n_draws, n_draws, axis=-1), 1, 2).astype(np.float32)
         then, landings = np.nonzero(np.any(weights != 0, axis=(0, 1)))
-        return cls(np.stack([landings, then], axis=1).astype(np.int32), weights[:, :, then, landings])
+        # Laid out alike whatever their shape: for each layout that it is called with numba compiles a loop anew.
+        of_pairs = np.ascontiguousarray(weights[:, :, then, landings])
+        return cls(np.stack([landings, then], axis=1).astype(np.int32), of_pairs)
 
 
 def side_by_side(

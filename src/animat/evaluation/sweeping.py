@@ -101,7 +101,9 @@ def bellman_backup(
                 fill_row_weights(row_places[k, row], tap_weights)
                 first = rows[k, row]
                 if n_taps == 1:
-                    summed[:] = values[first * width : (first + 1) * width]
+                    # One by one: numba would compile how the shapes of two slices differ, which takes a third more.
+                    for j in range(width):
+                        summed[j] = values[first * width + j]
                 else:
                     summed[:] = f4(0)
                     for tap in range(0, n_taps, 4):
