@@ -55,6 +55,7 @@ TRAINING = Training(Navigation(episode_limit=8), Thresholds(1), policies=2, iter
 ONE = replace(TRAINING, policies=1)
 """In one process: for what has nothing to do with how many train."""
 PROTOCOL = Protocol(order="mixed", pulses=2, patterns=8, trials=40, setup_s=0.1)
+BLOCKED = replace(PROTOCOL, order="blocked")
 PULSES = 5 * 40 * 2
 QUICK = Timetable(interval_min=10, duration_min=30, speed=1e6)
 
@@ -63,11 +64,31 @@ def lines(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / LOG_FILE).read_text().splitlines()]
 
 
+Seen = list[tuple[str, int, str, float]]
+"""What the page shows of a recording under way: its state, how many are complete, which is shown, and its end in s."""
+
+
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[LiveRun, Path, int]:
+def seen() -> Seen:
+    return []
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen) -> tuple[LiveRun, Path, int]:
+    """A run whose recordings are watched as they are made."""
     folder = tmp_path_factory.mktemp("live") / "live"
-    with FakeCulture() as culture:
-        found = live(TRAINING, culture, PROTOCOL, folder, timetable=QUICK, episodes=3)
+
+    class Watched(UnderWay):
+        def __call__(self, so_far: Any) -> None:
+            super().__call__(so_far)
+            found = RecordingView(folder / "recordings").view(None, 8.0)
+            facts = dict(found["blocks"][0]["rows"])
+            seen.append((found["state"], facts["complete"], facts["shown"], found["end_s"]))
+
+    with pytest.MonkeyPatch.context() as patch, FakeCulture() as culture:
+        patch.setattr(under_way, "EVERY_S", 0.0)
+        patch.setattr(shadowing, "UnderWay", Watched)
+        found = live(TRAINING, culture, BLOCKED, folder, timetable=QUICK, episodes=3)
         return found, folder, culture.delivered
 
 
@@ -81,21 +102,8 @@ def test_the_culture_is_recorded_every_interval(ran: tuple[LiveRun, Path, int]) 
     assert found.culture_min == pytest.approx(30.0)
 
 
-def test_recordings_are_watched_as_they_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, seen = tmp_path / "live" / "recordings", []
-
-    class Watched(UnderWay):
-        def __call__(self, so_far: Any) -> None:
-            super().__call__(so_far)
-            found = RecordingView(folder).view(None, 8.0)
-            facts = dict(found["blocks"][0]["rows"])
-            seen.append((found["state"], facts["complete"], facts["shown"], found["end_s"]))
-
-    monkeypatch.setattr(under_way, "EVERY_S", 0.0)
-    monkeypatch.setattr(shadowing, "UnderWay", Watched)
-    protocol = replace(PROTOCOL, order="blocked")
-    with FakeCulture() as culture:
-        found = live(ONE, culture, protocol, tmp_path / "live", timetable=QUICK, episodes=1)
+def test_recordings_are_watched_as_they_are_made(ran: tuple[LiveRun, Path, int], seen: Seen) -> None:
+    found, folder = ran[0], ran[1] / "recordings"
     assert {state for state, *_ in seen} == {"running"}
     assert {shown for *_, shown, _ in seen} == {"the one under way, as far as it is"}
     for number, file in enumerate(found.recordings):
@@ -126,7 +134,7 @@ def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(ran: 
         assert [swap["recorded_at_min"] for swap in told] == pytest.approx(starts_min)
         assert told[0]["chunk"] == 0
         assert policy.provenance["training"]["duration_min"] == 30.0
-        assert policy.presentation == PROTOCOL.presentation
+        assert policy.presentation == BLOCKED.presentation
 
 
 def test_what_happened_is_in_the_log_in_order(ran: tuple[LiveRun, Path, int]) -> None:
