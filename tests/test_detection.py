@@ -69,6 +69,11 @@ def known() -> tuple[RawTraces, list[Int64[np.ndarray, " n"]]]:
     return RawTraces.of_array(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
 
 
+@pytest.fixture(scope="module")
+def found_in_known(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> FoundSpikes:
+    return find_spikes(known[0], workers=1)
+
+
 def test_known_spikes_are_found_and_few_others(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> None:
     traces, truth = known
     found = find_spikes(traces)
@@ -83,9 +88,9 @@ def test_known_spikes_are_found_and_few_others(known: tuple[RawTraces, list[Int6
 
 @pytest.mark.parametrize(("chunk_s", "workers"), [(0.1, 1), (0.3, 3), (10.0, 2)])
 def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
-    known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]], chunk_s: float, workers: int
+    known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]], found_in_known: FoundSpikes, chunk_s: float, workers: int
 ) -> None:
-    whole = find_spikes(known[0], workers=1)
+    whole = found_in_known
     pieces = find_spikes(known[0], None, Detection(chunk_s=chunk_s), workers=workers)
     # A negative peak at the threshold itself can fall on either side by the rounding of single precision.
     assert abs(len(pieces.time_s) - len(whole.time_s)) <= 2

@@ -111,7 +111,8 @@ def is_safe(
             return False
     everything = [*past, *request]
     us = [round(Fraction(s.time_s) * 1_000_000) for s in everything]
-    for i, stimulus in enumerate(everything):
+    # Those that were delivered were looked at when they were asked for.
+    for i, stimulus in enumerate(request, len(past)):
         lasts_us = sum(Fraction(p.duration_us) for p in everything[i - 1].pulse.phases)
         if i and us[i] < us[i - 1] + lasts_us + Fraction(limits.gap_us):
             return False
@@ -233,7 +234,7 @@ def test_no_unsafe_request_passes_and_no_safe_one_is_refused(limits: Limits) -> 
 
 
 @pytest.mark.parametrize("limits", [LIMITS, DEVICE], ids=["simulated", "device"])
-@pytest.mark.parametrize("start_s", [10_000, 100_000])
+@pytest.mark.parametrize("start_s", [pytest.param(10_000, marks=pytest.mark.oracle), 100_000])
 def test_its_arithmetic_holds_after_long_sessions(limits: Limits, start_s: int) -> None:
     safe, unsafe = try_requests(limits, start_s, 1_000, start_us=1_000_000 * start_s + 7)
     assert min(safe, unsafe.total()) > 200
