@@ -41,7 +41,7 @@ from synthetic_recordings import write_synthetic_series
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
-QUICK = ["--policies", "2", "--iterations", "2000"]
+QUICK = ["--policies", "2", "--iterations", "1000"]
 
 
 @pytest.fixture(scope="module")
@@ -826,7 +826,7 @@ def test_what_help_says_of_an_option_is_one_paragraph(
         assert any(said in line for line in lines), said
 
 
-@pytest.mark.parametrize("arguments", [["live", "--help"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])
 def test_a_reader_that_closes_early_is_no_error(arguments: list[str]) -> None:
     read, write = os.pipe()
     os.close(read)
@@ -835,7 +835,7 @@ def test_a_reader_that_closes_early_is_no_error(arguments: list[str]) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.parametrize("arguments", [["live", "--help"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])
 def test_output_that_is_closed_is_no_error_and_a_full_disk_is_told_in_a_line(arguments: list[str]) -> None:
     closed = subprocess.run(
         ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "animat", *arguments], capture_output=True, text=True

@@ -770,7 +770,7 @@ class TestCommand:
             assert (words or "") in said
 
     def test_a_spent_budget_is_told_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert self.command(folder, "--budget-pulses", "50") == 1
+        assert self.command(folder, "--budget-pulses", "50", "--controls", "random") == 1
         printed = capsys.readouterr()
         assert "budget.pulses: 50 of 50 pulses are spent, and 2 more were wanted" in printed.err
         assert "50 of 50 pulses" in printed.out

@@ -67,18 +67,18 @@ class Kept:
 
 
 def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_stays_open(tmp_path: Path) -> None:
-    six = replace(SHORT, policies=6, iterations=2_000)
+    four = replace(SHORT, policies=4, iterations=1_000)
     progress = Kept()
     # First here, where the program is compiled that each worker then finds.
     with ThreadPoolExecutor(2) as executor:
-        lent = train(six, timeline_of(), tmp_path / "lent", executor=executor)
-        assert executor.submit(len, lent).result() == 6
-    train(six, timeline_of(), tmp_path / "two", workers=2, progress=progress)
-    assert list(bits(tmp_path / "two")) == [f"p{i}.safetensors" for i in range(6)]
+        lent = train(four, timeline_of(), tmp_path / "lent", executor=executor)
+        assert executor.submit(len, lent).result() == 4
+    train(four, timeline_of(), tmp_path / "two", workers=2, progress=progress)
+    assert list(bits(tmp_path / "two")) == [f"p{i}.safetensors" for i in range(4)]
     assert bits(tmp_path / "two") == bits(tmp_path / "lent")
-    assert progress.told[-1] == (6 * CHUNKS, 6 * CHUNKS)
+    assert progress.told[-1] == (4 * CHUNKS, 4 * CHUNKS)
     assert not any((tmp_path / name / ".unfinished").exists() for name in ("two", "lent"))
-    alone = train(six, timeline_of(), None)
+    alone = train(four, timeline_of(), None)
     for name, policy in lent.items():
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
 
