@@ -75,7 +75,9 @@ def energy(robot: TwoLinkArm, states: np.ndarray) -> np.ndarray:
     return np.array([s[2:4] @ mass_matrix(robot, s[:2]) @ s[2:4] / 2 for s in states])
 
 
-@pytest.mark.parametrize("robot", [TwoLinkArm(), TwoLinkArm(**LINKS, damping_n_m_s=0.001)])
+@pytest.mark.parametrize(
+    "robot", [pytest.param(TwoLinkArm(), marks=pytest.mark.oracle), TwoLinkArm(**LINKS, damping_n_m_s=0.001)]
+)
 def test_a_movement_is_the_solution_of_lagranges_equations(robot: TwoLinkArm) -> None:
     start, commands = np.array([0.4, 1.2, 1.5, -2.0]), [(1.0, -0.6), (-0.3, 0.9), (0.5, 1.0), (-1.0, -1.0)]
     states, _, _ = path(robot, start, commands)

@@ -58,7 +58,7 @@ def actions_of_navigation(o: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("id_", "mapping", "rule", "of_random", "of_rule"),
     [
-        ("Animat/Cartpole-v0", "1-threshold", actions_of_cartpole, -80, 15),
+        pytest.param("Animat/Cartpole-v0", "1-threshold", actions_of_cartpole, -80, 15, marks=pytest.mark.oracle),
         ("Animat/Cartpole-v0", "9-thresholds", actions_of_cartpole, -77, 63),
         ("Animat/Navigation-v0", "1-threshold", actions_of_navigation, -73, 19),
     ],

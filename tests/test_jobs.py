@@ -161,10 +161,11 @@ def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
             AnimatError,
             r"job: its process ended with status 7 \(is there memory enough\? .*\); start again to go on",
         ),
-        (
+        pytest.param(
             Killed(),
             AnimatError,
             r"job: its process ended with status -15 \(another program ended it\); start again to go on",
+            marks=pytest.mark.oracle,
         ),
     ],
 )

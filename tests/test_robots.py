@@ -28,7 +28,11 @@ from animat.robots import (
 
 VARIANTS = [
     *(robot_named(name) for name in ROBOTS),
-    *(kind.as_printed() for kind in ROBOTS.values() if hasattr(kind, "as_printed")),
+    *(
+        pytest.param(kind.as_printed(), marks=pytest.mark.oracle)
+        for kind in ROBOTS.values()
+        if hasattr(kind, "as_printed")
+    ),
 ]
 
 

@@ -70,7 +70,11 @@ def problem(seed: int, *, commands: int) -> tuple[Trained, Network, Batch, jax.A
     return trained, targets, reference.drawn_batch(seed, SIZE, N, n_actions, commands), uniforms
 
 
-@pytest.mark.parametrize("commands", [0, 1, 2])
+COMMANDS = (0, pytest.param(1, marks=pytest.mark.oracle), 2)
+"""Actions; one command and two, which are one program for another width."""
+
+
+@pytest.mark.parametrize("commands", COMMANDS)
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_losses_equal_a_float64_reference(commands: int, seed: int) -> None:
@@ -78,7 +82,7 @@ def test_losses_equal_a_float64_reference(commands: int, seed: int) -> None:
     np.testing.assert_allclose(compiled_losses(*given_), reference_losses(*given_), rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize("commands", [0, 1, 2])
+@pytest.mark.parametrize("commands", COMMANDS)
 def test_each_loss_moves_its_own_parameters_only(commands: int) -> None:
     gradients: Trained = compiled_gradients(*problem(1, commands=commands))
     for i, loss in enumerate(LOSSES):
@@ -87,7 +91,7 @@ def test_each_loss_moves_its_own_parameters_only(commands: int) -> None:
             assert moved == (name == loss), f"{loss} loss, parameters of {name}"
 
 
-@pytest.mark.parametrize("commands", [0, 1, 2])
+@pytest.mark.parametrize("commands", COMMANDS)
 def test_gradients_equal_finite_differences_of_the_reference(commands: int) -> None:
     trained, targets, batch, uniforms = problem(2, commands=commands)
     gradients: Trained = compiled_gradients(trained, targets, batch, uniforms)
