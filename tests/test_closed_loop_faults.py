@@ -82,10 +82,14 @@ def raising(error: Exception) -> Fault:
             "the connection to the culture is lost: DeviceFailed: fake: expected it to deliver, got "
             "ConnectionResetError: gone",
         ),
-        (OSError("no route to host"), "the connection to the culture is lost"),
+        pytest.param(OSError("no route to host"), "the connection to the culture is lost", marks=pytest.mark.oracle),
         # As the CL1's SDK says that its loop was late.
         (TimeoutError("no answer"), "the culture raised DeviceFailed: fake: expected it to deliver, got TimeoutError"),
-        (KeyError("window"), "the culture raised DeviceFailed: fake: expected it to deliver, got KeyError"),
+        pytest.param(
+            KeyError("window"),
+            "the culture raised DeviceFailed: fake: expected it to deliver, got KeyError",
+            marks=pytest.mark.oracle,
+        ),
     ],
 )
 def test_a_backend_that_raises_or_loses_its_connection(tmp_path: Path, error: Exception, words: str) -> None:

@@ -61,6 +61,7 @@ def test_who_drives_straight_to_the_goal_bumps_and_never_gets_there() -> None:
     assert np.mean(np.asarray(last) == -2) > 0.95 and np.mean(np.asarray(arrived)) < 0.05
 
 
+@pytest.mark.oracle
 def test_goals_in_oblique_surroundings_are_where_a_body_touches_something_at_one_of_many_places_on_the_way() -> None:
     walls = (*ROBOT.walls[:4], (0.1, 0.15, 0.6, 0.35), (0.3, 0.7, 0.3, 0.7), (0.9, 0.3, 0.7, 0.55))
     robot = Detour(walls=walls, obstacles=((0.8, 0.8, 0.1),), start_x_m=0.45)

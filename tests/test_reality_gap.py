@@ -606,7 +606,7 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
 
 
 @pytest.mark.usefixtures("few_bootstraps")
-@pytest.mark.parametrize(("rest_min", "warned"), [(20.0, False), (45.0, True)])
+@pytest.mark.parametrize(("rest_min", "warned"), [pytest.param(20.0, False, marks=pytest.mark.oracle), (45.0, True)])
 def test_a_recording_much_older_than_the_culture_is_said_to_be(
     tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
 ) -> None:
