@@ -84,8 +84,7 @@ def test_tensorboard_has_every_row(tmp_path: Path) -> None:
     from animat.report.tensorboard import TensorBoard
 
     with TensorBoard(tmp_path / "runs") as board:
-        short = replace(SHORT, iterations=1_000)
-        policies = trained(short, timeline_of(), tmp_path / "policies", callbacks=[board])
+        policies = trained(FOUR, timeline_of(), tmp_path / "policies", callbacks=[board])
     for name, policy in policies.items():
         curve = policy.learning_curve
         written = scalars(next((tmp_path / "runs" / name).iterdir()))

@@ -226,6 +226,7 @@ def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tu
     assert "are saturated on average" in names["saturated-channels"].message
 
 
+@pytest.mark.oracle
 def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, RawTraces]) -> None:
     traces, source = stimulated
     naive = find_spikes(source)

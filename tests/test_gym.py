@@ -314,6 +314,7 @@ def test_a_seed_decides_a_whole_vector() -> None:
     assert np.all(np.std(play(2)[10], axis=0) > 0)  # the environments differ from one another
 
 
+@pytest.mark.oracle
 def test_vector_and_single_have_the_same_returns() -> None:
     """Mean return of random play over whole episodes, by both; the standard error of the difference decides."""
 

@@ -193,7 +193,8 @@ def learned(environment: Environment[Any], rounds: int, **changed: Any) -> tuple
     return chunk(beginning(keys), coins(1, 9), jnp.int32(0), jnp.int32(rounds))  # type: ignore[no-any-return]
 
 
-@pytest.mark.parametrize(("cost", "best"), [pytest.param(1.2, 1, marks=pytest.mark.oracle), (2.0, 0)])
+@pytest.mark.oracle
+@pytest.mark.parametrize(("cost", "best"), [(1.2, 1), (2.0, 0)])
 def test_a_policy_learns_the_action_that_is_best_with_the_cost(cost: float, best: int) -> None:
     environment = TrialCosts(Animat(Payer(episode_limit=5), Thresholds(1), 2), (0.0, cost))
     learners, finished = learned(environment, 300)

@@ -301,7 +301,7 @@ ARRAYS = npst.arrays(
 )
 
 
-@settings(FEW, max_examples=200)
+@settings(FEW, max_examples=100)
 @given(
     arrays=st.dictionaries(st.sampled_from([*KEYS, *OTHER_NAMES, *ROUTING]), ARRAYS, max_size=5), whole=st.booleans()
 )

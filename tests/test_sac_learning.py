@@ -135,7 +135,7 @@ def test_only_what_was_written_is_learned_from() -> None:
 # --- one update -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("commands", [DISCRETE, None])
+@pytest.mark.parametrize("commands", [DISCRETE, pytest.param(None, marks=pytest.mark.oracle)])
 def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[float, ...] | None) -> None:
     # One transition remembered, so the batch is known: that row, over and over. One environment holds no actions, so
     # the entropy counts.
