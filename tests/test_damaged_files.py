@@ -41,7 +41,7 @@ def damage(kind: str, seed: int, count: int, folder: Path) -> None:
     print(done.stdout)
 
 
-# By default files that this process reads; those of HDF5 are read in another, which `test_reading_apart` has crash.
+# One library reads those of HDF5, in another process, whose crashes have tests of their own (`test_reading_apart`).
 HDF5 = ("nwb", "other-nwb", "maxwell", "old-maxwell", "cl1")
 
 
