@@ -70,6 +70,7 @@ def test_it_is_what_the_equations_say_of_discrete_actions(paid: bool) -> None:
     assert found.critic_loss == pytest.approx(loss, rel=1e-3)
 
 
+@pytest.mark.oracle
 def test_it_is_what_the_equations_say_of_continuous_actions() -> None:
     environment = WithoutNeurons(Navigation(), None)
     settings = replace(TINY, replay=200)

@@ -167,9 +167,8 @@ def test_cartpole_tried_to_the_end() -> None:
     assert found.value == pytest.approx(truth, abs=3 * found.grid_error + 0.5)
 
 
-@pytest.mark.parametrize(
-    ("robot", "resolution"), [pytest.param(Cartpole(), 0.75, marks=pytest.mark.oracle), (Navigation(), 0.5)]
-)
+@pytest.mark.oracle
+@pytest.mark.parametrize(("robot", "resolution"), [(Cartpole(), 0.75), (Navigation(), 0.5)])
 def test_where_nothing_can_be_chosen_the_optimum_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
     """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
     environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
