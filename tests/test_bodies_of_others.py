@@ -162,15 +162,20 @@ class Stopping:
 
 
 @pytest.mark.parametrize(
-    ("name", "mapping"),
+    ("name", "mapping", "iterations"),
     [
-        ("Slider", None),
-        *(pytest.param(*each, marks=pytest.mark.oracle) for each in (("Levels", Thresholds(1)), ("Remembers", None))),
+        ("Slider", None, 1_200),
+        *(
+            pytest.param(*each, 2_400, marks=pytest.mark.oracle)
+            for each in (("Levels", Thresholds(1)), ("Remembers", None))
+        ),
     ],
 )
-def test_stopped_and_started_again_it_ends_in_the_same_bits(name: str, mapping: Any, tmp_path: Path) -> None:
+def test_stopped_and_started_again_it_ends_in_the_same_bits(
+    name: str, mapping: Any, iterations: int, tmp_path: Path
+) -> None:
     timeline = None if mapping is None else timeline_of()
-    asked = training(named(name), mapping, iterations=1_200)
+    asked = training(named(name), mapping, iterations=iterations)
     description = describe(asked, timeline)
     group = Group(asked, (0, 1), timeline, description["fingerprint"], {})
     undisturbed = train_group(group, None, Stopping(10**9))
@@ -184,7 +189,7 @@ def test_stopped_and_started_again_it_ends_in_the_same_bits(name: str, mapping: 
             np.testing.assert_array_equal(a, b)
     assert not np.array_equal(undisturbed[0].weights[0], undisturbed[1].weights[0])
     episodes = undisturbed[0].learning_curve[:, 1].sum()
-    assert 0 < episodes <= 1_200
+    assert 0 < episodes <= iterations
 
 
 @pytest.mark.oracle
