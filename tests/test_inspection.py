@@ -20,12 +20,13 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms, rate_edges
 from animat.report.style import condition_colours, save_figure
 from animat.responses.condition import Condition
-from animat.responses.conditions import All, ByElectrode, ByFrequency, ByInterval, ByPattern
+from animat.responses.conditions import All, Assignment, ByElectrode, ByFrequency, ByInterval, ByPattern, Conditions
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.responses.psth import post_stimulus_histogram
 from animat.responses.quality.responses import _difference
 from animat.responses.responses import Responses
+from animat.stimulation.stimulus import Stimuli
 from synthetic_recordings import SyntheticCulture
 from test_responses import names, recording
 
@@ -143,15 +144,29 @@ def test_windows_past_the_end_are_left_out_and_counted() -> None:
     assert names(responses)["window-past-end"] == "warning"
 
 
+class Nothing(Conditions):
+    """A rule of one's own that no stimulus meets."""
+
+    def __str__(self) -> str:
+        return "mine"
+
+    def assign(self, stimuli: Stimuli) -> Assignment:
+        return ByPattern((7,)).assign(stimuli)
+
+
 def test_stimuli_without_a_condition_are_counted() -> None:
     source = recording([], [1, 2, 3], pattern=[0, 0, 1])
     found = {f.name: f for f in extract_responses(source, ByPattern((0,))).findings}
     assert (found["no-condition"].severity, found["no-condition"].value) == ("note", 1)
     assert names(extract_responses(source, ByPattern((7,))))["no-condition"] == "refuse"
     none = message(source, "no-condition", by=ByPattern((7,)))
-    assert "one of the conditions pattern:7; the recording has pattern 0, pattern 1: choose others" in none
-    none = message(source, "no-condition", by=ByElectrode())
-    assert "the recording has none of this kind: choose others (--conditions" in none
+    assert (
+        "none of the conditions pattern:7: 3 of 3 stimuli, all of them; the recording has pattern 0, pattern 1" in none
+    )
+    # What other kinds could be had is not a list of what the recording has.
+    for by in (ByElectrode(), ByInterval((7.0,)), Nothing()):
+        none = message(source, "no-condition", by=by)
+        assert "all of them: choose others (--conditions" in none
 
 
 def test_empty_and_thin_conditions() -> None:

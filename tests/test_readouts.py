@@ -123,6 +123,22 @@ def test_conditions_that_move_readouts_together_are_warned_of(part: float) -> No
     found = list(_readouts(replace(responses, readout_hz=both_hz)))
     assert [finding.name for finding in found] == (["readouts-alike"] if part < 0.5 else [])
     assert all("animat record --places corners" in finding.message for finding in found)
+    others = replace(responses.readouts, names=("upper", "lower"))
+    own = list(_readouts(replace(responses, readout_hz=both_hz, readouts=others)))
+    assert all("readouts upper and lower: " in each.message and "--places FILE" in each.message for each in own)
+
+
+def test_few_responses_cannot_tell_whether_conditions_separate_readouts() -> None:
+    source = SyntheticCulture(1, channels=2, patterns=40).record()
+    responses = extract_responses(source, burst_threshold=1, readouts=readouts_on("halves", source.channels))
+    # Of 40 responses 28 are high in the left readout, of the first condition 16; 20 are in the right one.
+    number = np.zeros(len(responses), np.int64)
+    for c in range(len(responses.conditions)):
+        number[responses.condition == c] = np.arange(40)
+    left = number < np.where(responses.condition == 0, 16, 28)
+    both_hz = np.stack([left, number % 2 == 0], axis=-1).astype(np.float64)
+    (found,) = _readouts(replace(responses, readout_hz=both_hz))
+    assert "so few responses cannot tell whether they separate" in found.message
 
 
 def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, halves: Readouts) -> None:
@@ -139,7 +155,7 @@ def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, 
         spike_channels=np.searchsorted(rows, recording.spike_channels[kept]),
     )
     with pytest.raises(
-        Mismatch, match=rf"^readouts: .*none that read 1 of its 16 \({gone}\): choose .* \(.* at 10 min\)$"
+        Mismatch, match=rf"^readouts: .*none that read 1 of its 16 \({gone}\); 31 are read .* at 10 min\)$"
     ):
         extract_series([recording, fewer], readouts="halves")
 

@@ -25,7 +25,7 @@ from animat.cli.convert import Convert
 from animat.cli.evaluate import Evaluate
 from animat.cli.inspect import Inspect
 from animat.cli.live import Live
-from animat.cli.record import PRESENTED, Record
+from animat.cli.record import Record
 from animat.cli.recover import Recover
 from animat.cli.replay import Replay
 from animat.cli.reproduce import Reproduce
@@ -172,10 +172,13 @@ def _by_option(command: Command, message: str) -> str:
     given = (each if isinstance(each, tuple) else (each,) for each in vars(command).values())
     # A file or a folder may have the name of an option.
     paths = {str(path) for each in given for path in each if isinstance(path, Path)}
+    if isinstance(command, Record) and command.protocol is not None:
+        from animat.stimulation.protocol import Protocol
+
+        if name in {field.name for field in dataclasses.fields(Protocol)}:
+            return f"{command.protocol}: {message}"
     if name not in options - paths:
         return message
-    if isinstance(command, Record) and command.protocol is not None and name in PRESENTED:
-        return f"{command.protocol}: {message}"
     value = vars(command)[name]
     file = f" {value}" if isinstance(value, str) and os.path.isfile(value) else ""  # noqa: PTH113 - any text at all
     return f"--{name.replace('_', '-')}{file}: {rest}"

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from animat.stimulation.protocol import Protocol
 
 
-PRESENTED = ("order", "pulses", "trials", "places")
+_PRESENTED = ("order", "pulses", "trials", "places")
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Record:
         # Before any device is powered.
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        asked = [f"--{name}" for name in PRESENTED if getattr(self, name) is not None]
+        asked = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
         asked += ["--paper"] if self.paper else []
         if asked and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
@@ -130,7 +130,7 @@ class Record:
             return self.interval_min
         # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
         usual = not self.paper and self.protocol is None
-        asked = [getattr(self, name) for name in PRESENTED]
+        asked = [getattr(self, name) for name in _PRESENTED]
         return 5.0 if usual and set(asked) <= {None, "corners"} else 10.0
 
     def _protocol(self, patterns: int = 100) -> Protocol:

@@ -267,10 +267,10 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             decay, weight, _, load_s = memory = simulator.memory
             near, of = (int(np.median(each)) for each in (simulator.nearest, simulator.followers))
             told = (
-                f"a response depends on the trials before it; each counts {decay:.2g} times as much as the next one, "
-                f"and its stimulus {weight:.2g} times as much as its response; the simulator draws from the {near} "
-                f"responses with the most similar history, of {of} to a condition"
+                f"a response depends on the trials before it: each counts {decay:.2g} times as much as the next one, "
+                f"and its stimulus {weight:.2g} times as much as its response. The simulator draws from the {near} "
+                f"responses with the most similar history, of the {of} of a condition"
             )
             if load_s:
-                told += f"; how much was stimulated in the last {load_s:g} s counts too"
+                told += f". How much was stimulated in the last {load_s:g} s counts too"
             yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"

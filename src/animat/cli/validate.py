@@ -9,7 +9,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.responses import Responding, say_findings
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.writing import expect_writable
 
 
@@ -73,8 +73,8 @@ class Validate(Responding):
                     )
                     several = range(len(responses.readouts)) if len(responses.readouts) > 1 else [None]
                     found = [validate(responses, kind=self.simulator, seed=self.seed, readout=d) for d in several]
-                except UnusableData as error:
-                    raise UnusableData(f"{file}: {error}") from error
+                except (Mismatch, UnusableData) as error:
+                    raise type(error)(f"{file}: {error}") from error
                 say_findings(responses.findings)
                 for validation, readout in zip(found, responses.readouts.names, strict=True):
                     apart = len(found) > 1

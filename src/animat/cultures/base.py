@@ -188,10 +188,13 @@ class Culture(Openable):
         x_um, y_um = (np.append(each, np.nan)[rows] for each in (table.x_um, table.y_um))
         places = electrodes_of(protocol.places, electrodes, x_um, y_um)
         if strange := sorted({each for place in places for each in place} - {*electrodes.tolist()}):
-            there, got = (", ".join(map(str, each)) for each in (sorted(electrodes.tolist()), strange[:8]))
+            there, got = (
+                ", ".join(map(str, each[:8])) + (", ..." if len(each) > 8 else "")
+                for each in (sorted(electrodes.tolist()), strange)
+            )
             raise InvalidArgument(
                 f"places: expected electrodes among the {len(electrodes)} that stimulate this culture ({there}), got "
-                f"{got}{', ...' if len(strange) > 8 else ''}"
+                f"{got}"
             )
         return make_schedule(protocol, self.patterns, seed, places=places)
 

@@ -101,7 +101,7 @@ def bellman_backup(
                 fill_row_weights(row_places[k, row], tap_weights)
                 first = rows[k, row]
                 if n_taps == 1:
-                    # One by one: numba would compile how the shapes of two slices differ, which takes a third more.
+                    # One by one: numba would compile a check that two slices are as long, which takes a third more.
                     for j in range(width):
                         summed[j] = values[first * width + j]
                 else:

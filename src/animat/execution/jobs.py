@@ -162,7 +162,7 @@ class Jobs:
         if failed:
             # In whatever order they ended, the same message.
             failed.sort(key=str)
-            in_vain = f"; {len(self.waiting)} jobs wait for what failed" if self.waiting else ""
+            in_vain = f"; waiting for what failed: {len(self.waiting)}" if self.waiting else ""
             failed[0].args = ("; ".join(map(str, failed)) + in_vain,)
             raise failed[0]
         return cpu_s

@@ -18,7 +18,7 @@ from animat.stimulation.places import CUT, count_places, electrodes_of
 from animat.stimulation.selection import Electrode
 from animat.tables import UNKNOWN
 
-_NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
+CUT_NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
 """Of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
 _MOST_BYTES = 2**20
 MOST_READOUTS = 64
@@ -83,10 +83,10 @@ class Readouts:
                     ", ".join(map(str, sorted(each)[:5])) + (", ..." if len(each) > 5 else "")
                     for each in (missing, read)
                 )
+                known = f"{len(read):,} are read ({there})" if read else "which ones are read is not known"
                 raise Mismatch(
                     f"readouts: expected channels that read all electrodes of the readout {name!r}, got none that read "
-                    f"{len(missing)} of its {len(group)} ({told}): choose among the {len(read):,} that are read "
-                    f"({there or 'the recording does not say which'})"
+                    f"{len(missing)} of its {len(group)} ({told}); {known}"
                 )
         return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
 
@@ -210,6 +210,6 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
         if not channels.has_positions:
             raise InvalidArgument(f"readouts: expected channels whose positions are known to cut into {readouts}")
         groups = electrodes_of(readouts, electrodes, channels.x_um[first], channels.y_um[first])
-        return Readouts(_NAMES[readouts], groups)
+        return Readouts(CUT_NAMES[readouts], groups)
     readouts.members(channels)
     return readouts

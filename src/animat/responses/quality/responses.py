@@ -15,10 +15,17 @@ from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import LEAST_RESPONSES, BurstSeparation
 from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment, conditions_named
-from animat.responses.psth import PostStimulusHistogram, find_response, post_stimulus_histogram, spontaneous_rate
+from animat.responses.psth import (
+    PostStimulusHistogram,
+    ResponseTime,
+    find_response,
+    post_stimulus_histogram,
+    spontaneous_rate,
+)
 from animat.responses.quality.drift import drift_findings
 from animat.responses.quality.memory import memory_findings
 from animat.responses.quality.timing import artefact_findings
+from animat.responses.readouts import CUT_NAMES
 from animat.responses.responses import Responses
 from animat.stimulation.stimulus import Stimuli
 
@@ -32,8 +39,10 @@ LITTLE_DIFFERENCE = 0.2
 (docs/evidence/optimal-return.md)."""
 
 _WINDOW_PARTS = 8
-_PLACES = {2: "corners", 4: "quadrants"}
-"""What to record for so many readouts."""
+_PLACES = {CUT_NAMES["halves"]: "corners", CUT_NAMES["quadrants"]: "quadrants"}
+"""What to record for readouts that are cut so."""
+_ALONE = ("frequency", "electrode", "pattern")
+"""Kinds of conditions that a recording has without values that were asked for."""
 
 
 def findings_on(
@@ -62,9 +71,11 @@ def findings_on(
         )
         return (Finding("no-stimuli", "refuse", message, 0.0),)
     else:
-        found = [*_timing(responses, source, assignment)]
+        response = None if source.stimuli.is_rest.all() else find_response(source)
+        found = [*_timing(responses, source, assignment, response)]
         # Two windows to use are one too many: where the response is elsewhere, its own is told.
-        is_elsewhere = any(finding.name in ("dead-window", "response-elsewhere") for finding in found)
+        outside = any(finding.name in ("dead-window", "response-elsewhere") for finding in found)
+        is_elsewhere = outside and response is not None
         found += artefact_findings(source, responses.window_ms, is_elsewhere=is_elsewhere)
     return (
         *_left_out(source.stimuli, assignment, str(responses.by), inside),
@@ -87,11 +98,12 @@ def _left_out(
     without = int(np.count_nonzero(read & ~has_condition))
     if without == n_read:
         kind = by.partition(":")[0]
-        there = conditions_named("frequency" if kind == "interval" else kind).assign(stimuli).conditions
+        there = conditions_named(kind).assign(stimuli).conditions if kind in _ALONE else ()
         listed = ", ".join(each.label for each in there[:8]) + (", ..." if len(there) > 8 else "")
         message = (
-            f"none of the {n_read} stimuli belongs to one of the conditions {by}; the recording has "
-            f"{listed or 'none of this kind'}: choose others (--conditions frequency, interval, electrode or pattern)"
+            f"left out, as they belong to none of the conditions {by}: {without} of {n_read} stimuli, all of them"
+            f"{f'; the recording has {listed}' if listed else ''}: choose others (--conditions frequency, interval, "
+            "electrode or pattern)"
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
@@ -102,7 +114,9 @@ def _left_out(
         yield Finding("window-past-end", "note" if late < 0.05 * n_read else "warning", message, float(late))
 
 
-def _timing(responses: Responses, recording: Recording, assignment: Assignment) -> Iterator[Finding]:
+def _timing(
+    responses: Responses, recording: Recording, assignment: Assignment, response: ResponseTime | None
+) -> Iterator[Finding]:
     start_ms, end_ms = responses.window_ms
     stimuli = recording.stimuli
     if stimuli.is_rest.all():
@@ -122,7 +136,6 @@ def _timing(responses: Responses, recording: Recording, assignment: Assignment) 
         )
         yield Finding("stimuli-too-close", "warning", message, float(overlapping))
     rate_hz, _ = spontaneous_rate(recording, after_ms=end_ms)
-    response = find_response(recording)
     parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
     if math.isnan(rate_hz) and parts.count.any():
         message = (
@@ -306,9 +319,11 @@ def _readouts(responses: Responses) -> Iterator[Finding]:
             alike.append((spread, f"{names[a]} and {names[b]}", " to ".join(ends)))
     if alike:
         spread, pair, between = min(alike)
+        is_known = spread < LITTLE_DIFFERENCE
+        does = "the conditions hardly separate" if is_known else "so few responses cannot tell whether they separate"
         message = (
-            f"the conditions hardly separate the readouts {pair}: P(x >= P50) of the first less that of the second is "
-            f"{between}, so a policy can hardly give one command without the other: record at places that differ "
-            f"(animat record --places {_PLACES.get(len(names), 'FILE')})"
+            f"{does} the readouts {pair}: P(x >= P50) of the first less that of the second is {between}, and a policy "
+            "needs them apart to give one command without the other: record more, or at places that differ "
+            f"(animat record --places {_PLACES.get(names, 'FILE')})"
         )
         yield Finding("readouts-alike", "warning", message, spread)
