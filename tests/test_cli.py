@@ -167,6 +167,7 @@ def test_settings_of_the_algorithm_are_those_that_policies_are_trained_with(reco
     assert [w.shape for w in Policy.load(tmp_path / "p0.safetensors").weights] == [(4, 8), (8, 8), (8, 5)]
 
 
+@pytest.mark.oracle
 def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_finished_one_is_told(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

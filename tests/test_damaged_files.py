@@ -69,6 +69,7 @@ def test_a_part_that_is_damaged_is_not_taken_for_one_that_is_missing(where: str,
         read_nwb(path)
 
 
+@pytest.mark.oracle
 def test_a_reader_that_is_not_ready_in_time_does_not_blame_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apart, "START_S", 0.0)
     with pytest.raises(InvalidFile, match=r"not ready after 0 s, is the machine busy\?"):

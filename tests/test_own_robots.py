@@ -324,6 +324,7 @@ def test_a_reward_that_is_no_number_later_is_named() -> None:
         train(training(LaterNaN(), None), None, None)
 
 
+@pytest.mark.oracle
 def test_a_training_that_is_refused_leaves_nothing_in_the_way_of_the_next(tmp_path: Path) -> None:
     register_robot(LaterNaN)
     try:
