@@ -83,7 +83,7 @@ class RealityGap:
                 return ""
             return (
                 f"; their measured return is {_more_or_less(row.gap.value)} than predicted, within what the "
-                f"recording's responses ({self.responses}) and so few episodes ({len(row.measured)}) can tell"
+                f"recording's responses ({self.responses}) and the episodes ({len(row.measured)}) can tell"
             )
         said = f"; their measured return is {_more_or_less(row.gap.value)} than predicted"
         if self.reasons:
