@@ -260,8 +260,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
         assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, measured)
     uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
-        f"; their measured return is 20.0 less than predicted, within what the recording's {gap.responses} responses "
-        "and 10 episodes can tell"
+        f"; their measured return is 20.0 less than predicted, within what the recording's responses ({gap.responses}) "
+        "and the episodes (10) can tell"
     )
     reasons = (Finding("a", "note", "it rained"), Finding("b", "note", "it snowed"))
     explained = replace(gap, rows=(replace(policies, measured=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)

@@ -142,9 +142,9 @@ class Live(Stimulating):
         from animat.execution.training import in_words
 
         print(
-            f"recordings: {len(ran.recordings)}, in {ran.culture_min:.0f} min of the culture's clock "
+            f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
             f"({ran.wall_s:.0f} s of ours); {ran.iterations:,} iterations of each policy, never stopped; "
-            f"swaps of simulators: {len(ran.swaps)}"
+            f"{len(ran.swaps)} swaps of simulators:"
         )
         for swap in ran.swaps:
             print(
