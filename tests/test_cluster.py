@@ -134,7 +134,7 @@ def test_what_fails_twice_is_done_and_thrice_is_reported(running: Running, tmp_p
         Job("in vain", Join("in vain", ("thrice",)), ("thrice",)),
         Job("other", Join("other")),
     ]
-    words = "^thrice: a.nwb: expected a recording, got none; 1 jobs wait for what failed$"
+    words = "^thrice: a.nwb: expected a recording, got none; waiting for what failed: 1$"
     with Cluster(running.file) as cluster, pytest.raises(AnimatError, match=words):
         run(jobs, tmp_path, cluster)
     assert (tmp_path / "thrice").read_text().count("tried") == 3

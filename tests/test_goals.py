@@ -22,6 +22,7 @@ from animat.goals.goal import Goal, Objective
 from animat.goals.region import Ball, Range
 from animat.goals.robot import RobotWithGoal, body_and_goal, robot_of, with_goal, without_goal
 from animat.goals.text import read_goal
+from animat.progress import Silent
 from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, Shuttle, SwingUp, robot_named
 from animat.robots.base import lacking
 from animat.robots.checking import check_robot
@@ -288,7 +289,7 @@ def best_controller(environment: Environment[Any], resolution: float, episodes: 
     grid = grid_for(robot).scaled(resolution)
     programme = _Programme(grid, [(environment, None)])
     tables = _Tables(grid, programme.n_layers, robot.episode_limit)
-    programme.run(tables, 1)
+    programme.run(tables, 1, Silent())
     return programme.play(tables, 0, episodes, 5, clock=True)
 
 
