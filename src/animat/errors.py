@@ -5,7 +5,7 @@ from __future__ import annotations
 import copyreg
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 
@@ -77,6 +77,11 @@ def shown(value: object) -> str:
         # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
         text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"
     return text if len(text) <= 80 else f"{text[:80]}... ({len(text):,} characters)"
+
+
+def some_of(names: Sequence[object], most: int = 8) -> str:
+    """The first of some names, and dots where there are more."""
+    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
 
 
 def expect_kind(what: str, given: object, kind: Any, words: str) -> None:

@@ -175,7 +175,7 @@ def _by_option(command: Command, message: str) -> str:
     if isinstance(command, Record) and command.protocol is not None:
         from animat.stimulation.protocol import Protocol
 
-        if name in {field.name for field in dataclasses.fields(Protocol)}:
+        if name in {field.name for field in dataclasses.fields(Protocol)} - paths:
             return f"{command.protocol}: {message}"
     if name not in options - paths:
         return message

@@ -17,7 +17,7 @@ from animat.cultures.observed import Observed, Spikes, assembled, more_left_out,
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
-from animat.errors import AnimatError, InvalidArgument
+from animat.errors import AnimatError, InvalidArgument, some_of
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.places import electrodes_of
@@ -188,13 +188,9 @@ class Culture(Openable):
         x_um, y_um = (np.append(each, np.nan)[rows] for each in (table.x_um, table.y_um))
         places = electrodes_of(protocol.places, electrodes, x_um, y_um)
         if strange := sorted({each for place in places for each in place} - {*electrodes.tolist()}):
-            there, got = (
-                ", ".join(map(str, each[:8])) + (", ..." if len(each) > 8 else "")
-                for each in (sorted(electrodes.tolist()), strange)
-            )
             raise InvalidArgument(
-                f"places: expected electrodes among the {len(electrodes)} that stimulate this culture ({there}), got "
-                f"{got}"
+                f"places: expected electrodes among the {len(electrodes)} that stimulate this culture "
+                f"({some_of(sorted(electrodes.tolist()))}), got {some_of(strange)}"
             )
         return make_schedule(protocol, self.patterns, seed, places=places)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from pydantic import Field
 
-from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown, some_of
 from animat.plain_file import read_plain_text
 from animat.recordings.recording import Channels
 from animat.records import in_file, json_data, read_record, record
@@ -78,15 +78,13 @@ class Readouts:
             return np.ones((1, len(channels)), np.bool_)
         read = set(channels.electrode.tolist()) - {UNKNOWN}
         for name, group in zip(self.names, self.electrodes, strict=True):
-            if missing := set(group) - read:
-                told, there = (
-                    ", ".join(map(str, sorted(each)[:5])) + (", ..." if len(each) > 5 else "")
-                    for each in (missing, read)
+            if missing := sorted(set(group) - read):
+                known = (
+                    f"{len(read):,} are read ({some_of(sorted(read), 5)})" if read else "which are read is not known"
                 )
-                known = f"{len(read):,} are read ({there})" if read else "which ones are read is not known"
                 raise Mismatch(
                     f"readouts: expected channels that read all electrodes of the readout {name!r}, got none that read "
-                    f"{len(missing)} of its {len(group)} ({told}); {known}"
+                    f"{len(missing)} of its {len(group)} ({some_of(missing, 5)}); {known}"
                 )
         return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
 

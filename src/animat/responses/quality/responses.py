@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool
 
+from animat.errors import some_of
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -41,8 +42,8 @@ LITTLE_DIFFERENCE = 0.2
 _WINDOW_PARTS = 8
 _PLACES = {CUT_NAMES["halves"]: "corners", CUT_NAMES["quadrants"]: "quadrants"}
 """What to record for readouts that are cut so."""
-_ALONE = ("frequency", "electrode", "pattern")
-"""Kinds of conditions that a recording has without values that were asked for."""
+_NAMED_ALONE = ("frequency", "electrode", "pattern")
+"""Kinds of conditions that are named without values: all of them that a recording has."""
 
 
 def findings_on(
@@ -98,12 +99,11 @@ def _left_out(
     without = int(np.count_nonzero(read & ~has_condition))
     if without == n_read:
         kind = by.partition(":")[0]
-        there = conditions_named(kind).assign(stimuli).conditions if kind in _ALONE else ()
-        listed = ", ".join(each.label for each in there[:8]) + (", ..." if len(there) > 8 else "")
+        there = conditions_named(kind).assign(stimuli).conditions if kind in _NAMED_ALONE else ()
+        known = f"; the recording has {some_of([each.label for each in there])}" if there else ""
         message = (
-            f"left out, as they belong to none of the conditions {by}: {without} of {n_read} stimuli, all of them"
-            f"{f'; the recording has {listed}' if listed else ''}: choose others (--conditions frequency, interval, "
-            "electrode or pattern)"
+            f"no stimulus of {n_read} belongs to the conditions {by}{known}: choose others (--conditions frequency, "
+            "interval, electrode or pattern)"
         )
         yield Finding("no-condition", "refuse", message, float(without))
     elif without:
@@ -273,7 +273,7 @@ def _difference(responses: Responses) -> Iterator[Finding]:
         return
     lowest, highest = min(known, key=lambda item: item[1]), max(known, key=lambda item: item[1])
     spread = highest[1] - lowest[1]
-    listed = ", ".join(f"{p:.2f} for {label}" for label, p in known[:8]) + (", ..." if len(known) > 8 else "")
+    listed = some_of([f"{p:.2f} for {label}" for label, p in known])
     reach = (
         f"with one threshold the choice moves the mean command from {2 * lowest[1] - 1:+.2f} to "
         f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
