@@ -32,17 +32,18 @@ class Record:
     """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
     paper: bool = False
     """The paper's protocol: blocks of one frequency, 100 trials of each, 15 recordings; default: what a closed
-    loop needs, frequencies mixed, 500 trials of each, 2 recordings"""
+    loop needs, frequencies mixed, 1,000 trials of each, 2 recordings"""
     sessions: int | None = None
     """How many recordings; default: 2, with --paper 15"""
-    interval_min: float | None = None
-    """Minutes from one recording to the next; default: 5; 10 for all that is presented otherwise"""
+    interval_min: float = 10.0
+    """Minutes from one recording to the next"""
     order: Literal["blocked", "mixed"] | None = None
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
     """Pulses per trial, the last one read; default: 1"""
     trials: int | None = None
-    """Presentations at each frequency; default: 500, with --paper 100, with --places corners 1000"""
+    """Presentations at each frequency; default: 1000, with --places other than corners 500, with
+    --paper 100"""
     places: str | None = None
     """corners: four places at 20 Hz, for a robot with two commands; halves, quadrants, or a file of JSON with groups of
     electrodes, [[1, 2], [3, 4]]: each at each frequency is a condition then, presented so often; default: at each
@@ -110,7 +111,7 @@ class Record:
             self._protocol() if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
             self.out,
             sessions=self._sessions,
-            interval_min=self._interval_min,
+            interval_min=self.interval_min,
             seed=self.seed,
             progress=progress,
         )
@@ -124,15 +125,6 @@ class Record:
             return self.sessions
         return 15 if self.paper else 2
 
-    @property
-    def _interval_min(self) -> float:
-        if self.interval_min is not None:
-            return self.interval_min
-        # What is presented otherwise may take longer than 5 min: half of the electrodes at each frequency does.
-        usual = not self.paper and self.protocol is None
-        asked = [getattr(self, name) for name in _PRESENTED]
-        return 5.0 if usual and set(asked) <= {None, "corners"} else 10.0
-
     def _protocol(self, patterns: int = 100) -> Protocol:
         """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
         from animat.cultures.kinds import pulse_for
@@ -142,6 +134,9 @@ class Record:
         # What a file leaves out is the paper's: it stands alone.
         paper = self.paper or self.protocol is not None
         living = TWO_COMMANDS if self.places == "corners" else CLOSED_LOOP
+        if self.places not in (None, "corners"):
+            # Of each place at each frequency: several times as many conditions.
+            living = replace(living, trials=living.trials // 2)
         usual = replace(PAPER if paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)

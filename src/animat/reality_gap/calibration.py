@@ -14,6 +14,7 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
+from animat.reality_gap.threshold_error import threshold_error
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
@@ -39,6 +40,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were made, as `Policy.fitted`.
         remembering: how a loop's responses become the history state of its simulator.
+        threshold_error: of a loop whose thresholds adapt (`animat.reality_gap.threshold_error`); 0: they are fixed.
     """
 
     simulator: NeuronSimulator
@@ -55,6 +57,7 @@ class Calibration:
     fitted: dict[str, Any]
     readouts: Readouts = ALL
     remembering: Remembering | None = None
+    threshold_error: float = 0.0
 
     @property
     def percentiles(self) -> Float64[np.ndarray, "*readouts percentiles"]:
@@ -94,6 +97,7 @@ class Calibration:
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         simulator = timeline.at(start_min)
+        before = timeline.responses[row - 1] if row else None
         # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
         memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
         # All of one shape: what runs on them is compiled once.
@@ -113,15 +117,17 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
             remembering=Remembering.of(responses, simulator),
+            threshold_error=threshold_error(responses, simulator, before),
         )
         if policy is None or policy.percentiles != "first":
             return calibration
         return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:
-        """The same with one set of percentiles in all simulators: they do not move with the responses."""
+        """The same with one set of percentiles in all simulators, for thresholds that are fixed."""
 
         def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
-        return replace(self, simulator=fixed(self.simulator), bootstraps=tuple(map(fixed, self.bootstraps)))
+        bootstraps = tuple(map(fixed, self.bootstraps))
+        return replace(self, simulator=fixed(self.simulator), bootstraps=bootstraps, threshold_error=0.0)

@@ -1,4 +1,8 @@
-"""What the recording's simulator says that policies and controls will return, and how well it can know."""
+"""What the recording's simulator says that policies and controls will return, and how well it can know.
+
+Thresholds are off in it as those of the loop will be, by one of `ROLL_OUTS` equally likely errors in each roll-out
+(`animat.reality_gap.threshold_error`).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import repeat
+from itertools import cycle, repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +23,7 @@ from animat.evaluation.rollouts import Episodes, Uniform, roll_out
 from animat.progress import Progress, Silent
 from animat.reality_gap.answered import Passes
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.threshold_error import errors_of, with_thresholds_off
 from animat.robots.host import HostRobot
 
 EPISODES = 200
@@ -91,6 +96,11 @@ def predict(
     """
     progress = progress or Silent()
     simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
+    off = cycle(errors_of(calibration.threshold_error, ROLL_OUTS).tolist())
+    simulators = [
+        replace(each, percentiles=with_thresholds_off(np.asarray(each.percentiles), error))  # type: ignore[type-var]
+        for each, error in zip(simulators, off, strict=False)
+    ]
     if isinstance(environment.robot, HostRobot):
         simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
         episodes_each = episodes_on_host(environment.robot)

@@ -173,10 +173,10 @@ def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None
 PAPER = Protocol()
 """The paper's recording."""
 
-CLOSED_LOOP = Protocol(order="mixed", trials=500)
+CLOSED_LOOP = Protocol(order="mixed", trials=1000)
 """What a closed loop needs: frequencies mixed at random, one pulse a trial, and so many of each that a simulator
 with memory finds responses with a similar history."""
 
-TWO_COMMANDS = replace(CLOSED_LOOP, places="corners", frequencies_hz=(20.0,), trials=1000)
+TWO_COMMANDS = replace(CLOSED_LOOP, places="corners", frequencies_hz=(20.0,))
 """What a closed loop with two commands needs: stimuli that differ in place alone. A culture is then stimulated as often
 whatever is chosen; of several frequencies a policy takes the fastest all the time, which no recording has shown."""
