@@ -15,8 +15,8 @@ from animat.responses.responses import Responses
 
 _EPISODE = 100
 """Trials, after which thresholds move: about as many as an episode has."""
-_LAGS = range(10, 101)
-"""Trials: what neurons remember of single trials is over by then, and an episode is not."""
+_APART = 10
+"""Trials, at least: what neurons remember of single ones is over by then."""
 _RANKS = np.linspace(0.0, 1.0, N_PERCENTILES)
 
 
@@ -25,16 +25,18 @@ def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Re
 
     The thresholds of a loop are percentiles of its newest responses. They are off by chance, and as they come late when
     the culture's responses rise or fall. To a simulator, whose percentiles are those of its own responses, neither
-    happens. So a loop's thresholds are led through the recording, trial by trial. With r the rank of a response beyond
-    what the simulator expects, and o how far thresholds are off then, the error is what r - o of trials 10 to 100 apart
-    have in common: the square root of their mean product, 0 where that is negative.
+    happens. So a loop's thresholds are led through the recording, and move after every hundred trials. With r the rank
+    of a response beyond what the simulator expects, and o how far thresholds are off then, the error is what the r - o
+    of a hundred trials have in common: the square root of the mean product of two that are ten or more apart, 0 where
+    that is negative.
 
     Args:
         responses: of the recording, in the order of time.
         simulator: made of them.
         before: the recording before it, where thresholds begin; None: with its own responses.
     """
-    if len(responses) <= 2 * _LAGS[-1]:
+    episodes = len(responses) // _EPISODE
+    if not episodes:
         return 0.0
     usable, columns = ~responses.is_burst, responses.read_hz.reshape(len(responses), -1)
     known = [np.ones(len(responses))]
@@ -42,16 +44,18 @@ def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Re
         ranked = Ranked(responses)
         known += [ranked.traces(simulator.memory), ranked.loads(simulator.memory.load_s).at]
     off = _off(responses, before or responses).reshape(len(responses), -1)
-    products = []
+    products, pairs = 0.0, 0
     for column, error in zip(columns.T, off.T, strict=True):
         beyond = ranks_among(np.sort(column[usable]), column)
         for condition in range(len(responses.conditions)):
             rows = usable & (responses.condition == condition)
             history = np.stack([each[rows] for each in known], axis=1)
             beyond[rows] -= history @ np.linalg.lstsq(history, beyond[rows], rcond=None)[0]
-        slow = np.where(usable, beyond - error, 0.0)
-        products.append(np.mean([np.mean(slow[lag:] * slow[:-lag]) for lag in _LAGS]))
-    return float(np.sqrt(max(0.0, np.mean(products))))
+        in_one = np.where(usable, beyond - error, 0.0)[: episodes * _EPISODE].reshape(episodes, _EPISODE)
+        for lag in range(_APART, _EPISODE):
+            products += float(np.sum(in_one[:, lag:] * in_one[:, :-lag]))
+            pairs += episodes * (_EPISODE - lag)
+    return float(np.sqrt(max(0.0, products / pairs)))
 
 
 def _off(responses: Responses, before: Responses) -> Float64[np.ndarray, "responses *readouts"]:
