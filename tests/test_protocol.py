@@ -45,11 +45,11 @@ def test_the_closed_loops_protocol_presents_as_often_as_a_memory_needs() -> None
     assert CLOSED_LOOP.presentation == Presentation("mixed", 1)
     (block,) = make_schedule(CLOSED_LOOP, PATTERNS, seed=1).blocks
     frequency_hz = block.stimuli.frequency_hz
-    assert [int(np.sum(frequency_hz == f)) for f in (5, 10, 20, 40, 80)] == [500] * 5
-    # Each of 100 patterns five times at each frequency.
+    assert [int(np.sum(frequency_hz == f)) for f in (5, 10, 20, 40, 80)] == [1000] * 5
+    # Each of 100 patterns ten times at each frequency.
     pairs, often = np.unique(np.stack([frequency_hz, block.stimuli.pattern]), axis=1, return_counts=True)
     assert pairs.shape == (2, 500)
-    assert set(often.tolist()) == {5}
+    assert set(often.tolist()) == {10}
 
 
 def test_five_pulses_are_of_one_frequency_and_the_last_is_read() -> None:
