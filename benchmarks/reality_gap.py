@@ -8,11 +8,11 @@
 For each virtual culture and way - the commands without options, as in the README; the paper's blocks with one pulse,
 mixed with one, mixed with five, and mixed with one, recorded five times as long and simulated with its memory, through
 one threshold and through nine - the culture is
-recorded at 0 and 10 min (without options at 0 and 5), policies are trained on that, and run in closed loop on the same
+recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same
 culture from where the last recording left it.
 Everything is kept under `--out`, one folder each; what is there already is not done again.
 
-With `--backends` each culture is opened once, recorded at 0 and 5 min as without options, and run by policies that
+With `--backends` each culture is opened once, recorded at 0 and 10 min as without options, and run by policies that
 are trained as without options: the virtual culture with so many channels, the CL1 through its SDK's simulator and the
 MaxOne through the tests' stand-in, both over the same tissue.
 """
@@ -167,9 +167,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
         with backends.opened(backend, channels, seed) as culture:
             pulse = pulse_for(backend)
             protocol = replace(CLOSED_LOOP, patterns=min(100, len(culture.patterns)), pulse=pulse)
-            series = record_series(
-                lambda: culture, protocol, attempt / "recordings", sessions=2, interval_min=5, seed=seed
-            )
+            series = record_series(lambda: culture, protocol, attempt / "recordings", sessions=2, seed=seed)
             out = str(attempt / "policies")
             iterations = ["--iterations", str(options.iterations)] if options.iterations else []
             expect(["train", robot, "--recordings", str(attempt / "recordings"), *iterations, "--out", out])
