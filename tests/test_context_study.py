@@ -13,6 +13,7 @@ import pytest
 
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, Mismatch
+from animat.progress import Silent
 from animat.report.results import ContextRow, LostRow
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
 from animat.studies.context import RanContext, plan_context_study, run_context_study
@@ -79,6 +80,19 @@ def test_robots_with_more_commands_than_two_are_refused() -> None:
     assert ContextStudy(robots=("wheels", "detour", "arm"))
     with pytest.raises(InvalidArgument, match="robots: expected ones in JAX with one or two commands, got 'gymnasium:"):
         ContextStudy(robots=("gymnasium:Pendulum-v1",))
+
+
+@pytest.mark.parametrize("n_commands", [1, 2])
+def test_a_recording_is_over_when_the_next_one_is_due(
+    n_commands: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def looked_for(*_: object) -> None:
+        raise NotImplementedError("earlier recordings")
+
+    monkeypatch.setattr("animat.cultures.series._expect_lived", looked_for)
+    # Recordings that take too long are refused before earlier ones are looked for.
+    with pytest.raises(NotImplementedError, match="earlier recordings"):
+        RecordCulture(1, n_commands).run(tmp_path, Silent())
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -188,13 +188,14 @@ def run_policies(
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
         findings += (Finding("no-optimum", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
+    # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
+    predicting = calibration if adaptive else calibration.with_percentiles(simulator.percentiles)
     predicted = predict(
         trained,
         tuple(policies),
         controls,
         environment,
-        # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
-        calibration if adaptive else calibration.with_percentiles(calibration.simulator.percentiles),
+        predicting,
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
@@ -247,6 +248,7 @@ def run_policies(
         loop.mapping.name,
         loop,
         calibration.start_min,
+        predicting.threshold_error,
         best,
         rows,
         session,

@@ -100,7 +100,7 @@ class ContextTask(Task):
 @final
 @dataclass(frozen=True)
 class RecordCulture(ContextTask):
-    """Record the culture twice, five minutes apart, for robots with so many commands."""
+    """Record the culture twice, ten minutes apart, for robots with so many commands."""
 
     n_commands: int = 1
 
@@ -114,7 +114,6 @@ class RecordCulture(ContextTask):
             presented_for(self.n_commands),
             out,
             sessions=2,
-            interval_min=5.0,
             progress=progress,
         ).files
         return [*files, out / STATE_FILE, out / SELECTION_FILE]
