@@ -194,7 +194,7 @@ def patch() -> Iterator[pytest.MonkeyPatch]:
 def crowd_at(
     kind: str, number: int, threads: int, seed: int, delivered: int, patch: pytest.MonkeyPatch, *, too_soon: int = 0
 ) -> None:
-    """A crowd that asks so often, and again until more than so many requests were delivered, and refused as too soon.
+    """A crowd that asks again until more than `delivered` requests were delivered and `too_soon` refused as too soon.
 
     How many are depends on whose turn it is when the culture is stopped and opened anew.
     """

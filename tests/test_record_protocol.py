@@ -99,7 +99,7 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
     assert main(["record", "--paper", "--out", str(tmp_path / "out")]) == 0
     mixed = Protocol(order="mixed", trials=1000)
     # What a file leaves out is the paper's.
-    assert asked == [Protocol((5, 20), setup_s=0), replace(mixed, pulses=5), mixed, Protocol()]
+    assert asked == [Protocol((5, 20), setup_s=0), replace(mixed, pulses=5, trials=200), mixed, Protocol()]
 
 
 @pytest.mark.parametrize("culture", ["virtual", "replay"])
@@ -166,7 +166,16 @@ def test_pulses_faster_than_the_response_window_are_warned_of(
 
 @pytest.mark.parametrize(
     ("options", "trials"),
-    [({}, 1000), ({"places": "corners"}, 1000), ({"places": "halves"}, 500), ({"paper": True}, 100)],
+    [
+        ({}, 1000),
+        ({"pulses": 5}, 200),
+        ({"places": "corners"}, 1000),
+        ({"places": "halves"}, 500),
+        ({"places": "quadrants", "pulses": 3}, 83),
+        ({"order": "blocked"}, 1000),
+        ({"paper": True}, 100),
+        ({"paper": True, "pulses": 5}, 100),
+    ],
 )
 def test_what_is_recorded_without_options_takes_less_than_the_interval(options: dict[str, Any], trials: int) -> None:
     record = Record(**options)

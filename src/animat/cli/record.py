@@ -42,8 +42,8 @@ class Record:
     pulses: int | None = None
     """Pulses per trial, the last one read; default: 1"""
     trials: int | None = None
-    """Presentations at each frequency; default: 1000, with --places other than corners 500, with
-    --paper 100"""
+    """Presentations at each frequency, and at each place of --places; default: 1000, of several pulses or places (but
+    corners) as many fewer, with --paper 100"""
     places: str | None = None
     """corners: four places at 20 Hz, for a robot with two commands; halves, quadrants, or a file of JSON with groups of
     electrodes, [[1, 2], [3, 4]]: each at each frequency is a condition then, presented so often; default: at each
@@ -134,15 +134,17 @@ class Record:
         # What a file leaves out is the paper's: it stands alone.
         paper = self.paper or self.protocol is not None
         living = TWO_COMMANDS if self.places == "corners" else CLOSED_LOOP
-        if self.places not in (None, "corners"):
-            # Of each place at each frequency: several times as many conditions.
-            living = replace(living, trials=living.trials // 2)
         usual = replace(PAPER if paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
         asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
         asked["places"] = None if self.places is None else read_places(self.places)
-        return replace(usual, **{name: value for name, value in asked.items() if value is not None})
+        protocol = replace(usual, **{name: value for name, value in asked.items() if value is not None})
+        if self.trials is not None or self.paper:
+            return protocol
+        # Of several pulses, or of more conditions, fewer: a recording takes as long, and is over when the next is due.
+        times = protocol.pulses * (1 if self.places == "corners" else max(1, protocol.n_places))
+        return replace(protocol, trials=max(1, protocol.trials // times))
 
 
 def _expect_no_others(folder: Path) -> None:

@@ -31,6 +31,8 @@ OnLate = Literal["continue", "stop"]
 
 MOST_WARM_UP = 100
 """Presentations of each condition in a warm-up: as many as a recording holds; more wears a culture out for nothing."""
+SETTLINGS = 10
+"""How many pauses the settling has, where thresholds adapt and an action is one pulse."""
 SETTLING_ROUNDS = 6
 """Presentations of each condition after each pause of the settling: with five of them 2.3 s, next to a pause of 2 s."""
 
@@ -66,7 +68,7 @@ class Loop:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
         settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode. A recording
             tires a culture more than a loop does. The culture recovers in the first minute, and thresholds lag behind.
-            None: 10 where thresholds adapt and an action is one pulse, else 0.
+            None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
@@ -125,7 +127,9 @@ class Loop:
         if self.warm_up is None:
             object.__setattr__(self, "warm_up", 2 if self.pulses == 1 else 0)
         if self.settling is None:
-            object.__setattr__(self, "settling", 10 if self.pulses == 1 and self.adaptive_from is not None else 0)
+            object.__setattr__(
+                self, "settling", SETTLINGS if self.pulses == 1 and self.adaptive_from is not None else 0
+            )
         for name in ("warm_up", "settling"):
             if not (isinstance(number := getattr(self, name), int) and 0 <= number <= MOST_WARM_UP):
                 raise InvalidArgument(f"{name}: expected a whole number from 0 to {MOST_WARM_UP}, got {number!r}")

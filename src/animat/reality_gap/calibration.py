@@ -40,7 +40,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were made, as `Policy.fitted`.
         remembering: how a loop's responses become the history state of its simulator.
-        threshold_error: of a loop whose thresholds adapt (`animat.reality_gap.threshold_error`); 0: they are fixed.
+        threshold_error: of a loop whose thresholds adapt (`animat.reality_gap.threshold_error`).
     """
 
     simulator: NeuronSimulator
@@ -97,7 +97,6 @@ class Calibration:
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         simulator = timeline.at(start_min)
-        before = timeline.responses[row - 1] if row else None
         # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
         memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
         # All of one shape: what runs on them is compiled once.
@@ -117,17 +116,16 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
             remembering=Remembering.of(responses, simulator),
-            threshold_error=threshold_error(responses, simulator, before),
+            threshold_error=threshold_error(responses, simulator, timeline.responses[row - 1] if row else None),
         )
         if policy is None or policy.percentiles != "first":
             return calibration
         return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:
-        """The same with one set of percentiles in all simulators, for thresholds that are fixed."""
+        """The same with one set of percentiles in all simulators: they do not move with the responses."""
 
         def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
-        bootstraps = tuple(map(fixed, self.bootstraps))
-        return replace(self, simulator=fixed(self.simulator), bootstraps=bootstraps, threshold_error=0.0)
+        return replace(self, simulator=fixed(self.simulator), bootstraps=tuple(map(fixed, self.bootstraps)))

@@ -29,7 +29,7 @@ class RealityGap:
 
     Attributes:
         calibrated_at_min: of the recording that predicted.
-        threshold_error: that predictions were made with, in ranks (`animat.reality_gap.threshold_error`).
+        threshold_error: that predictions were made with, a share of responses (`animat.reality_gap.threshold_error`).
         optimum: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
@@ -139,7 +139,9 @@ class RealityGap:
         interval = "its 95 % interval"
         head = ["", "predicted", interval, "measured", "gap", interval, *(MEANS if objectives else ()), "episodes"]
         head += ["pulses/action", "electrode pulses", *(("predicted net", "net") if cost else ()), "p value", "meaning"]
-        off = f", with thresholds off by {100 * self.threshold_error:.1f} % of the responses" * (self.threshold_error > 0)
+        off = ""
+        if self.threshold_error:
+            off = f", with thresholds off by {100 * self.threshold_error:.1f} percentile points (standard deviation)"
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
             f"{self.calibrated_at_min:g} min{off}",
