@@ -118,6 +118,8 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 40)
     monkeypatch.setattr("animat.reality_gap.calibration.threshold_error", lambda *_: 0.05)
     gap, policies = run(tmp_path, series)
+    assert gap.to_dict()["threshold_error"] == 0.05
+    assert "with thresholds off by 5.0 percentile points (standard deviation)" in gap.to_text()
     rows = {row.name: row for row in gap.rows}
     constants = [f"constant {hz} Hz" for hz in (5, 10, 20, 40, 80)]
     assert list(rows) == ["policies", "p0", "p1", "random", *constants, "silent", "shuffled", "heuristic"]
@@ -454,8 +456,27 @@ def test_simulators_of_bootstrapped_responses_have_the_recordings_shape(kind: Ki
 
 
 def test_no_two_roll_outs_have_the_same_draws() -> None:
-    seeds = [roll_out_seed(seed, group, on) for seed in (1, 2, 2**32 - 1) for group in range(10) for on in range(105)]
+    seeds = [roll_out_seed(seed, group, on) for seed in (1, 2, 2**32 - 1) for group in range(10) for on in range(525)]
     assert len(set(seeds)) == len(seeds) and 0 <= min(seeds) <= max(seeds) < 2**32
+
+
+@pytest.mark.usefixtures("few_bootstraps")
+@pytest.mark.parametrize(("adaptive", "mapping", "error"), [(True, 1, 0.05), (False, 1, 0.0), (True, None, 0.0)])
+def test_only_adaptive_thresholds_are_off(
+    adaptive: bool,
+    mapping: int | None,
+    error: float,
+    series: list[Responses],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("animat.reality_gap.calibration.threshold_error", lambda *_: 0.05)
+    policies = {"p0": policy_of(0, series, mapping=Linear() if mapping is None else Thresholds(mapping))}
+    with FakeCulture() as culture:
+        calibration = Calibration.of_series(series)
+        gap = run_policies(policies, culture, calibration, tmp_path, episodes=1, with_controls=False, adaptive=adaptive)
+    assert gap.threshold_error == error
+    assert ("thresholds off by" in gap.to_text()) == (error > 0)
 
 
 @pytest.mark.long
