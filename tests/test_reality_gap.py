@@ -40,7 +40,7 @@ from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
-from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
+from animat.reality_gap.predicting import ERRORS, EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
@@ -143,7 +143,8 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     calibration = Calibration.of_series(series)
     environment = Animat(policies["p0"].robot, Thresholds(1), 5)
     both = networks_of(list(policies.values()), greedy=True)
-    simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.bootstraps]
+    # Each meets each of five errors.
+    simulators = [calibration.simulator] * ROLL_OUTS + [each for each in calibration.bootstraps for _ in range(5)]
     off, tenths = norm.ppf([0.1, 0.3, 0.5, 0.7, 0.9]), np.linspace(0, 1, 11)
     off *= 0.05 / off.std()
     for i, each in enumerate(simulators):
@@ -154,7 +155,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
         for i, simulator in enumerate(simulators)
     ]
     predicted = np.concatenate([each.returns for each in rolled[:ROLL_OUTS]], axis=1)
-    anew = np.array([each.returns.mean(axis=1) for each in rolled[ROLL_OUTS:]])
+    anew = np.array([each.returns.mean(axis=1) for each in rolled[ROLL_OUTS:]]).reshape(-1, 5, 2).mean(axis=1)
     for i, name in enumerate(policies):
         np.testing.assert_array_equal(rows[name].predicted, predicted[i])
         np.testing.assert_allclose(rows[name].predicted_anew, anew[:, i])
@@ -510,7 +511,10 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
             gap.rows[0],
             predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),
             predicted_anew=np.array(
-                [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.bootstraps)]
+                [
+                    returns(each, ERRORS * EPISODES, 10_000 + seed + i).mean()
+                    for i, each in enumerate(calibration.bootstraps)
+                ]
             ),
             measured=returns(living, 40, 1000 + seed),
         )
