@@ -40,7 +40,7 @@ from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
 from animat.reality_gap.answered import answered
-from animat.reality_gap.predicting import ERRORS, EPISODES, ROLL_OUTS, roll_out_seed
+from animat.reality_gap.predicting import EPISODES, ERRORS, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
