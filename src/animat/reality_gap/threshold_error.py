@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Float64
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
@@ -52,7 +53,7 @@ def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Re
         return 0.0
     those = slice(settled, settled + hundreds * _EPISODE)
     usable = (~responses.is_burst)[those].reshape(hundreds, _EPISODE)
-    off = _off(responses, before, settled, hundreds)
+    off = _off(responses, simulator, before, settled, hundreds)
     products, pairs = 0.0, 0
     for readout, beyond in enumerate(_beyond(responses, simulator).T):
         common = np.where(usable, beyond[those].reshape(hundreds, _EPISODE) - off[:, None, readout], 0.0)
@@ -80,26 +81,31 @@ def _beyond(responses: Responses, simulator: NeuronSimulator) -> Float64[np.ndar
 
 
 def _off(
-    responses: Responses, before: Responses, settled: int, hundreds: int
+    responses: Responses, simulator: NeuronSimulator, before: Responses, settled: int, hundreds: int
 ) -> Float64[np.ndarray, "hundreds readouts"]:
-    """How much too high adaptive thresholds are in each hundred, in ranks: the mean over P10 to P90."""
+    """How much too high adaptive thresholds are in each hundred, in ranks: the mean over P10 to P90.
+
+    Beside the simulator's, so that ties are ties in both.
+    """
     usable, read_hz = ~responses.is_burst, responses.read_hz
     adaptive = AdaptiveThresholds([before.read_of(i) for i in range(len(before.conditions))])
     own_hz = np.sort(read_hz[usable], axis=0).reshape(int(usable.sum()), -1).T
+    right = _ranks(own_hz, simulator.percentiles)
     off, done = [], 0
     for hundred in range(hundreds):
         for trial in range(done, done := settled + hundred * _EPISODE):
             if usable[trial]:
                 adaptive.add(int(responses.condition[trial]), read_hz[trial])
-        now = np.atleast_2d(np.asarray(adaptive.percentiles(), np.float64))
-        off.append([_too_high(own, of) for own, of in zip(own_hz, now, strict=True)])
+        off.append((_ranks(own_hz, adaptive.percentiles()) - right)[:, 1:-1].mean(axis=1))
     return np.array(off)
 
 
-def _too_high(own_hz: Float64[np.ndarray, " sorted"], percentiles: Float64[np.ndarray, " percentiles"]) -> float:
-    """The mean difference in rank between P10 to P90 and the recording's own; ties are ties in both."""
-    right = np.percentile(own_hz, 100 * _RANKS).astype(np.float32).astype(np.float64)
-    return float(np.mean((ranks_among(own_hz, percentiles) - ranks_among(own_hz, right))[1:-1]))
+def _ranks(
+    own_hz: Float64[np.ndarray, "readouts responses"], percentiles: ArrayLike
+) -> Float64[np.ndarray, "readouts percentiles"]:
+    """The ranks of percentiles among a recording's own responses, which are sorted."""
+    each = zip(own_hz, np.atleast_2d(np.asarray(percentiles, np.float64)), strict=True)
+    return np.array([ranks_among(own, of) for own, of in each])
 
 
 def errors_of(error: float, number: int) -> Float64[np.ndarray, " number"]:
