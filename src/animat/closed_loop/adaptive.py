@@ -1,44 +1,56 @@
-"""Adaptive thresholds: the percentiles of the culture's newest responses, not of a past hour."""
+"""Adaptive thresholds: the percentiles of a culture as it is now, not of a past hour."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float32, Float64
+from scipy.special import ndtr, ndtri
 
 from animat.coding.mapping import N_PERCENTILES
+from animat.neurons.expected_rank import ExpectedRank
 
-MOST_COUNTED = 100
-"""Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones adapt late."""
+COUNTED = 100
+"""Of a condition: as many as the paper's recording holds."""
+_SHARES = np.linspace(0.0, 1.0, N_PERCENTILES)
 
 
 class AdaptiveThresholds:
-    """The newest responses of each condition, and the percentiles of all of them together.
+    """Percentiles of a recording, moved by how far the culture's newest responses are above the expected rank.
 
     A culture drifts and tires: minutes after a recording its responses to all conditions are smaller, and more of them
-    stay under the recording's median. So each new response takes the place of the oldest one of its condition. Every
-    condition keeps the share that it has in the recording, however often it is chosen: percentiles are of what a
-    recording would hold now, and not of what a policy likes to choose.
+    stay under the recording's median. Let d_c be how far responses to a condition are above the rank that is expected
+    after the same history, a running mean over about `COUNTED` of them, and d the mean of all d_c. Every condition
+    counts the same, however often it is chosen. Then the percentile of the share k is
+
+        P_k = Q(Phi(Phi^-1(k) + sqrt(2) Phi^-1(1/2 + d))),
+
+    with the recording's quantiles Q and the normal distribution Phi. This is what P_k becomes when the responses, on a
+    scale on which they are normal, all move by as much, and their mean rank is then 1/2 + d. With d = 0.05 the median
+    is at the recording's P57, with d = -0.05 at P43.
 
     Args:
-        responses_hz: non-burst responses of each condition, in the order of time, shape (responses,), or (responses,
-            readouts). Where a condition has more than `MOST_COUNTED`, the newest count, of all conditions the same
-            part.
+        expected: of the recording that thresholds start from.
     """
 
-    def __init__(self, responses_hz: Sequence[Float64[np.ndarray, "responses *readouts"]]) -> None:
-        part = min(1.0, MOST_COUNTED / max(len(each) for each in responses_hz))
-        self._newest = [deque(each, maxlen=max(1, round(part * len(each)))) for each in responses_hz]
-        self.seen = 0
+    def __init__(self, expected: ExpectedRank) -> None:
+        self.expected = expected
+        self._above = np.zeros_like(expected.levels)
+        self._counts = np.zeros(len(expected.levels))
 
-    def add(self, condition: int, rate_hz: Float64[np.ndarray, "*readouts"]) -> None:
-        """A new non-burst response to a condition, of all readouts."""
-        self._newest[condition].append(rate_hz)
-        self.seen += 1
+    @property
+    def seen(self) -> int:
+        """How many responses were added."""
+        return int(self._counts.sum())
+
+    def add(self, condition: int, beyond: Float64[np.ndarray, " readouts"]) -> None:
+        """How far above the expected rank a new non-burst response is (`ExpectedRank.beyond`), of each readout."""
+        self._counts[condition] += 1
+        self._above[condition] += (beyond - self._above[condition]) / min(self._counts[condition], COUNTED)
 
     def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
-        """P0, P10, ..., P100 of all together, in Hz, shape (11,), or (readouts, 11)."""
-        pooled = np.concatenate([np.array(each) for each in self._newest])
-        return np.asarray(np.percentile(pooled, np.linspace(0, 100, N_PERCENTILES), axis=0).T, np.float32)
+        """P0, P10, ..., P100 of the culture now, in Hz, shape (11,), or (readouts, 11)."""
+        by = np.sqrt(2) * ndtri(0.5 + self._above.mean(axis=0))
+        shares = ndtr(ndtri(_SHARES) + by[:, None])
+        each = zip(np.atleast_2d(self.expected.sorted_hz), shares, strict=True)
+        moved = [np.quantile(own_hz, share) for own_hz, share in each]
+        return np.asarray(moved, np.float32).reshape(*self.expected.sorted_hz.shape[:-1], N_PERCENTILES)

@@ -27,6 +27,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.errors import AnimatError, BudgetSpent
 from animat.neurons.remembering import Remembered
+from animat.responses.extraction import SILENCE_S
 from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
@@ -83,6 +84,8 @@ class Driver:
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
+        adaptive_from = loop.adaptive_from
+        self._remembering = loop.remembering or (None if adaptive_from is None else adaptive_from.remembering)
         self._remembered = Remembered()
         self._given: dict[str, list[int]] = {}
         """What was delivered in the last whole episode of each agent."""
@@ -250,15 +253,15 @@ class Driver:
             **read.told,
         }
         self._presented += 1
+        if self._remembering is not None and stimuli:
+            is_rested = pulse_time_s[0] - self._remembered.at_s > SILENCE_S
+            came = self._remembering.when(self._remembered, float(after_s[0]), is_rested=bool(is_rested))
+            x, is_burst = read.told["rate_hz"], read.is_burst
+            self._remembered = self._remembering.after(came, delivered, x, is_burst=is_burst)
+            if self._adaptive is not None and (agent.calibrates or is_warm_up) and not is_burst:
+                self._adaptive.add(delivered, self._adaptive.expected.beyond(came, delivered, np.asarray(read.x_hz)))
         if loop.remembering is not None:
-            if stimuli:
-                first_s, at_s, x = float(pulse_time_s[0]), float(after_s[0]), read.told["rate_hz"]
-                self._remembered = loop.remembering.after(
-                    self._remembered, delivered, x, first_s, at_s, is_burst=read.is_burst
-                )
             tick["neurons"] = loop.remembering.observed(self._remembered)
-        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
-            self._adaptive.add(delivered, read.x_hz)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
         try:

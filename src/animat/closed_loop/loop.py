@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 from numpy.typing import ArrayLike
 
 from animat.coding.decoder import Decoder, expect_fit
@@ -16,6 +16,7 @@ from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.goals.robot import body_and_goal
+from animat.neurons.expected_rank import ExpectedRank
 from animat.neurons.remembering import Remembering
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
@@ -51,8 +52,8 @@ class Loop:
         conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,); of several readouts
             (readouts, 11).
-        adaptive_from: non-burst responses of each condition in that recording, Hz, in the order of time, which adaptive
-            thresholds start from (see `animat.closed_loop.adaptive`). None: thresholds are fixed.
+        adaptive_from: what is expected of responses by that recording, whose percentiles adaptive thresholds start from
+            (see `animat.closed_loop.adaptive`). None: thresholds are fixed.
         pulses: of a trial.
         window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
@@ -84,7 +85,7 @@ class Loop:
     mapping: Mapping
     conditions: tuple[Condition, ...]
     percentiles: Float32[np.ndarray, "*readouts percentiles"] = field(repr=False)
-    adaptive_from: tuple[Float64[np.ndarray, "responses *readouts"], ...] | None = field(default=None, repr=False)
+    adaptive_from: ExpectedRank | None = field(default=None, repr=False)
     pulses: int = 1
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
     burst_threshold: float = 1.0
@@ -114,13 +115,12 @@ class Loop:
         check_window(self.window_ms)
         _ = self.presentation
         _ = self.encoder
-        if self.adaptive_from is not None and (
-            len(self.adaptive_from) != len(self.conditions) or not all(len(x) for x in self.adaptive_from)
-        ):
-            raise InvalidArgument(
-                f"adaptive_from: expected some responses of each of {len(self.conditions)} conditions, got "
-                f"{[len(x) for x in self.adaptive_from]}"
-            )
+        if self.adaptive_from is not None:
+            of_it, of_loop = self.adaptive_from.levels.shape, (len(self.conditions), len(self.readouts))
+            if of_it != of_loop:
+                raise InvalidArgument(
+                    "adaptive_from: expected {} conditions and {} readouts, got {} and {}".format(*of_loop, *of_it)
+                )
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by, ranks_among
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
-from animat.responses.extraction import SILENCE_S
+from animat.responses.conditions import NO_CONDITION
 from animat.responses.responses import Responses
 
 
@@ -48,24 +48,33 @@ class Remembering:
             memory, added = simulator.memory, float(simulator.added)
         return cls(memory, added, ranked.sorted_hz, ranked.means)
 
-    def after(
-        self, before: Remembered, condition: int, rate_hz: float, first_s: float, at_s: float, *, is_burst: bool
-    ) -> Remembered:
-        """The state after a trial.
+    def when(self, before: Remembered, at_s: float, *, is_rested: bool) -> Remembered:
+        """The state when a trial comes.
 
         Args:
             before: the state after the trial before it; `Remembered()` after silence.
+            at_s: the pulse that it is read after, s.
+            is_rested: whether there was no pulse in the second before it.
+        """
+        load_s = self.memory.load_s
+        load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
+        return Remembered(0.0 if is_rested else before.trace, float(load), float(at_s))
+
+    def after(self, came: Remembered, condition: int, rate_hz: float, *, is_burst: bool) -> Remembered:
+        """The state after a trial.
+
+        Args:
+            came: the state when it came.
+            condition: of the trial; `NO_CONDITION` where it has none.
             rate_hz: the response of all channels, Hz a channel.
-            first_s, at_s: its first and its last pulse, s.
             is_burst: whether the response was a burst, after which nothing is known of the trace.
         """
-        trace = 0.0 if first_s - before.at_s > SILENCE_S else before.trace
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
-        (more,) = left_by(rank, float(self.mean_ranks[condition]), self.memory).tolist()
-        trace = 0.5 if is_burst else self.memory.decay * trace + more
-        load_s = self.memory.load_s
-        load = before.load * np.exp((before.at_s - at_s) / load_s) + self.added if load_s else before.load
-        return Remembered(float(trace), float(load), at_s)
+        # Of what has no condition of its own the middle one's is as good as any.
+        mean = 0.5 if condition == NO_CONDITION else float(self.mean_ranks[condition])
+        (more,) = left_by(rank, mean, self.memory).tolist()
+        trace = 0.5 if is_burst else self.memory.decay * came.trace + more
+        return Remembered(float(trace), came.load + self.added, came.at_s)
 
     def observed(self, state: Remembered) -> tuple[float, float]:
         """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""

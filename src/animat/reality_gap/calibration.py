@@ -9,9 +9,9 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float64
 
+from animat.neurons.expected_rank import ExpectedRank
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
 from animat.reality_gap.threshold_error import threshold_error
@@ -39,7 +39,7 @@ class Calibration:
         drift: of the recordings up to it; None where one recording tells none.
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were made, as `Policy.fitted`.
-        remembering: how a loop's responses become the history state of its simulator.
+        expected: what is expected of a loop's responses, and how they become the history state of its simulator.
         threshold_error: of a loop whose thresholds adapt (`animat.reality_gap.threshold_error`).
     """
 
@@ -55,8 +55,8 @@ class Calibration:
     presentation: Presentation | None
     findings: tuple[Finding, ...]
     fitted: dict[str, Any]
+    expected: ExpectedRank
     readouts: Readouts = ALL
-    remembering: Remembering | None = None
     threshold_error: float = 0.0
 
     @property
@@ -101,6 +101,9 @@ class Calibration:
         memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
         # All of one shape: what runs on them is compiled once.
         fit |= {"memory": memory, "room": room_for(series)}
+        expected, before = ExpectedRank.of(responses, simulator), None
+        if row:
+            before = ExpectedRank.of(timeline.responses[row - 1], timeline.at(float(timeline.start_min[row - 1])))
         calibration = cls(
             simulator=simulator,
             bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
@@ -115,8 +118,8 @@ class Calibration:
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
-            remembering=Remembering.of(responses, simulator),
-            threshold_error=threshold_error(responses, simulator, timeline.responses[row - 1] if row else None),
+            expected=expected,
+            threshold_error=threshold_error(responses, simulator.percentiles, expected, before),
         )
         if policy is None or policy.percentiles != "first":
             return calibration

@@ -115,11 +115,11 @@ def run_policies(
     check_conditions(first, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if adaptive:
-        settings["adaptive_from"] = calibration.responses_hz
+        settings["adaptive_from"] = calibration.expected
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
     if first.neural_observation:
-        settings["remembering"] = calibration.remembering
+        settings["remembering"] = calibration.expected.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":

@@ -10,9 +10,8 @@ from scipy.special import ndtri
 from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.loop import SETTLING_ROUNDS, SETTLINGS
 from animat.coding.mapping import N_PERCENTILES
-from animat.neurons.history import NO_MEMORY, Ranked, ranks_among
-from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.history import ranks_among
 from animat.responses.responses import Responses
 
 _EPISODE = 100
@@ -24,14 +23,16 @@ _FEWEST = 20
 _RANKS = np.linspace(0.0, 1.0, N_PERCENTILES)
 
 
-def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Responses | None) -> float:
+def threshold_error(
+    responses: Responses, percentiles: ArrayLike, expected: ExpectedRank, before: ExpectedRank | None
+) -> float:
     """What the errors of a loop's adaptive thresholds have in common: its standard deviation, as a share of responses.
 
-    The thresholds of a loop are percentiles of its newest responses. They are off by chance, and they come late when
-    the culture's responses rise or fall. In a simulator they are never off. So a recording is taken for a loop:
-    adaptive thresholds begin with the newest responses of the recording before it, settle for as many trials as a loop
-    does, and then move after every hundred trials. Let r be the rank of a response beyond what the simulator expects,
-    from 0 to 1, and o the mean of how much too high P10 to P90 are at that time, in ranks. Then
+    The thresholds of a loop follow its newest responses. They are off by chance, and they come late when the culture's
+    responses rise or fall. In a simulator they are never off. So a recording is taken for a loop: adaptive thresholds
+    begin with those of the recording before it, settle for as many trials as a loop does, and then move after every
+    hundred trials. Let r be how far a response is above the expected rank, and o the mean of how much too high P10 to
+    P90 are at that time, in ranks. Then
 
         error^2 = mean of (r_i - o_i) (r_j - o_j)
 
@@ -40,8 +41,9 @@ def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Re
 
     Args:
         responses: of the recording, in the order of time.
-        simulator: made of them.
-        before: the recording before it; None where there is none.
+        percentiles: P0, P10, ..., P100 of its simulator, in Hz, shape (11,), or (readouts, 11).
+        expected: of them.
+        before: of the recording before it; None where there is none.
 
     Returns:
         From 0 to 1; of several readouts the root of their mean square. 0 too where it cannot be known: of the first
@@ -53,9 +55,9 @@ def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Re
         return 0.0
     those = slice(settled, settled + hundreds * _EPISODE)
     usable = (~responses.is_burst)[those].reshape(hundreds, _EPISODE)
-    off = _off(responses, simulator, before, settled, hundreds)
+    off = _off(responses, percentiles, before, settled, hundreds)
     products, pairs = 0.0, 0
-    for readout, beyond in enumerate(_beyond(responses, simulator).T):
+    for readout, beyond in enumerate(expected.along(responses).T):
         common = np.where(usable, beyond[those].reshape(hundreds, _EPISODE) - off[:, None, readout], 0.0)
         for lag in range(_APART, _EPISODE):
             products += float(np.sum(common[:, lag:] * common[:, :-lag]))
@@ -63,39 +65,22 @@ def threshold_error(responses: Responses, simulator: NeuronSimulator, before: Re
     return float(np.sqrt(max(0.0, products / max(pairs, 1))))
 
 
-def _beyond(responses: Responses, simulator: NeuronSimulator) -> Float64[np.ndarray, "responses readouts"]:
-    """The ranks of responses, less the mean of the condition, and less what trace and load explain to the simulator."""
-    known = [np.ones(len(responses))]
-    if isinstance(simulator, MemorySimulator) and simulator.memory != NO_MEMORY:
-        ranked = Ranked(responses)
-        known += [ranked.traces(simulator.memory), ranked.loads(simulator.memory.load_s).at]
-    usable, beyond = ~responses.is_burst, []
-    for column in responses.read_hz.reshape(len(responses), -1).T:
-        rank = ranks_among(np.sort(column[usable]), column)
-        for condition in range(len(responses.conditions)):
-            rows = usable & (responses.condition == condition)
-            history = np.stack([each[rows] for each in known], axis=1)
-            rank[rows] -= history @ np.linalg.lstsq(history, rank[rows], rcond=None)[0]
-        beyond.append(rank)
-    return np.stack(beyond, axis=1)
-
-
 def _off(
-    responses: Responses, simulator: NeuronSimulator, before: Responses, settled: int, hundreds: int
+    responses: Responses, percentiles: ArrayLike, before: ExpectedRank, settled: int, hundreds: int
 ) -> Float64[np.ndarray, "hundreds readouts"]:
     """How much too high adaptive thresholds are in each hundred, in ranks: the mean over P10 to P90.
 
     Beside the simulator's, so that ties are ties in both.
     """
-    usable, read_hz = ~responses.is_burst, responses.read_hz
-    adaptive = AdaptiveThresholds([before.read_of(i) for i in range(len(before.conditions))])
-    own_hz = np.sort(read_hz[usable], axis=0).reshape(int(usable.sum()), -1).T
-    right = _ranks(own_hz, simulator.percentiles)
+    usable, beyond = ~responses.is_burst, before.along(responses)
+    adaptive = AdaptiveThresholds(before)
+    own_hz = np.sort(responses.read_hz[usable], axis=0).reshape(int(usable.sum()), -1).T
+    right = _ranks(own_hz, percentiles)
     off, done = [], 0
     for hundred in range(hundreds):
         for trial in range(done, done := settled + hundred * _EPISODE):
             if usable[trial]:
-                adaptive.add(int(responses.condition[trial]), read_hz[trial])
+                adaptive.add(int(responses.condition[trial]), beyond[trial])
         off.append((_ranks(own_hz, adaptive.percentiles()) - right)[:, 1:-1].mean(axis=1))
     return np.array(off)
 
