@@ -19,7 +19,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import (
     ActorController,
     Agent,
@@ -39,11 +38,12 @@ from animat.closed_loop.timing import ahead_of_other_programs, among_other_progr
 from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
-from animat.cultures.observed import Observed, Spikes
 from animat.environment import Animat
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.statistics import Interval
+from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByFrequency
@@ -402,26 +402,8 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
     assert len(list(session.ticks)) == 15
 
 
-def test_the_warm_up_counts_for_adaptive_thresholds(tmp_path: Path) -> None:
-    reference = tuple(np.zeros(3) for _ in HZ)
-    loop = loop_of(warm_up=3, adaptive_from=reference)
-    one = Agent("constant", "", OneCondition(0), calibrates=False)
-    with FakeCulture() as culture:
-        session = run_session(culture, loop, [one], tmp_path, episodes=1)
-    warming = [tick.rate_hz for tick in session.ticks if tick.handled == "warm-up"]
-    told = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
-    assert len(warming) == 15
-    assert max(warming) > 0
-    # Three of each condition: all that was recorded has given way.
-    np.testing.assert_array_equal(told, [np.percentile(warming, np.linspace(0, 100, 11)).astype(np.float32)])
-    acted = [tick for tick in session.ticks if tick.handled != "warm-up"]
-    assert all(
-        tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), np.float32(told[0]))) for tick in acted
-    )
-
-
-def test_thresholds_settle_before_the_first_episode(tmp_path: Path) -> None:
-    loop = loop_of(settling=3, warm_up=1, pause_s=0.5, adaptive_from=tuple(np.zeros(15) for _ in HZ))
+def test_a_culture_settles_before_the_first_episode(tmp_path: Path) -> None:
+    loop = loop_of(settling=3, warm_up=1, pause_s=0.5)
     # Silence comes first: what settles is given all the same.
     silent = Agent("silent", "", OneCondition(0), "silent")
     with FakeCulture() as culture:
@@ -437,9 +419,6 @@ def test_thresholds_settle_before_the_first_episode(tmp_path: Path) -> None:
     at_s = np.reshape([tick.pulse_time_s[0] for tick in settling], (3, 30))
     rests_s = at_s[:, 0] - np.array([0.0, *at_s[:-1, -1]]) - [1 / HZ[c] for c in delivered[::6, 0]]
     assert np.all((rests_s > 0.499) & (rests_s < 0.53))
-    told = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
-    newest = [[t.rate_hz for t in settling if t.delivered == condition][-15:] for condition in range(5)]
-    np.testing.assert_array_equal(told[0], np.percentile(newest, np.linspace(0, 100, 11)).astype(np.float32))
     assert len([tick for tick in session.ticks if tick.handled == "warm-up" and tick.episode == 1]) == 5
     assert_read_alike(tmp_path, loop)
     outline = Outline()
@@ -447,20 +426,6 @@ def test_thresholds_settle_before_the_first_episode(tmp_path: Path) -> None:
         outline.add(record.words)
     assert (
         outline.moved_at_s == next(tick.wall_s for tick in session.ticks if tick.iteration == 0) > settling[-1].wall_s
-    )
-
-
-def test_thresholds_settle_by_the_culture_s_own_responses(tmp_path: Path) -> None:
-    loop = loop_of(settling=1, adaptive_from=tuple(np.zeros(6) for _ in HZ))
-    drawing = Agent("random spikes", "", AnyCondition(5), "silent", drawn_from=np.array([999.0]))
-    with FakeCulture() as culture:
-        session = run_session(culture, loop, [drawing], tmp_path, episodes=1)
-    settling = [tick for tick in session.ticks if tick.handled == "warm-up"]
-    acted = [tick.rate_hz for tick in session.ticks if tick.handled == "used"]
-    assert len(settling) == 30 and max(tick.rate_hz for tick in settling) < 999 and set(acted) == {999.0}
-    (told,) = [r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]
-    np.testing.assert_array_equal(
-        told, np.percentile([t.rate_hz for t in settling], np.linspace(0, 100, 11)).astype(np.float32)
     )
 
 
@@ -472,8 +437,10 @@ def test_what_is_told_of_a_session_before_its_first_move() -> None:
 
 
 def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
-    recorded = tuple(np.zeros(3) for _ in HZ)
-    assert [loop_of(pulses=n, adaptive_from=recorded, settling=None).settling for n in (1, 2)] == [10, 0]
+    with FakeCulture() as culture:
+        recorded = extract_responses(culture.record(Protocol(order="mixed", patterns=8, trials=4, setup_s=0.1)))
+    expected = ExpectedRank.of(recorded, fit_empirical(recorded))
+    assert [loop_of(pulses=n, adaptive_from=expected, settling=None).settling for n in (1, 2)] == [10, 0]
     assert loop_of(settling=None).settling == 0
     assert loop_of(pulses=2, settling=1).settling == 1
 
@@ -692,85 +659,3 @@ def test_a_budget_is_kept_to_the_pulse() -> None:
     with pytest.raises(InvalidArgument, match="pulses"):
         Budget(pulses=-1)
     assert replace(Budget(), pulses=3) == Budget(3)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.data())
-def test_thresholds_adapt_to_the_newest_of_each_condition_and_of_nothing_else(data: st.DataObject) -> None:
-    # Where a condition has more than a hundred, the newest count, of every condition the same part.
-    sizes = data.draw(st.lists(st.integers(1, 6) | st.integers(98, 130), min_size=1, max_size=4))
-    rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
-    history = [rng.gamma(5.0, 2.0, n).tolist() for n in sizes]
-    adaptive = AdaptiveThresholds([np.array(each) for each in history])
-    for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
-        x = float(rng.gamma(5.0, 1.0))
-        history[condition].append(x)
-        adaptive.add(condition, x)
-    part = min(1, 100 / max(sizes))
-    pooled = np.concatenate([each[-max(1, round(part * n)) :] for each, n in zip(history, sizes, strict=True)])
-    expected = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
-    np.testing.assert_array_equal(adaptive.percentiles(), expected)
-
-
-def test_in_a_session_percentiles_move_between_episodes_only(tmp_path: Path) -> None:
-    reference = tuple(np.full(4, 100.0) for _ in HZ)
-    loop = loop_of(adaptive_from=reference, mapping=Linear(), burst_threshold=0.95)
-    agents = [
-        RANDOM,
-        Agent("always", "", OneCondition(4), calibrates=False),
-        Agent("no", "", OneCondition(4), "silent"),
-    ]
-    with FakeCulture() as culture:
-        session = run_session(culture, loop, agents, tmp_path, episodes=6)
-    in_force = {record.words["episode"]: record.words["percentiles_hz"] for record in session.log.records
-                if record.words["kind"] == "percentiles"}  # fmt: skip
-    history = [list(each) for each in reference]
-    percentiles = loop.percentiles
-    for tick in session.ticks:
-        if tick.iteration == 0 and any(len(each) > 4 for each in history):
-            pooled = np.concatenate([each[-4:] for each in history])
-            percentiles = np.percentile(pooled, range(0, 101, 10)).astype(np.float32)
-            np.testing.assert_array_equal(np.float32(in_force[tick.episode]), percentiles)
-        assert tick.command == float(loop.mapping.command(np.float32(tick.rate_hz), percentiles))
-        if tick.agent == "random" and not tick.is_burst:
-            history[tick.delivered].append(tick.rate_hz)
-    assert sum(len(each) for each in history) > 20 + 20
-    assert_read_alike(tmp_path, loop)
-    for wrong in (reference[:3], (*reference[:4], np.empty(0))):
-        with pytest.raises(InvalidArgument, match="adaptive_from"):
-            loop_of(adaptive_from=wrong)
-
-
-class Tiring(FakeCulture):
-    """Its responses to all conditions fade: halved in ten minutes."""
-
-    def _deliver(self, admitted: Any, duration_s: float) -> Observed:
-        observed = super()._deliver(admitted, duration_s)
-        kept = np.random.default_rng(self.deliveries).random(len(observed.spikes.time_s)) < 2 ** (-self.now_s / 600)
-        return replace(observed, spikes=Spikes(observed.spikes.time_s[kept], observed.spikes.channel[kept]))
-
-
-def test_adaptive_thresholds_keep_half_of_the_responses_above_the_median_of_a_culture_that_tires(
-    tmp_path: Path,
-) -> None:
-    above: dict[str, float] = {}
-    protocol = Protocol(order="mixed", patterns=8, trials=40, setup_s=0.1)
-    for how in ("fixed", "adaptive"):
-        with Tiring() as culture:
-            responses = extract_responses(culture.record(protocol), burst_threshold=0.95)
-            percentiles = np.percentile(responses.non_burst_rate_hz, range(0, 101, 10))
-            reference = tuple(responses.rates_of(i) for i in range(5)) if how == "adaptive" else None
-            culture.rest(600.0)
-            loop = loop_of(
-                robot=Navigation(episode_limit=25),
-                mapping=Thresholds(1),
-                percentiles=percentiles,
-                adaptive_from=reference,
-                burst_threshold=0.95,
-            )
-            session = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=16)
-        # The last quarter of the session.
-        above[how] = float(np.mean([tick.command == 1.0 for tick in list(session.ticks)[-100:]]))
-    # Half of a binomial of 100: standard deviation 0.05. Ties at the median count as above it.
-    assert above["fixed"] < 0.25
-    assert 0.38 < above["adaptive"] < 0.72

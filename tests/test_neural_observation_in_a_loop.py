@@ -61,25 +61,19 @@ def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, r
     state = Remembered()
     for row, at_s in enumerate(presented.time_s.tolist()):
         # The load falls up to the trial; what a policy sees is that after the trial before it.
-        assert state.load * np.exp((state.at_s - at_s) / MEMORY.load_s) == pytest.approx(loads.every[row])
-        if not presented.is_rested[row]:
-            assert state.trace == pytest.approx(traces[row])
+        came = remembering.when(state, at_s, is_rested=bool(presented.is_rested[row]))
+        assert (came.trace, came.load, came.at_s) == pytest.approx((traces[row], loads.every[row], at_s))
         state = remembering.after(
-            state,
-            int(presented.condition[row]),
-            float(presented.rate_hz[row]),
-            at_s,
-            at_s,
-            is_burst=bool(presented.is_burst[row]),
+            came, int(presented.condition[row]), float(presented.rate_hz[row]), is_burst=bool(presented.is_burst[row])
         )
 
 
 def test_without_memory_it_is_what_simulators_without_memory_show(responses: Responses) -> None:
     blank = Remembering.of(responses, fit_simulator(responses, kind="histogram", bins=20, range_hz=None))
-    state = blank.after(Remembered(), 2, 30.0, 1.0, 1.0, is_burst=False)
+    state = blank.after(Remembered(), 2, 30.0, is_burst=False)
     assert blank.observed(state) == blank.observed(Remembered()) == (0.5, 0.5)
     no_load = Remembering.of(responses, fit_memory(responses, memory=MEMORY._replace(load_s=0.0)))
-    assert no_load.observed(no_load.after(Remembered(), 2, 30.0, 1.0, 1.0, is_burst=False))[1] == 0.5
+    assert no_load.observed(no_load.after(Remembered(), 2, 30.0, is_burst=False))[1] == 0.5
 
 
 class Watching:

@@ -31,6 +31,7 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.evaluation.heuristic import Heuristic, HeuristicPolicy
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
+from animat.neurons.expected_rank import ExpectedRank
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.answered import answered
@@ -82,13 +83,12 @@ def numbers(values: Sequence[str]) -> list[float]:
 
 def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: SimulatorTimeline, tmp_path: Path) -> None:
     responses = timeline.responses[0]
-    recorded_hz = tuple(responses.read_of(i) for i in range(5))
     loop = Loop(
         Wheels(episode_limit=8),
         Thresholds(9),
         timeline.conditions,
         np.asarray(timeline.at(0.0).percentiles),
-        adaptive_from=recorded_hz,
+        adaptive_from=ExpectedRank.of(responses, timeline.at(0.0)),
         burst_threshold=0.95,
         warm_up=1,
         readouts=timeline.readouts,

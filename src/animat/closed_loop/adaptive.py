@@ -8,49 +8,61 @@ from scipy.special import ndtr, ndtri
 
 from animat.coding.mapping import N_PERCENTILES
 from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.remembering import Remembered
+from animat.responses.extraction import SILENCE_S
 
+import os
+FAST = int(os.environ.get("CNT", "10"))
+SLOW = int(os.environ.get("SLOW", "100"))
+SLOPE = 2 * np.sqrt(np.pi)
 COUNTED = 100
 """Of a condition: as many as the paper's recording holds."""
-_SHARES = np.linspace(0.0, 1.0, N_PERCENTILES)
+_SCORES = ndtri(np.linspace(0.0, 1.0, N_PERCENTILES))
+_BETWEEN = (0.01, 0.99)
+"""The mean rank of a culture that answers nothing any more, or everything, would move thresholds without end."""
 
 
 class AdaptiveThresholds:
-    """Percentiles of a recording, moved by how far the culture's newest responses are above the expected rank.
-
-    A culture drifts and tires: minutes after a recording its responses to all conditions are smaller, and more of them
-    stay under the recording's median. Let d_c be how far responses to a condition are above the rank that is expected
-    after the same history, a running mean over about `COUNTED` of them, and d the mean of all d_c. Every condition
-    counts the same, however often it is chosen. Then the percentile of the share k is
-
-        P_k = Q(Phi(Phi^-1(k) + sqrt(2) Phi^-1(1/2 + d))),
-
-    with the recording's quantiles Q and the normal distribution Phi. This is what P_k becomes when the responses, on a
-    scale on which they are normal, all move by as much, and their mean rank is then 1/2 + d. With d = 0.05 the median
-    is at the recording's P57, with d = -0.05 at P43.
-
-    Args:
-        expected: of the recording that thresholds start from.
-    """
-
     def __init__(self, expected: ExpectedRank) -> None:
-        self.expected = expected
-        self._above = np.zeros_like(expected.levels)
-        self._counts = np.zeros(len(expected.levels))
+        self._expected = expected
+        n_conditions, n_readouts = expected.levels.shape
+        self._counts = np.zeros(n_conditions)
+        self._drift = np.zeros(n_readouts)
+        self._above = np.zeros((n_conditions, n_readouts))
+        self._remembered = Remembered()
 
     @property
     def seen(self) -> int:
-        """How many responses were added."""
         return int(self._counts.sum())
 
-    def add(self, condition: int, beyond: Float64[np.ndarray, " readouts"]) -> None:
-        """How far above the expected rank a new non-burst response is (`ExpectedRank.beyond`), of each readout."""
-        self._counts[condition] += 1
-        self._above[condition] += (beyond - self._above[condition]) / min(self._counts[condition], COUNTED)
+    def take_in(self, condition, read_hz, rate_hz, first_s, at_s, *, is_burst, counts) -> None:
+        expected, remembering = self._expected, self._expected.remembering
+        is_rested = first_s - self._remembered.at_s > SILENCE_S
+        came = remembering.when(self._remembered, at_s, is_rested=bool(is_rested))
+        if counts and not is_burst:
+            rank = _moved(expected.rank(np.asarray(read_hz)), -self._drift)
+            beyond = rank - expected.at(came, condition)
+            self._counts[condition] += 1
+            n = self._counts[condition]
+            self._above[condition] += (beyond - self._above[condition]) / min(n, FAST)
+            self._drift += SLOPE * beyond / (len(self._counts) * min(n, SLOW))
+        of_all = _moved(remembering.rank(rate_hz), -self._drift.mean())
+        self._remembered = remembering.after(came, condition, float(of_all), is_burst=is_burst)
 
     def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
         """P0, P10, ..., P100 of the culture now, in Hz, shape (11,), or (readouts, 11)."""
-        by = np.sqrt(2) * ndtri(0.5 + self._above.mean(axis=0))
-        shares = ndtr(ndtri(_SHARES) + by[:, None])
-        each = zip(np.atleast_2d(self.expected.sorted_hz), shares, strict=True)
-        moved = [np.quantile(own_hz, share) for own_hz, share in each]
-        return np.asarray(moved, np.float32).reshape(*self.expected.sorted_hz.shape[:-1], N_PERCENTILES)
+        mean_rank = np.clip(0.5 + self._above.mean(axis=0), *_BETWEEN)
+        shares = ndtr(_SCORES + (self._drift + np.sqrt(2) * ndtri(mean_rank))[:, None])
+        sorted_hz = self._expected.sorted_hz
+        # Between two responses it is a straight line, as `np.quantile` has it, which would sort them again.
+        below, part = np.divmod(shares * (sorted_hz.shape[-1] - 1), 1.0)
+        low_hz, high_hz = (
+            np.take_along_axis(np.atleast_2d(sorted_hz), np.minimum(at, sorted_hz.shape[-1] - 1).astype(int), axis=1)
+            for at in (below, below + 1)
+        )
+        moved_hz = low_hz + part * (high_hz - low_hz)
+        return np.asarray(moved_hz, np.float32).reshape(*sorted_hz.shape[:-1], N_PERCENTILES)
+
+
+def _moved(rank, by):
+    return ndtr(ndtri(np.clip(rank, 1e-4, 1 - 1e-4)) + by)

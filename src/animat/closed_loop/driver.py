@@ -84,8 +84,6 @@ class Driver:
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
-        adaptive_from = loop.adaptive_from
-        self._remembering = loop.remembering or (None if adaptive_from is None else adaptive_from.remembering)
         self._remembered = Remembered()
         self._given: dict[str, list[int]] = {}
         """What was delivered in the last whole episode of each agent."""
@@ -128,11 +126,6 @@ class Driver:
         self._last_command = self._at_rest
         for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
             self._warm_up(agent, episode, rounds)
-        if self._adaptive is not None and self._adaptive.seen:
-            # Between episodes only: within one the robot's world stays as it is, and its first tick alone pays for it.
-            self._percentiles = self._adaptive.percentiles()
-            told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
-            self.records.append(Record(told))
         self.standing.begin(agent.name)
         given, remembering = list[int](), loop.remembering if agent.sees_neurons(turn) else None
         source = self._source_of(agent)
@@ -253,14 +246,13 @@ class Driver:
             **read.told,
         }
         self._presented += 1
-        if self._remembering is not None and stimuli:
-            is_rested = pulse_time_s[0] - self._remembered.at_s > SILENCE_S
-            came = self._remembering.when(self._remembered, float(after_s[0]), is_rested=bool(is_rested))
-            x, is_burst = read.told["rate_hz"], read.is_burst
-            self._remembered = self._remembering.after(came, delivered, x, is_burst=is_burst)
-            if self._adaptive is not None and (agent.calibrates or is_warm_up) and not is_burst:
-                self._adaptive.add(delivered, self._adaptive.expected.beyond(came, delivered, np.asarray(read.x_hz)))
+        first_s, at_s, x = pulse_time_s[0], float(after_s[0]), read.told["rate_hz"]
         if loop.remembering is not None:
+            if stimuli:
+                is_rested = bool(first_s - self._remembered.at_s > SILENCE_S)
+                came = loop.remembering.when(self._remembered, at_s, is_rested=is_rested)
+                rank = loop.remembering.rank(x)
+                self._remembered = loop.remembering.after(came, delivered, rank, is_burst=read.is_burst)
             tick["neurons"] = loop.remembering.observed(self._remembered)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
@@ -274,6 +266,13 @@ class Driver:
             finished = Tick(**tick)
             self.records.append(seen_in(stretch, stimuli, vars(finished)))
             self._unmoved = None
+        if self._adaptive is not None and stimuli:
+            counts = agent.calibrates or is_warm_up
+            self._adaptive.take_in(delivered, read.x_hz, x, first_s, at_s, is_burst=read.is_burst, counts=counts)
+            if counts and not read.is_burst:
+                self._percentiles = self._adaptive.percentiles()
+                told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
+                self.records.append(Record(told))
         return finished, again
 
     def _move(

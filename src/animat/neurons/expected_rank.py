@@ -48,18 +48,18 @@ class ExpectedRank:
         found = np.linalg.lstsq(given, _ranks(sorted_hz, responses.read_hz[usable]), rcond=None)[0]
         return cls(remembering, sorted_hz, found[:n_conditions], found[n_conditions:])
 
-    def beyond(
-        self, came: Remembered, condition: int, read_hz: Float64[np.ndarray, "*readouts"]
-    ) -> Float64[np.ndarray, " readouts"]:
-        """How far above the expected rank a response is.
+    def rank(self, read_hz: Float64[np.ndarray, "*readouts"]) -> Float64[np.ndarray, " readouts"]:
+        """The rank of a response, of each readout."""
+        return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0])
+
+    def at(self, came: Remembered, condition: int) -> Float64[np.ndarray, " readouts"]:
+        """What is expected of a response.
 
         Args:
             came: the history state when the trial came (`Remembering.when`).
             condition: of the trial.
-            read_hz: x of each readout, Hz.
         """
-        expected = self.levels[condition] + np.array([came.trace, came.load]) @ self.slopes
-        return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - expected)
+        return np.asarray(self.levels[condition] + np.array([came.trace, came.load]) @ self.slopes)
 
     def along(self, responses: Responses) -> Float64[np.ndarray, "responses readouts"]:
         """How far above the expected rank each response of any recording of the same conditions is, burst or not."""
@@ -84,7 +84,7 @@ def _states(remembering: Remembering, responses: Responses) -> Float64[np.ndarra
     for trial, (condition, rate_hz, is_burst, is_rested, at_s) in enumerate(trials):
         came = remembering.when(state, at_s, is_rested=is_rested)
         states[trial] = came.trace, came.load
-        state = remembering.after(came, condition, rate_hz, is_burst=is_burst)
+        state = remembering.after(came, condition, remembering.rank(rate_hz), is_burst=is_burst)
     if presented.time_s is None:
         states[:, 1] = AT_FIRST[1]
     return np.asarray(states[place])

@@ -14,7 +14,6 @@ from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
-from animat.reality_gap.threshold_error import threshold_error
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
@@ -40,7 +39,6 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were made, as `Policy.fitted`.
         expected: what is expected of a loop's responses, and how they become the history state of its simulator.
-        threshold_error: of a loop whose thresholds adapt (`animat.reality_gap.threshold_error`).
     """
 
     simulator: NeuronSimulator
@@ -57,7 +55,6 @@ class Calibration:
     fitted: dict[str, Any]
     expected: ExpectedRank
     readouts: Readouts = ALL
-    threshold_error: float = 0.0
 
     @property
     def percentiles(self) -> Float64[np.ndarray, "*readouts percentiles"]:
@@ -92,8 +89,7 @@ class Calibration:
             first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
             trained_until = None if policy is None else policy.trained_until_min(first_min)
             at_min = last_min if policy is None else first_min if trained_until is None else trained_until
-        row = timeline.row_asked_for(at_min)
-        start_min = float(timeline.start_min[row])
+        start_min = float(timeline.start_min[timeline.row_asked_for(at_min)])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         simulator = timeline.at(start_min)
@@ -101,9 +97,6 @@ class Calibration:
         memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
         # All of one shape: what runs on them is compiled once.
         fit |= {"memory": memory, "room": room_for(series)}
-        expected, before = ExpectedRank.of(responses, simulator), None
-        if row:
-            before = ExpectedRank.of(timeline.responses[row - 1], timeline.at(float(timeline.start_min[row - 1])))
         calibration = cls(
             simulator=simulator,
             bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
@@ -118,8 +111,7 @@ class Calibration:
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
-            expected=expected,
-            threshold_error=threshold_error(responses, simulator.percentiles, expected, before),
+            expected=ExpectedRank.of(responses, simulator),
         )
         if policy is None or policy.percentiles != "first":
             return calibration

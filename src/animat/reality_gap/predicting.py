@@ -19,15 +19,12 @@ from animat.evaluation.rollouts import Episodes, Uniform, roll_out
 from animat.progress import Progress, Silent
 from animat.reality_gap.answered import Passes
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.threshold_error import errors_of, with_thresholds_off
 from animat.robots.host import HostRobot
 
-ERRORS = 5
-"""Of thresholds, equally likely (`animat.reality_gap.threshold_error`): one in each roll-out."""
-EPISODES = 40
+EPISODES = 200
 """Of each policy and control in one roll-out."""
-ROLL_OUTS = 25
-"""On the recording's simulator, five with each error; one with each on each simulator of bootstrapped responses."""
+ROLL_OUTS = 5
+"""On the recording's simulator; one on each simulator of bootstrapped responses."""
 
 BOOTSTRAPS_ON_HOST = 40
 """Fewer for a robot that is stepped on the host, where an episode takes a thousand times as long."""
@@ -39,7 +36,7 @@ class Predicted(NamedTuple):
     Attributes:
         returns: of its episodes on the simulator of the recording, shape (episodes,).
         anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
-            as the recording's responses and, a little, as `ERRORS` times `EPISODES` do.
+            as the recording's responses and, a little, as 200 episodes do.
         passes: in all its episodes on the simulator of the recording, shape (conditions,).
         passes_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
     """
@@ -76,7 +73,6 @@ def predict(
     environment: Environment[Any],
     calibration: Calibration,
     *,
-    threshold_error: float = 0.0,
     seed: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, Predicted]:
@@ -87,7 +83,6 @@ def predict(
         names: of each of them.
         controls: beside them.
         environment: robot and mapping, and what policies see besides.
-        threshold_error: how far thresholds are off, as a share of responses (`animat.reality_gap.threshold_error`).
         seed: decides every random draw.
         progress: told after the policies and each control.
 
@@ -95,15 +90,10 @@ def predict(
         By the name of the policy or control.
     """
     progress = progress or Silent()
-    bootstraps, episodes_each = calibration.bootstraps, EPISODES
+    simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
     if isinstance(environment.robot, HostRobot):
-        bootstraps, episodes_each = bootstraps[:BOOTSTRAPS_ON_HOST], episodes_on_host(environment.robot)
-    errors = errors_of(threshold_error, ERRORS)
-    simulators = [
-        replace(each, percentiles=with_thresholds_off(np.asarray(each.percentiles), error))  # type: ignore[type-var]
-        for each in (*[calibration.simulator] * (ROLL_OUTS // ERRORS), *bootstraps)
-        for error in errors.tolist()
-    ]
+        simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
+        episodes_each = episodes_on_host(environment.robot)
     acting = [policies, *map(_by_anybody, controls)]
 
     def rolled(number: int, on: int) -> Episodes:
@@ -130,16 +120,16 @@ def predict(
                 each = Passes(*(counts[:, of] for counts in passes)).summed(1)
                 found[name] = Predicted(
                     returns[:ROLL_OUTS, of].ravel(),
-                    returns[ROLL_OUTS:, of].reshape(len(bootstraps), -1).mean(axis=1),
+                    returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
                     Passes(*(counts[:ROLL_OUTS] for counts in each)).summed(0),
-                    Passes(*(c[ROLL_OUTS:].reshape(len(bootstraps), ERRORS, *c.shape[1:]) for c in each)).summed(1),
+                    Passes(*(counts[ROLL_OUTS:] for counts in each)),
                 )
     return found
 
 
 def episodes_on_host(robot: HostRobot) -> int:
-    """Of each policy in one roll-out: four, or fewer of more than 200 iterations, but one at least."""
-    return max(1, min(4, 800 // robot.episode_limit))
+    """Of each policy on each simulator: twenty, or fewer of more than 200 iterations, but four at least."""
+    return max(4, min(20, 4_000 // robot.episode_limit))
 
 
 def roll_out_seed(seed: int, group: int, on: int) -> int:

@@ -17,7 +17,6 @@ from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.coding.electrode_pulses import electrode_pulses
-from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
@@ -189,8 +188,6 @@ def run_policies(
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     if why_not is not None:
         findings += (Finding("no-optimum", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
-    # Only these thresholds stand between percentiles of which the error is known.
-    off = calibration.threshold_error if adaptive and isinstance(loop.mapping, Thresholds) else 0.0
     predicted = predict(
         trained,
         tuple(policies),
@@ -198,7 +195,6 @@ def run_policies(
         environment,
         # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
         calibration if adaptive else calibration.with_percentiles(simulator.percentiles),
-        threshold_error=off,
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
@@ -251,7 +247,6 @@ def run_policies(
         loop.mapping.name,
         loop,
         calibration.start_min,
-        off,
         best,
         rows,
         session,

@@ -29,7 +29,6 @@ class RealityGap:
 
     Attributes:
         calibrated_at_min: of the recording that predicted.
-        threshold_error: that predictions were made with, a share of responses (`animat.reality_gap.threshold_error`).
         optimum: the optimal return on that recording's simulator, of any controller (`animat.evaluation.optimum`);
             None where conditions have too few responses to tell.
         rows: all policies together first, then each of them where there are several, then the controls.
@@ -44,7 +43,6 @@ class RealityGap:
     mapping: str
     loop: Loop
     calibrated_at_min: float
-    threshold_error: float
     optimum: float | None
     rows: tuple[Row, ...]
     session: Session
@@ -99,7 +97,6 @@ class RealityGap:
             "mapping": self.mapping,
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
-            "threshold_error": self.threshold_error,
             "optimum": self.optimum,
             "pulse_cost": self.rows[0].pulse_cost,
             "gap_share": self.gap_share,
@@ -139,12 +136,9 @@ class RealityGap:
         interval = "its 95 % interval"
         head = ["", "predicted", interval, "measured", "gap", interval, *(MEANS if objectives else ()), "episodes"]
         head += ["pulses/action", "electrode pulses", *(("predicted net", "net") if cost else ()), "p value", "meaning"]
-        off = ""
-        if self.threshold_error:
-            off = f", with thresholds off by {100 * self.threshold_error:.1f} percentile points (standard deviation)"
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
-            f"{self.calibrated_at_min:g} min{off}",
+            f"{self.calibrated_at_min:g} min",
             *lined_up(head, cells),
         ]
         if self.rows[0].met:
