@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm, percentileofscore
 
-from animat.closed_loop.adaptive import COUNTED, AdaptiveThresholds
+from animat.closed_loop.adaptive import LATEST, NEWEST, AdaptiveThresholds
 from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import InvalidArgument
-from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Memory, Ranked
 from animat.neurons.memory import fit_memory
 from animat.neurons.remembering import Remembered
@@ -48,104 +48,135 @@ def recorded() -> Responses:
 
 
 @pytest.fixture(scope="module")
-def expected(recorded: Responses) -> ExpectedRank:
-    return ExpectedRank.of(recorded, fit_empirical(recorded))
+def adjusted(recorded: Responses) -> AdjustedRanks:
+    return AdjustedRanks.of(recorded, fit_empirical(recorded))
 
 
-def moved(recorded_hz: list[np.ndarray], answered: list[tuple[int, float]]) -> np.ndarray:
-    """P0 to P100, computed again with SciPy's ranks and NumPy's quantiles: of conditions that remember nothing."""
-    pooled = np.concatenate(recorded_hz)
-    d = []
+def thresholds_after(recorded_hz: list[np.ndarray], answered: list[tuple[int, float]]) -> np.ndarray:
+    """P0 to P100, computed again with SciPy's ranks, lists and NumPy's quantiles, where nothing is remembered."""
+    everything = np.concatenate(recorded_hz)
+
+    def mean_rank(values: list[float]) -> float:
+        return float(np.mean([percentileofscore(everything, x, kind="mean") for x in values]) / 100)
+
+    part = min(1, NEWEST / max(map(len, recorded_hz)))
+    pooled, above = list[float](), []
     for condition, own in enumerate(recorded_hz):
-        mean_rank = np.mean([percentileofscore(pooled, x, kind="mean") for x in own]) / 100
-        above = 0.0
-        for n, x in enumerate([x for c, x in answered if c == condition], 1):
-            above += (percentileofscore(pooled, x, kind="mean") / 100 - mean_rank - above) / min(n, COUNTED)
-        d.append(above)
-    shares = norm.cdf(norm.ppf(np.linspace(0, 1, 11)) + np.sqrt(2) * norm.ppf(0.5 + np.mean(d)))
-    return np.quantile(pooled, shares).astype(np.float32)
+        kept = max(1, round(part * len(own)))
+        latest = mean_rank(own[-kept:].tolist())
+        new = [x for c, x in answered if c == condition]
+        for x in new:
+            latest = (1 - 1 / LATEST) * latest + mean_rank([x]) / LATEST
+        newest = [*own.tolist(), *new][-kept:]
+        pooled += newest
+        above.append(latest - mean_rank(newest))
+    by = np.sqrt(2) * norm.ppf(np.clip(0.5 + np.mean(above), 0.01, 0.99))
+    return np.quantile(pooled, norm.cdf(norm.ppf(np.linspace(0, 1, 11)) + by)).astype(np.float32)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_thresholds_move_with_the_newest_of_each_condition_and_with_nothing_else(data: st.DataObject) -> None:
+def test_thresholds_follow_the_newest_of_each_condition_and_nothing_else(data: st.DataObject) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
-    sizes = data.draw(st.lists(st.integers(2, 6) | st.integers(98, 130), min_size=1, max_size=4))
+    # Where a condition has more than a hundred, the newest count, of every condition the same part.
+    sizes = data.draw(st.lists(st.integers(1, 6) | st.integers(98, 130), min_size=1, max_size=4))
     recorded_hz = [rng.gamma(5.0, 2.0, n).round(data.draw(st.integers(0, 2))) for n in sizes]
     responses = responses_of(np.repeat(np.arange(len(sizes)), sizes), np.concatenate(recorded_hz))
-    expected = ExpectedRank.of(responses, fit_empirical(responses))
-    thresholds, answered = AdaptiveThresholds(expected), list[tuple[int, float]]()
-    for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=4 * COUNTED)):
+    thresholds = AdaptiveThresholds(AdjustedRanks.of(responses, fit_empirical(responses)))
+    answered = list[tuple[int, float]]()
+    for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
         answered.append((condition, float(rng.gamma(5.0, 1.0))))
-        thresholds.add(condition, expected.beyond(Remembered(), condition, np.array(answered[-1][1])))
-    assert thresholds.seen == len(answered)
-    np.testing.assert_allclose(thresholds.percentiles(), moved(recorded_hz, answered), rtol=1e-5, atol=1e-6)
+        thresholds.add(condition, Remembered(), np.array(answered[-1][1]))
+    np.testing.assert_allclose(thresholds.percentiles(), thresholds_after(recorded_hz, answered), rtol=1e-5)
 
 
-@pytest.mark.parametrize("by", [-2.0, -0.4, 0.0, 0.1, 1.0])
+@pytest.mark.parametrize("by", [-1.5, -0.4, 0.0, 0.1, 1.0])
 def test_when_all_responses_move_on_a_normal_scale_thresholds_move_with_them(by: float) -> None:
-    # Of x normal and y normal that is `by` larger on average, P(x < y) = Phi(by / sqrt(2)).
-    sample = norm.ppf((np.arange(20_000) + 0.5) / 20_000)
-    responses = responses_of(np.tile([0, 1], 10_000), np.exp(sample))
-    expected = ExpectedRank.of(responses, fit_empirical(responses))
-    thresholds = AdaptiveThresholds(expected)
-    for condition in (0, 1):
-        thresholds.add(condition, np.array([norm.cdf(by / np.sqrt(2)) - 0.5]))
-    tenths = np.linspace(0.1, 0.9, 9)
-    np.testing.assert_allclose(np.log(thresholds.percentiles()[1:-1]), norm.ppf(tenths) + by, atol=0.01)
+    rng = np.random.default_rng(2)
+    condition, sample = np.tile([0, 1], 50_000), rng.normal(size=100_000)
+    recorded = responses_of(condition, np.exp(sample))
+    adjusted = AdjustedRanks.of(recorded, fit_empirical(recorded))
+    found = []
+    for each in np.array_split(rng.normal(size=40_000) + by, 200):
+        # Of each condition a hundred of before, then a hundred of now, which count for more than those do.
+        thresholds = AdaptiveThresholds(adjusted)
+        latest = np.array([thresholds.percentiles()])
+        for turn, x in enumerate(np.exp(each)):
+            thresholds.add(turn % 2, Remembered(), np.array(x))
+            latest = np.array([thresholds.percentiles()])
+        found.append(np.log(latest[0, 5]))
+    # Of Gaussian x and of y that is `by` larger on average, P(x < y) = Phi(by / sqrt(2)).
+    assert np.mean(found) == pytest.approx(by, abs=0.06)
 
 
-def test_a_culture_that_answers_nothing_any_more_leaves_thresholds_that_are_numbers(expected: ExpectedRank) -> None:
-    for x in (-1.0, 1e6):
-        thresholds = AdaptiveThresholds(expected)
+def test_the_latest_responses_move_the_thresholds_at_once(adjusted: AdjustedRanks) -> None:
+    thresholds, high_hz = AdaptiveThresholds(adjusted), float(adjusted.sorted_hz[-20])
+    before_hz = thresholds.percentiles()[5]
+    for _ in range(3):
         for condition in range(5):
-            thresholds.add(condition, expected.beyond(Remembered(), condition, np.array(x)))
+            thresholds.add(condition, Remembered(), np.array(high_hz))
+    # By 3 of 100 newest responses of each condition the median would hardly move.
+    share = float(np.mean(adjusted.sorted_hz < thresholds.percentiles()[5]))
+    assert share > 0.7 and thresholds.percentiles()[5] > before_hz
+    for x in (-1.0, 1e6):
+        for condition in range(5):
+            for _ in range(200):
+                thresholds.add(condition, Remembered(), np.array(x))
         percentiles = thresholds.percentiles()
         assert np.all(np.isfinite(percentiles)) and np.all(np.diff(percentiles) >= 0)
 
 
-def test_what_is_expected_leaves_nothing_of_condition_trace_and_load(recorded: Responses) -> None:
+def test_an_adjusted_rank_has_nothing_left_of_trace_and_load(recorded: Responses) -> None:
     # The normal equations: what least squares leave is orthogonal to all that was given.
-    expected = ExpectedRank.of(recorded, fit_memory(recorded, memory=MEMORY))
-    (beyond,) = expected.along(recorded).T
-    ranked, usable = Ranked(recorded), ~recorded.is_burst
-    given = [*np.eye(5)[recorded.condition].T, ranked.traces(MEMORY), ranked.loads(MEMORY.load_s).at]
-    assert np.all(expected.slopes != 0)
-    np.testing.assert_allclose([np.sum((each * beyond)[usable]) for each in given], 0.0, atol=1e-9)
-    rank = np.array([percentileofscore(expected.sorted_hz, x, kind="mean") for x in recorded.rate_hz]) / 100
-    np.testing.assert_allclose(
-        beyond, rank - expected.levels[recorded.condition, 0] - np.stack(given[5:], axis=1) @ expected.slopes[:, 0]
-    )
+    adjusted, ranked = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY)), Ranked(recorded)
+    history = np.stack([ranked.traces(MEMORY), ranked.loads(MEMORY.load_s).at], axis=1)
+    assert np.all(adjusted.slopes != 0)
+    for_history = np.zeros(2)
+    for condition, (own_hz, ranks) in enumerate(zip(adjusted.responses_hz, adjusted.ranks, strict=True)):
+        rows = ~recorded.is_burst & (recorded.condition == condition)
+        np.testing.assert_array_equal(own_hz, recorded.rate_hz[rows])
+        rank = np.array([percentileofscore(adjusted.sorted_hz, x, kind="mean") for x in own_hz]) / 100
+        np.testing.assert_allclose(ranks, rank[:, None] - history[rows] @ adjusted.slopes)
+        for_history += history[rows].T @ (ranks[:, 0] - ranks.mean())
+    np.testing.assert_allclose(for_history, 0.0, atol=1e-6)
 
 
-def test_trial_by_trial_a_loop_finds_what_is_found_along_a_recording(recorded: Responses) -> None:
-    expected = ExpectedRank.of(recorded, fit_memory(recorded, memory=MEMORY))
+def test_without_memory_an_adjusted_rank_is_the_rank(adjusted: AdjustedRanks) -> None:
+    np.testing.assert_array_equal(adjusted.slopes, 0.0)
+    came = Remembered(trace=0.9, load=2.0)
+    assert adjusted.of_response(came, np.array(adjusted.sorted_hz[-1] + 1)) == pytest.approx(1.0)
+
+
+def test_trial_by_trial_a_loop_finds_the_adjusted_ranks_of_the_recording(recorded: Responses) -> None:
+    adjusted = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY))
     presented, place = recorded.presentations
     assert presented.time_s is not None
-    state, found, remembering = Remembered(), [], expected.remembering
+    state, found, remembering = Remembered(), [], adjusted.remembering
     for condition, x, is_burst, is_rested, at_s in zip(
         presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, presented.time_s, strict=True
     ):
         came = remembering.when(state, at_s, is_rested=is_rested)
-        found.append(expected.beyond(came, condition, np.array(x)))
+        found.append(adjusted.of_response(came, np.array(x)))
         state = remembering.after(came, condition, x, is_burst=is_burst)
-    np.testing.assert_allclose(expected.along(recorded), np.array(found)[place])
+    for condition, ranks in enumerate(adjusted.ranks):
+        rows = ~recorded.is_burst & (recorded.condition == condition)
+        np.testing.assert_allclose(ranks, np.array(found)[place][rows])
 
 
-def test_two_readouts_move_each_by_its_own() -> None:
+def test_two_readouts_adapt_each_by_its_own() -> None:
     rng = np.random.default_rng(3)
     recorded = responses_of(np.tile([0, 1], 200), rng.gamma(5.0, 2.0, 400))
     of_each = [recorded, replace(recorded, rate_hz=rng.gamma(3.0, 2.0, 400))]
     both_hz = np.stack([each.rate_hz for each in of_each], axis=1)
     both = replace(recorded, readouts=Readouts(("a", "b"), ((1,), (2,))), readout_hz=both_hz)
-    together = AdaptiveThresholds(ExpectedRank.of(both, fit_empirical(both)))
-    alone = [AdaptiveThresholds(ExpectedRank.of(each, fit_empirical(each))) for each in of_each]
+    together = AdaptiveThresholds(AdjustedRanks.of(both, fit_empirical(both)))
+    alone = [AdaptiveThresholds(AdjustedRanks.of(each, fit_empirical(each))) for each in of_each]
     for condition, x in ((0, (3.0, 9.0)), (1, (12.0, 2.0)), (0, (1.0, 1.0))):
-        together.add(condition, together.expected.beyond(Remembered(), condition, np.array(x)))
+        together.add(condition, Remembered(), np.array(x))
         for each, own in zip(alone, x, strict=True):
-            each.add(condition, each.expected.beyond(Remembered(), condition, np.array(own)))
+            each.add(condition, Remembered(), np.array(own))
     assert together.percentiles().shape == (2, 11)
-    np.testing.assert_allclose(together.percentiles(), [each.percentiles() for each in alone])
+    np.testing.assert_array_equal(together.percentiles(), [each.percentiles() for each in alone])
 
 
 def adapted(session: Session, recorded: Responses, counts: Any) -> None:
@@ -162,16 +193,14 @@ def adapted(session: Session, recorded: Responses, counts: Any) -> None:
         if counts(tick) and not tick.is_burst:
             answered.append((tick.delivered, tick.rate_hz))
             percentiles = np.float32(next(told))
-            np.testing.assert_allclose(percentiles, moved(recorded_hz, answered), rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(percentiles, thresholds_after(recorded_hz, answered), rtol=1e-5)
     assert next(told, None) is None and len(answered) > 10
 
 
 def test_in_a_session_thresholds_move_after_every_response_that_counts(
-    recorded: Responses, expected: ExpectedRank, tmp_path: Path
+    recorded: Responses, adjusted: AdjustedRanks, tmp_path: Path
 ) -> None:
-    loop = loop_of(
-        mapping=Linear(), percentiles=expected_percentiles(expected), adaptive_from=expected, burst_threshold=0.95
-    )
+    loop = loop_of(mapping=Linear(), percentiles=percentiles_of(adjusted), adaptive_from=adjusted, burst_threshold=0.95)
     agents = [
         RANDOM,
         Agent("always", "", OneCondition(4), calibrates=False),
@@ -181,15 +210,15 @@ def test_in_a_session_thresholds_move_after_every_response_that_counts(
         session = run_session(culture, loop, agents, tmp_path, episodes=6)
     adapted(session, recorded, lambda tick: tick.agent == "random")
     assert_read_alike(tmp_path, loop)
-    with pytest.raises(InvalidArgument, match="adaptive_from: expected 4 conditions and 1 readouts, got 5 and 1"):
-        loop_of(adaptive_from=expected, conditions=CONDITIONS[:4])
+    with pytest.raises(InvalidArgument, match="adaptive_from: expected some responses of each of 4 conditions, of 1 "):
+        loop_of(adaptive_from=adjusted, conditions=CONDITIONS[:4])
 
 
-def test_the_warm_up_and_the_settling_count(recorded: Responses, expected: ExpectedRank, tmp_path: Path) -> None:
+def test_the_warm_up_and_the_settling_count(recorded: Responses, adjusted: AdjustedRanks, tmp_path: Path) -> None:
     loop = loop_of(
         mapping=Linear(),
-        percentiles=expected_percentiles(expected),
-        adaptive_from=expected,
+        percentiles=percentiles_of(adjusted),
+        adaptive_from=adjusted,
         warm_up=3,
         settling=1,
         burst_threshold=0.95,
@@ -204,8 +233,8 @@ def test_the_warm_up_and_the_settling_count(recorded: Responses, expected: Expec
     adapted(session, recorded, lambda tick: tick.handled == "warm-up")
 
 
-def expected_percentiles(expected: ExpectedRank) -> np.ndarray:
-    return np.percentile(expected.sorted_hz, range(0, 101, 10))
+def percentiles_of(adjusted: AdjustedRanks) -> np.ndarray:
+    return np.percentile(adjusted.sorted_hz, range(0, 101, 10))
 
 
 class Tiring(FakeCulture):
@@ -222,13 +251,13 @@ def test_half_of_the_responses_of_a_culture_that_tires_stay_above_the_median(tmp
     for how in ("fixed", "adaptive"):
         with Tiring() as culture:
             responses = extract_responses(culture.record(PROTOCOL), burst_threshold=0.95)
-            expected = ExpectedRank.of(responses, fit_empirical(responses))
+            adjusted = AdjustedRanks.of(responses, fit_empirical(responses))
             culture.rest(600.0)
             loop = loop_of(
                 robot=Navigation(episode_limit=25),
                 mapping=Thresholds(1),
-                percentiles=expected_percentiles(expected),
-                adaptive_from=expected if how == "adaptive" else None,
+                percentiles=percentiles_of(adjusted),
+                adaptive_from=adjusted if how == "adaptive" else None,
                 burst_threshold=0.95,
             )
             session = run_session(culture, loop, [RANDOM], tmp_path / how, episodes=16)

@@ -42,7 +42,7 @@ from animat.environment import Animat
 from animat.errors import BudgetSpent, InvalidArgument, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.statistics import Interval
-from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition
@@ -439,8 +439,8 @@ def test_what_is_told_of_a_session_before_its_first_move() -> None:
 def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
     with FakeCulture() as culture:
         recorded = extract_responses(culture.record(Protocol(order="mixed", patterns=8, trials=4, setup_s=0.1)))
-    expected = ExpectedRank.of(recorded, fit_empirical(recorded))
-    assert [loop_of(pulses=n, adaptive_from=expected, settling=None).settling for n in (1, 2)] == [10, 0]
+    adjusted = AdjustedRanks.of(recorded, fit_empirical(recorded))
+    assert [loop_of(pulses=n, adaptive_from=adjusted, settling=None).settling for n in (1, 2)] == [10, 0]
     assert loop_of(settling=None).settling == 0
     assert loop_of(pulses=2, settling=1).settling == 1
 

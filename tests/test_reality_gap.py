@@ -204,7 +204,8 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
     tmp_path: Path, series: list[Responses]
 ) -> None:
     calibration = Calibration.of_series(series)
-    few = replace(calibration, responses_hz=(*calibration.responses_hz[:4], calibration.responses_hz[4][:3]))
+    of_each = calibration.responses_hz
+    few = replace(calibration, adjusted=replace(calibration.adjusted, responses_hz=(*of_each[:4], of_each[4][:3])))
     with FakeCulture() as culture:
         gap = run_policies({"p0": policy_of(0, series)}, culture, few, tmp_path, episodes=1, with_controls=False)
     told = json.loads(json.dumps(gap.to_dict()))
@@ -281,8 +282,7 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
             passed.append(tick.rate_hz >= thresholds.percentiles()[5])
         if not tick.is_burst:
             # Two pulses a trial: neurons remember nothing.
-            beyond = gap.loop.adaptive_from.beyond(Remembered(), tick.delivered, np.array(tick.rate_hz))
-            thresholds.add(tick.delivered, beyond)
+            thresholds.add(tick.delivered, Remembered(), np.array(tick.rate_hz))
     found = answered(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.passed, passed)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import ActorController, Agent, OneCondition, random_control
 from animat.closed_loop.header import read_header
 from animat.closed_loop.loop import Loop
@@ -31,7 +30,8 @@ from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.evaluation.heuristic import Heuristic, HeuristicPolicy
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
-from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.answered import answered
@@ -88,7 +88,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         Thresholds(9),
         timeline.conditions,
         np.asarray(timeline.at(0.0).percentiles),
-        adaptive_from=ExpectedRank.of(responses, timeline.at(0.0)),
+        adaptive_from=AdjustedRanks.of(responses, fit_empirical(responses)),
         burst_threshold=0.95,
         warm_up=1,
         readouts=timeline.readouts,
@@ -112,28 +112,25 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     np.testing.assert_array_equal(whole.read_hz, [tick.readout_hz for tick in stimulated])
     np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
 
-    # The thresholds adapt to each half on its own: percentiles over its newest responses, computed again here.
-    newest = [list(of) for of in recorded_hz]
-    logged = {w["episode"]: w["percentiles_hz"] for w in session.log.records.words() if w["kind"] == "percentiles"}
-    # Until something was answered they are the recording's.
-    told = [np.asarray(logged.get(0, loop.percentiles), np.float32)]
-    for episode in range(1, len(session.episodes)):
-        told.append(np.asarray(logged.get(episode, told[-1]), np.float32))
-    assert len(logged) >= 6
-    moved = 0
+    # The thresholds adapt to each half on its own, computed again here from the responses before.
+    told = iter([w["percentiles_hz"] for w in session.log.records.words() if w["kind"] == "percentiles"])
+    now, in_force, moved = np.asarray(loop.percentiles, np.float32), list[np.ndarray](), 0
+    answered_hz: list[list[tuple[int, float]]] = [[], []]
     for tick in session.ticks:
+        in_force.append(now)
         if tick.handled == "used":
-            each = zip(tick.readout_hz, told[tick.episode], strict=True)
+            each = zip(tick.readout_hz, now, strict=True)
             wanted = [Thresholds(9).command(np.float32(x), p) for x, p in each]
             assert tick.command == tuple(wanted)
             moved += len(set(tick.command)) > 1
-        if tick.iteration == 0 and tick.episode in logged:
-            pooled = np.concatenate(newest)
-            expected = [np.percentile(pooled[:, d], range(0, 101, 10)) for d in range(2)]
-            np.testing.assert_allclose(told[tick.episode], expected, rtol=1e-6)
-        counts = tick.agent != "constant" or tick.handled == "warm-up"
-        if counts and tick.patterns and not tick.is_burst:
-            newest[tick.delivered] = [*newest[tick.delivered][1:], np.array(tick.readout_hz)]
+        if (tick.agent != "constant" or tick.handled == "warm-up") and tick.patterns and not tick.is_burst:
+            now = np.asarray(next(told), np.float32)
+            for d, of_half in enumerate(answered_hz):
+                of_half.append((tick.delivered, tick.readout_hz[d]))
+    assert next(told, None) is None
+    for d, of_half in enumerate(answered_hz):
+        recorded_hz = [responses.read_of(i)[:, d] for i in range(5)]
+        np.testing.assert_allclose(now[d], thresholds_after(recorded_hz, of_half), rtol=1e-5)
     assert moved > 10
 
     with (tmp_path / "ticks.csv").open(newline="") as file:
@@ -147,7 +144,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     # How often each half passed its own median, as the reasons of a gap ask.
     read = answered(session, loop, ["random"])
     used = [tick for tick in session.ticks if tick.handled == "used" and tick.agent == "random"]
-    above = [np.array(t.readout_hz) >= told[t.episode][:, 5] for t in used]
+    above = [np.array(t.readout_hz) >= in_force[t.number][:, 5] for t in used]
     np.testing.assert_array_equal(read.passed, above)
     np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in used])
     passes = read.passes.summed(0)
@@ -287,18 +284,6 @@ def test_the_heuristic_policy_takes_the_nearest_in_the_plane() -> None:
         rule = HeuristicPolicy(jnp.arange(3)[None], jnp.asarray(means, jnp.float32)[None])
         acts = ActorController(rule, Animat(robot, Thresholds(1), 3))
         assert acts.act(np.zeros(3), np.random.default_rng()) == nearest
-
-
-def test_thresholds_adapt_to_every_readout_on_its_own() -> None:
-    rng = np.random.default_rng(0)
-    both = AdaptiveThresholds([rng.gamma(4, 5, (30, 2)) for _ in range(3)])
-    rng = np.random.default_rng(0)
-    alone = [AdaptiveThresholds([x[:, d] for x in [rng.gamma(4, 5, (30, 2)) for _ in range(3)]]) for d in range(1)]
-    for _ in range(20):
-        x = np.random.default_rng(1).gamma(4, 5, 2)
-        both.add(1, x)
-        alone[0].add(1, x[0])
-    np.testing.assert_array_equal(both.percentiles()[0], alone[0].percentiles())
 
 
 def test_it_is_a_gymnasium_environment(recording: Recording, timeline: SimulatorTimeline) -> None:

@@ -7,62 +7,73 @@ from jaxtyping import Float32, Float64
 from scipy.special import ndtr, ndtri
 
 from animat.coding.mapping import N_PERCENTILES
-from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.remembering import Remembered
-from animat.responses.extraction import SILENCE_S
 
-import os
-FAST = int(os.environ.get("CNT", "10"))
-SLOW = int(os.environ.get("SLOW", "100"))
-SLOPE = 2 * np.sqrt(np.pi)
-COUNTED = 100
-"""Of a condition: as many as the paper's recording holds."""
+NEWEST = 100
+"""Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones adapt late."""
+LATEST = 5
+"""Of a condition: with five of them 25 trials, some seconds."""
 _SCORES = ndtri(np.linspace(0.0, 1.0, N_PERCENTILES))
-_BETWEEN = (0.01, 0.99)
+_BETWEEN = 0.01, 0.99
 """The mean rank of a culture that answers nothing any more, or everything, would move thresholds without end."""
 
 
 class AdaptiveThresholds:
-    def __init__(self, expected: ExpectedRank) -> None:
-        self._expected = expected
-        n_conditions, n_readouts = expected.levels.shape
-        self._counts = np.zeros(n_conditions)
-        self._drift = np.zeros(n_readouts)
-        self._above = np.zeros((n_conditions, n_readouts))
-        self._remembered = Remembered()
+    """Percentiles of the newest responses, moved by how far the latest of them are above the others.
 
-    @property
-    def seen(self) -> int:
-        return int(self._counts.sum())
+    A culture drifts and tires: minutes after a recording its responses to all conditions are smaller, and more of them
+    stay under the recording's median. So each new response takes the place of the oldest one of its condition. Every
+    condition keeps the share that it has in the recording, however often it is chosen.
 
-    def take_in(self, condition, read_hz, rate_hz, first_s, at_s, *, is_burst, counts) -> None:
-        expected, remembering = self._expected, self._expected.remembering
-        is_rested = first_s - self._remembered.at_s > SILENCE_S
-        came = remembering.when(self._remembered, at_s, is_rested=bool(is_rested))
-        if counts and not is_burst:
-            rank = _moved(expected.rank(np.asarray(read_hz)), -self._drift)
-            beyond = rank - expected.at(came, condition)
-            self._counts[condition] += 1
-            n = self._counts[condition]
-            self._above[condition] += (beyond - self._above[condition]) / min(n, FAST)
-            self._drift += SLOPE * beyond / (len(self._counts) * min(n, SLOW))
-        of_all = _moved(remembering.rank(rate_hz), -self._drift.mean())
-        self._remembered = remembering.after(came, condition, float(of_all), is_burst=is_burst)
+    Responses rise and fall within seconds too. Let y be a response's rank without what its history explains
+    (`AdjustedRanks`), and d the difference of two means of y, of about the `LATEST` responses of a condition and of all
+    its newest, on average over the conditions. Then the percentile of the share k is
+
+        P_k = Q(Phi(Phi^-1(k) + sqrt(2) Phi^-1(1/2 + d))),
+
+    with the quantiles Q of the newest responses of all conditions together, and the normal distribution Phi. This is
+    what P_k becomes when responses, on a scale on which they are normal, all rise by as much, and their mean rank is
+    then 1/2 + d. With d = 0.05 the median is at P57, with d = -0.05 at P43.
+
+    Args:
+        recorded: responses of the recording that thresholds start from. Where a condition has more than `NEWEST`, the
+            newest count, of all conditions the same part.
+    """
+
+    def __init__(self, recorded: AdjustedRanks) -> None:
+        part = min(1.0, NEWEST / max(map(len, recorded.ranks)))
+        self._kept = np.array([max(1, round(part * len(each))) for each in recorded.ranks])
+        self._first = np.cumsum(self._kept) - self._kept
+        newest = [slice(len(each) - kept, None) for each, kept in zip(recorded.ranks, self._kept, strict=True)]
+        self._hz, self._ranks = (
+            np.concatenate([each[of] for each, of in zip(values, newest, strict=True)])
+            for values in (recorded.responses_hz, recorded.ranks)
+        )
+        self._recorded, self._added = recorded, np.zeros(len(newest), np.int64)
+        self._latest = self._means()
+
+    def add(self, condition: int, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
+        """A new non-burst response.
+
+        Args:
+            condition: of its trial.
+            came: the history state when that came.
+            read_hz: x of each readout, Hz.
+        """
+        row = self._first[condition] + self._added[condition] % self._kept[condition]
+        self._hz[row] = read_hz
+        self._ranks[row] = rank = self._recorded.of_response(came, read_hz)
+        self._latest[condition] += (rank - self._latest[condition]) / LATEST
+        self._added[condition] += 1
 
     def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
         """P0, P10, ..., P100 of the culture now, in Hz, shape (11,), or (readouts, 11)."""
-        mean_rank = np.clip(0.5 + self._above.mean(axis=0), *_BETWEEN)
-        shares = ndtr(_SCORES + (self._drift + np.sqrt(2) * ndtri(mean_rank))[:, None])
-        sorted_hz = self._expected.sorted_hz
-        # Between two responses it is a straight line, as `np.quantile` has it, which would sort them again.
-        below, part = np.divmod(shares * (sorted_hz.shape[-1] - 1), 1.0)
-        low_hz, high_hz = (
-            np.take_along_axis(np.atleast_2d(sorted_hz), np.minimum(at, sorted_hz.shape[-1] - 1).astype(int), axis=1)
-            for at in (below, below + 1)
-        )
-        moved_hz = low_hz + part * (high_hz - low_hz)
-        return np.asarray(moved_hz, np.float32).reshape(*sorted_hz.shape[:-1], N_PERCENTILES)
+        above = (self._latest - self._means()).mean(axis=0)
+        shares = ndtr(_SCORES + np.sqrt(2) * ndtri(np.clip(0.5 + above, *_BETWEEN))[:, None])
+        each = zip(self._hz.reshape(len(self._hz), -1).T, shares, strict=True)
+        found = np.array([np.quantile(hz, share) for hz, share in each], np.float32)
+        return found.reshape(*self._hz.shape[1:], N_PERCENTILES)
 
-
-def _moved(rank, by):
-    return ndtr(ndtri(np.clip(rank, 1e-4, 1 - 1e-4)) + by)
+    def _means(self) -> Float64[np.ndarray, "conditions readouts"]:
+        return np.asarray(np.add.reduceat(self._ranks, self._first) / self._kept[:, None])

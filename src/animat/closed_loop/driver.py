@@ -246,13 +246,12 @@ class Driver:
             **read.told,
         }
         self._presented += 1
-        first_s, at_s, x = pulse_time_s[0], float(after_s[0]), read.told["rate_hz"]
+        came = self._remembered
+        if loop.history is not None and stimuli:
+            is_rested = bool(pulse_time_s[0] - came.at_s > SILENCE_S)
+            came = loop.history.when(came, float(after_s[0]), is_rested=is_rested)
+            self._remembered = loop.history.after(came, delivered, read.told["rate_hz"], is_burst=read.is_burst)
         if loop.remembering is not None:
-            if stimuli:
-                is_rested = bool(first_s - self._remembered.at_s > SILENCE_S)
-                came = loop.remembering.when(self._remembered, at_s, is_rested=is_rested)
-                rank = loop.remembering.rank(x)
-                self._remembered = loop.remembering.after(came, delivered, rank, is_burst=read.is_burst)
             tick["neurons"] = loop.remembering.observed(self._remembered)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
@@ -266,13 +265,11 @@ class Driver:
             finished = Tick(**tick)
             self.records.append(seen_in(stretch, stimuli, vars(finished)))
             self._unmoved = None
-        if self._adaptive is not None and stimuli:
-            counts = agent.calibrates or is_warm_up
-            self._adaptive.take_in(delivered, read.x_hz, x, first_s, at_s, is_burst=read.is_burst, counts=counts)
-            if counts and not read.is_burst:
-                self._percentiles = self._adaptive.percentiles()
-                told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
-                self.records.append(Record(told))
+        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
+            self._adaptive.add(delivered, came, np.asarray(read.x_hz))
+            self._percentiles = self._adaptive.percentiles()
+            told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
+            self.records.append(Record(told))
         return finished, again
 
     def _move(

@@ -16,7 +16,7 @@ from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import other_presentation
 from animat.goals.robot import body_and_goal
-from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.remembering import Remembering
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
@@ -52,8 +52,8 @@ class Loop:
         conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
         percentiles: of the simulator that the policy was trained on, in Hz, shape (11,); of several readouts
             (readouts, 11).
-        adaptive_from: what is expected of responses by that recording, whose percentiles adaptive thresholds start from
-            (see `animat.closed_loop.adaptive`). None: thresholds are fixed.
+        adaptive_from: responses of that recording, which adaptive thresholds start from (see
+            `animat.closed_loop.adaptive`). None: thresholds are fixed.
         pulses: of a trial.
         window_ms: the response window.
         burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
@@ -85,7 +85,7 @@ class Loop:
     mapping: Mapping
     conditions: tuple[Condition, ...]
     percentiles: Float32[np.ndarray, "*readouts percentiles"] = field(repr=False)
-    adaptive_from: ExpectedRank | None = field(default=None, repr=False)
+    adaptive_from: AdjustedRanks | None = field(default=None, repr=False)
     pulses: int = 1
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS
     burst_threshold: float = 1.0
@@ -116,11 +116,14 @@ class Loop:
         _ = self.presentation
         _ = self.encoder
         if self.adaptive_from is not None:
-            of_it, of_loop = self.adaptive_from.levels.shape, (len(self.conditions), len(self.readouts))
-            if of_it != of_loop:
+            ranks, (_, readouts) = self.adaptive_from.ranks, self.adaptive_from.slopes.shape
+            if (len(ranks), readouts) != (len(self.conditions), len(self.readouts)) or not all(map(len, ranks)):
                 raise InvalidArgument(
-                    "adaptive_from: expected {} conditions and {} readouts, got {} and {}".format(*of_loop, *of_it)
+                    f"adaptive_from: expected some responses of each of {len(self.conditions)} conditions, of "
+                    f"{len(self.readouts)} readouts, got {[len(each) for each in ranks]}, of {readouts}"
                 )
+            if self.remembering not in (None, self.adaptive_from.remembering):
+                raise InvalidArgument("remembering: expected that of adaptive_from, got another recording's")
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
@@ -145,6 +148,11 @@ class Loop:
         """How often each condition is presented after each of the pauses before an episode."""
         settling = self.settling if episode == 0 else 0
         return [SETTLING_ROUNDS] * (settling or 0) + [0 if is_silent else self.warm_up or 0]
+
+    @property
+    def history(self) -> Remembering | None:
+        """How its responses become the history state, for thresholds that adapt or for agents; None: nobody asks."""
+        return self.remembering if self.adaptive_from is None else self.adaptive_from.remembering
 
     @property
     def presentation(self) -> Presentation:

@@ -60,22 +60,19 @@ class Remembering:
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
         return Remembered(0.0 if is_rested else before.trace, float(load), float(at_s))
 
-    def rank(self, rate_hz: float) -> float:
-        """The share of the recording's responses that is below a response of all channels, ties half."""
-        return float(ranks_among(self.sorted_hz, np.array([rate_hz]))[0])
-
-    def after(self, came: Remembered, condition: int, rank: float, *, is_burst: bool) -> Remembered:
+    def after(self, came: Remembered, condition: int, rate_hz: float, *, is_burst: bool) -> Remembered:
         """The state after a trial.
 
         Args:
             came: the state when it came.
             condition: of the trial; `NO_CONDITION` where it has none.
-            rank: of the response.
+            rate_hz: the response of all channels, Hz a channel.
             is_burst: whether the response was a burst, after which nothing is known of the trace.
         """
+        rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         # Of what has no condition of its own the middle one's is as good as any.
         mean = 0.5 if condition == NO_CONDITION else float(self.mean_ranks[condition])
-        (more,) = left_by(np.array([rank]), mean, self.memory).tolist()
+        (more,) = left_by(rank, mean, self.memory).tolist()
         trace = 0.5 if is_burst else self.memory.decay * came.trace + more
         return Remembered(float(trace), came.load + self.added, came.at_s)
 

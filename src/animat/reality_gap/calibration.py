@@ -9,9 +9,10 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.expected_rank import ExpectedRank
+from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
+from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
 from animat.recordings.findings import Finding
@@ -32,18 +33,15 @@ class Calibration:
 
     Attributes:
         bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
-        responses_hz: non-burst responses of each condition, in the order of time, shape (responses,); of several
-            readouts (responses, readouts).
         burst_threshold: ratio of active channels above which its responses were bursts.
         drift: of the recordings up to it; None where one recording tells none.
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were made, as `Policy.fitted`.
-        expected: what is expected of a loop's responses, and how they become the history state of its simulator.
+        adjusted: its responses, which adaptive thresholds start from.
     """
 
     simulator: NeuronSimulator
     bootstraps: tuple[NeuronSimulator, ...]
-    responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
     burst_threshold: float
     burst_share: float
     drift: MedianDrift | None
@@ -53,8 +51,18 @@ class Calibration:
     presentation: Presentation | None
     findings: tuple[Finding, ...]
     fitted: dict[str, Any]
-    expected: ExpectedRank
+    adjusted: AdjustedRanks
     readouts: Readouts = ALL
+
+    @property
+    def responses_hz(self) -> tuple[Float64[np.ndarray, "responses *readouts"], ...]:
+        """Non-burst responses of each condition, in the order of time, shape (responses,), or (responses, readouts)."""
+        return self.adjusted.responses_hz
+
+    @property
+    def remembering(self) -> Remembering:
+        """How a loop's responses become the history state of its simulator."""
+        return self.adjusted.remembering
 
     @property
     def percentiles(self) -> Float64[np.ndarray, "*readouts percentiles"]:
@@ -100,7 +108,6 @@ class Calibration:
         calibration = cls(
             simulator=simulator,
             bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
-            responses_hz=tuple(responses.read_of(i) for i in range(len(responses.conditions))),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
             drift=median_drift([each for each in timeline.responses if each.start_min <= start_min]),
@@ -111,7 +118,7 @@ class Calibration:
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
-            expected=ExpectedRank.of(responses, simulator),
+            adjusted=AdjustedRanks.of(responses, simulator),
         )
         if policy is None or policy.percentiles != "first":
             return calibration

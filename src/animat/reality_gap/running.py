@@ -114,11 +114,11 @@ def run_policies(
     check_conditions(first, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if adaptive:
-        settings["adaptive_from"] = calibration.expected
+        settings["adaptive_from"] = calibration.adjusted
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
     if first.neural_observation:
-        settings["remembering"] = calibration.expected.remembering
+        settings["remembering"] = calibration.remembering
     loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(other_calibration(first.presentation, calibration.presentation))
     if first.delivery == "shuffled":

@@ -1,4 +1,4 @@
-"""The rank that a response is expected to have, and how far a culture is above or below it."""
+"""The rank of a response without what its history explains."""
 
 from __future__ import annotations
 
@@ -15,56 +15,60 @@ from animat.responses.responses import Responses
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedRank:
-    """The mean rank that responses of a recording have after such a history.
+class AdjustedRanks:
+    """Responses of a recording by condition, with their ranks as they would be after no history.
 
-        e = m_c + a p + b l
+        y = r - a p - b l
 
-    The rank is the share of the recording's responses that are below, ties half; m_c is of the condition, p and l are
-    trace and load when the trial comes (`animat.neurons.history.Memory`). It is found by least squares. Of several
-    readouts each has its own.
+    r is the rank of the response, the share of the recording's responses below it, ties half; p and l are trace and
+    load when its trial came (`animat.neurons.history.Memory`). The slopes a and b, the same for all conditions, are
+    found by least squares beside a mean of each condition. Of several readouts each has its own.
 
     Attributes:
         remembering: what trace and load are.
         sorted_hz: the recording's non-burst responses, rising, shape (responses,), or (readouts, responses).
-        levels: m, shape (conditions, readouts).
         slopes: a and b, shape (2, readouts); 0 of what the recording's simulator does not remember.
+        responses_hz: non-burst responses of each condition, in the order of time, Hz, shape (responses,), or
+            (responses, readouts).
+        ranks: y of each, shape (responses, readouts).
     """
 
     remembering: Remembering
     sorted_hz: Float64[np.ndarray, "*readouts responses"]
-    levels: Float64[np.ndarray, "conditions readouts"]
     slopes: Float64[np.ndarray, "2 readouts"]
+    responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
+    ranks: tuple[Float64[np.ndarray, "responses readouts"], ...]
 
     @classmethod
     def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
         """Of a recording, with the memory of its simulator."""
-        remembering, n_conditions = Remembering.of(responses, simulator), len(responses.conditions)
-        usable = ~responses.is_burst
-        sorted_hz = np.sort(responses.read_hz[usable].T, axis=-1)
-        memory = remembering.memory
+        remembering, usable = Remembering.of(responses, simulator), ~responses.is_burst
+        n_conditions, condition, read_hz = (
+            len(responses.conditions),
+            responses.condition[usable],
+            responses.read_hz[usable],
+        )
+        sorted_hz, memory = np.sort(read_hz.T, axis=-1), remembering.memory
         history = _states(remembering, responses)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
-        given = np.concatenate([np.eye(n_conditions)[responses.condition[usable]], history], axis=1)
-        found = np.linalg.lstsq(given, _ranks(sorted_hz, responses.read_hz[usable]), rcond=None)[0]
-        return cls(remembering, sorted_hz, found[:n_conditions], found[n_conditions:])
+        ranks = _ranks(sorted_hz, read_hz)
+        given = np.concatenate([np.eye(n_conditions)[condition], history], axis=1)
+        slopes = np.linalg.lstsq(given, ranks, rcond=None)[0][n_conditions:]
+        adjusted = ranks - history @ slopes
+        rows = [condition == each for each in range(n_conditions)]
+        return cls(
+            remembering, sorted_hz, slopes, tuple(read_hz[of] for of in rows), tuple(adjusted[of] for of in rows)
+        )
 
-    def rank(self, read_hz: Float64[np.ndarray, "*readouts"]) -> Float64[np.ndarray, " readouts"]:
-        """The rank of a response, of each readout."""
-        return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0])
-
-    def at(self, came: Remembered, condition: int) -> Float64[np.ndarray, " readouts"]:
-        """What is expected of a response.
+    def of_response(
+        self, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]
+    ) -> Float64[np.ndarray, " readouts"]:
+        """y of another response.
 
         Args:
-            came: the history state when the trial came (`Remembering.when`).
-            condition: of the trial.
+            came: the history state when its trial came (`Remembering.when`).
+            read_hz: x of each readout, Hz.
         """
-        return np.asarray(self.levels[condition] + np.array([came.trace, came.load]) @ self.slopes)
-
-    def along(self, responses: Responses) -> Float64[np.ndarray, "responses readouts"]:
-        """How far above the expected rank each response of any recording of the same conditions is, burst or not."""
-        expected = self.levels[responses.condition] + _states(self.remembering, responses) @ self.slopes
-        return np.asarray(_ranks(self.sorted_hz, responses.read_hz) - expected)
+        return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)
 
 
 def _ranks(
@@ -84,7 +88,7 @@ def _states(remembering: Remembering, responses: Responses) -> Float64[np.ndarra
     for trial, (condition, rate_hz, is_burst, is_rested, at_s) in enumerate(trials):
         came = remembering.when(state, at_s, is_rested=is_rested)
         states[trial] = came.trace, came.load
-        state = remembering.after(came, condition, remembering.rank(rate_hz), is_burst=is_burst)
+        state = remembering.after(came, condition, rate_hz, is_burst=is_burst)
     if presented.time_s is None:
         states[:, 1] = AT_FIRST[1]
     return np.asarray(states[place])
