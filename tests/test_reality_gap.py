@@ -93,10 +93,13 @@ def policy_of(seed: int, series: list[Responses], robot: Robot[Any] | None = Non
     return Policy(**(given | changed))
 
 
-def run(folder: Path, series: list[Responses], **changed: Any) -> tuple[RealityGap, dict[str, Policy]]:
+def run(
+    folder: Path, series: list[Responses], adaptive: bool = True, **changed: Any
+) -> tuple[RealityGap, dict[str, Policy]]:
     policies = {"p0": policy_of(0, series), "p1": policy_of(1, series)}
     with FakeCulture() as culture:
-        gap = run_policies(policies, culture, Calibration.of_series(series), folder, episodes=4, **changed)
+        calibration = Calibration.of_series(series, adaptive=adaptive)
+        gap = run_policies(policies, culture, calibration, folder, episodes=4, **changed)
     return gap, policies
 
 
@@ -373,15 +376,9 @@ def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, 
         np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
     for adaptive in (True, False):
         with FakeCulture() as culture:
-            gap = run_policies(
-                {"p": policy},
-                culture,
-                first,
-                tmp_path / str(adaptive),
-                episodes=1,
-                with_controls=False,
-                adaptive=adaptive,
-            )
+            calibration = replace(first, adaptive=adaptive)
+            folder = tmp_path / str(adaptive)
+            gap = run_policies({"p": policy}, culture, calibration, folder, episodes=1, with_controls=False)
         assert ("moving-percentiles" in [finding.name for finding in gap.findings]) == adaptive
     gap, _ = run(tmp_path / "fixed", series, with_controls=False, adaptive=False)
     other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)

@@ -140,7 +140,6 @@ class Run(Stimulating):
                 with_coupling=self.controls == "coupling",
                 with_interventions=self.interventions,
                 greedy=not self.drawn,
-                adaptive=self.thresholds == "adaptive",
                 seed=self.seed,
                 account=account,
                 progress=progress,
@@ -203,9 +202,9 @@ class Run(Stimulating):
             allow=self.allow,
             readouts=first.readouts,
         )
-        return Calibration.of_series(
-            series, first, at_min=self.at_min, **fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
-        )
+        made = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
+        adaptive = self.thresholds == "adaptive"
+        return Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **made)
 
 
 @contextmanager

@@ -69,11 +69,22 @@ class AdaptiveThresholds:
 
     def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
         """P0, P10, ..., P100 of the culture now, in Hz, shape (11,), or (readouts, 11)."""
-        above = (self._latest - self._means()).mean(axis=0)
-        shares = ndtr(_SCORES + np.sqrt(2) * ndtri(np.clip(0.5 + above, *_BETWEEN))[:, None])
+        shares = ndtr(_SCORES + self._risen[:, None])
         each = zip(self._hz.reshape(len(self._hz), -1).T, shares, strict=True)
         found = np.array([np.quantile(hz, share) for hz, share in each], np.float32)
         return found.reshape(*self._hz.shape[1:], N_PERCENTILES)
+
+    def ranks(self, read_hz: Float64[np.ndarray, "*readouts"]) -> Float64[np.ndarray, " readouts"]:
+        """The share of the culture's responses that lie below one, as they are now; ties half."""
+        each = zip(self._hz.reshape(len(self._hz), -1).T, np.atleast_1d(read_hz), strict=True)
+        among = np.array([(np.mean(hz < x) + np.mean(hz <= x)) / 2 for hz, x in each])
+        return np.asarray(ndtr(ndtri(among) - self._risen))
+
+    @property
+    def _risen(self) -> Float64[np.ndarray, " readouts"]:
+        """How far the latest responses are above the newest, on the normal scale."""
+        above = (self._latest - self._means()).mean(axis=0)
+        return np.asarray(np.sqrt(2) * ndtri(np.clip(0.5 + above, *_BETWEEN)))
 
     def _means(self) -> Float64[np.ndarray, "conditions readouts"]:
         return np.asarray(np.add.reduceat(self._ranks, self._first) / self._kept[:, None])

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.history import AT_FIRST, NO_MEMORY, ranks_among
+from animat.neurons.history import NO_MEMORY, ranks_among
 from animat.neurons.remembering import Remembered, Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.responses import Responses
@@ -49,7 +49,7 @@ class AdjustedRanks:
             responses.read_hz[usable],
         )
         sorted_hz, memory = np.sort(read_hz.T, axis=-1), remembering.memory
-        history = _states(remembering, responses)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
+        history = remembering.along(responses)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
         ranks = _ranks(sorted_hz, read_hz)
         given = np.concatenate([np.eye(n_conditions)[condition], history], axis=1)
         slopes = np.linalg.lstsq(given, ranks, rcond=None)[0][n_conditions:]
@@ -76,19 +76,3 @@ def _ranks(
 ) -> Float64[np.ndarray, "values readouts"]:
     each = zip(np.atleast_2d(sorted_hz), read_hz.reshape(len(read_hz), -1).T, strict=True)
     return np.stack([ranks_among(own, of) for own, of in each], axis=-1)
-
-
-def _states(remembering: Remembering, responses: Responses) -> Float64[np.ndarray, "responses 2"]:
-    """Trace and load when the trial of each response comes."""
-    presented, place = responses.presentations
-    n = len(presented.condition)
-    times_s = np.zeros(n) if presented.time_s is None else presented.time_s
-    state, states = Remembered(), np.empty((n, 2))
-    trials = zip(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, times_s, strict=True)
-    for trial, (condition, rate_hz, is_burst, is_rested, at_s) in enumerate(trials):
-        came = remembering.when(state, at_s, is_rested=is_rested)
-        states[trial] = came.trace, came.load
-        state = remembering.after(came, condition, rate_hz, is_burst=is_burst)
-    if presented.time_s is None:
-        states[:, 1] = AT_FIRST[1]
-    return np.asarray(states[place])

@@ -15,6 +15,7 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
+from animat.reality_gap.as_read import as_read
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
@@ -32,6 +33,8 @@ class Calibration:
     """What a closed loop takes from a recording, and what its prediction is made with.
 
     Attributes:
+        adaptive: whether the loop's thresholds adapt (`animat.closed_loop.adaptive`) or are fixed.
+        simulator: of the recording; where thresholds adapt, of its responses as these read them.
         bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
         burst_threshold: ratio of active channels above which its responses were bursts.
         drift: of the recordings up to it; None where one recording tells none.
@@ -40,6 +43,7 @@ class Calibration:
         adjusted: its responses, which adaptive thresholds start from.
     """
 
+    adaptive: bool
     simulator: NeuronSimulator
     bootstraps: tuple[NeuronSimulator, ...]
     burst_threshold: float
@@ -76,6 +80,7 @@ class Calibration:
         policy: Policy | None = None,
         *,
         at_min: float | None = None,
+        adaptive: bool = True,
         kind: Kind | None = None,
         bins: int = 20,
         range_hz: float | None = None,
@@ -86,6 +91,8 @@ class Calibration:
             series: in any order.
             policy: its last simulator in training is the one that is taken, its thresholds fixed if they were then.
             at_min: the minute whose newest recording is taken instead; None without a policy: the last.
+            adaptive: whether the loop's thresholds will adapt, or are fixed. Of thresholds that adapt, simulators are
+                made of responses as these read them (`animat.reality_gap.as_read`), but of recordings in blocks.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
         Raises:
@@ -101,13 +108,19 @@ class Calibration:
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         simulator = timeline.at(start_min)
-        # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
-        memory = simulator.memory if isinstance(simulator, MemorySimulator) else None
+        adjusted = AdjustedRanks.of(responses, simulator)
         # All of one shape: what runs on them is compiled once.
-        fit |= {"memory": memory, "room": room_for(series)}
+        fit["room"] = room_for(series)
+        answers = responses
+        if adaptive and not responses.is_blocked:
+            answers = as_read(responses, adjusted)
+            simulator = fit_simulator(answers, **fit)
+        # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
+        fit["memory"] = simulator.memory if isinstance(simulator, MemorySimulator) else None
         calibration = cls(
+            adaptive=adaptive,
             simulator=simulator,
-            bootstraps=tuple(fit_simulator(responses.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
+            bootstraps=tuple(fit_simulator(answers.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             burst_threshold=responses.threshold,
             burst_share=float(responses.is_burst.mean()),
             drift=median_drift([each for each in timeline.responses if each.start_min <= start_min]),
@@ -118,7 +131,7 @@ class Calibration:
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
-            adjusted=AdjustedRanks.of(responses, simulator),
+            adjusted=adjusted,
         )
         if policy is None or policy.percentiles != "first":
             return calibration

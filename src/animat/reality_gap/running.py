@@ -70,7 +70,6 @@ def run_policies(
     with_coupling: bool = False,
     with_interventions: bool = False,
     greedy: bool = True,
-    adaptive: bool = True,
     seed: int = 1,
     pulses: int | None = None,
     account: Account | None = None,
@@ -96,8 +95,6 @@ def run_policies(
         with_interventions: the policies with random spikes in place of responses, yoked stimuli, the mapping turned
             round and, of a robot with several goals, the goal switched; and whose work it is.
         greedy: whether policies take the most probable action, or draw as in training.
-        adaptive: whether the mapping's thresholds adapt to the culture (`animat.closed_loop.adaptive`) from where the
-            calibration left them, or are fixed.
         seed: decides every random draw, but what the culture does.
         pulses: of a trial; None: as in the policies' recordings.
         progress: told of each phase how far it is, and of the closed loop the returns so far.
@@ -113,7 +110,7 @@ def run_policies(
     first = check_policies(policies)
     check_conditions(first, calibration)
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if adaptive:
+    if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
     # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
     settings["conditions"] = calibration.conditions
@@ -133,7 +130,7 @@ def run_policies(
             "the measured return will be less than predicted"
         )
         findings += (Finding("no-warm-up", "warning", message),)
-    if adaptive and first.percentiles == "first":
+    if calibration.adaptive and first.percentiles == "first":
         message = (
             "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
             "--thresholds fixed they are as in training"
@@ -194,7 +191,7 @@ def run_policies(
         controls,
         environment,
         # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
-        calibration if adaptive else calibration.with_percentiles(simulator.percentiles),
+        calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
