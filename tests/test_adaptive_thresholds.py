@@ -52,9 +52,11 @@ def adjusted(recorded: Responses) -> AdjustedRanks:
     return AdjustedRanks.of(recorded, fit_empirical(recorded))
 
 
-def thresholds_after(recorded_hz: list[np.ndarray], answered: list[tuple[int, float]]) -> np.ndarray:
+def thresholds_after(
+    recorded_hz: list[np.ndarray], answered: list[tuple[int, float]], among: np.ndarray | None = None
+) -> np.ndarray:
     """P0 to P100, computed again with SciPy's ranks, lists and NumPy's quantiles, where nothing is remembered."""
-    everything = np.concatenate(recorded_hz)
+    everything = np.concatenate(recorded_hz) if among is None else among
 
     def mean_rank(values: list[float]) -> float:
         return float(np.mean([percentileofscore(everything, x, kind="mean") for x in values]) / 100)

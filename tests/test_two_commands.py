@@ -48,6 +48,7 @@ from animat.training.policy import Policy
 from animat.training.specification import Training
 from fake_culture import CHANNELS, FakeCulture
 from synthetic_recordings import write_synthetic_series
+from test_adaptive_thresholds import thresholds_after
 from test_training import SMALL
 from two_wheels import FILE, Wheels
 

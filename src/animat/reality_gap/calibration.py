@@ -35,6 +35,8 @@ class Calibration:
     Attributes:
         adaptive: whether the loop's thresholds adapt (`animat.closed_loop.adaptive`) or are fixed.
         simulator: of the recording; where thresholds adapt, of its responses as these read them.
+        percentiles: P0, P10, ..., P100 of its non-burst responses, Hz, shape (11,), or (readouts, 11): those that the
+            loop begins with.
         bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
         burst_threshold: ratio of active channels above which its responses were bursts.
         drift: of the recordings up to it; None where one recording tells none.
@@ -44,6 +46,7 @@ class Calibration:
     """
 
     adaptive: bool
+    percentiles: Float64[np.ndarray, "*readouts percentiles"]
     simulator: NeuronSimulator
     bootstraps: tuple[NeuronSimulator, ...]
     burst_threshold: float
@@ -67,11 +70,6 @@ class Calibration:
     def remembering(self) -> Remembering:
         """How a loop's responses become the history state of its simulator."""
         return self.adjusted.remembering
-
-    @property
-    def percentiles(self) -> Float64[np.ndarray, "*readouts percentiles"]:
-        """P0, P10, ..., P100 of the non-burst responses, Hz."""
-        return np.asarray(self.simulator.percentiles, np.float64)
 
     @classmethod
     def of_series(
@@ -119,6 +117,7 @@ class Calibration:
         fit["memory"] = simulator.memory if isinstance(simulator, MemorySimulator) else None
         calibration = cls(
             adaptive=adaptive,
+            percentiles=np.asarray(timeline.at(start_min).percentiles, np.float64),
             simulator=simulator,
             bootstraps=tuple(fit_simulator(answers.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             burst_threshold=responses.threshold,
@@ -143,4 +142,5 @@ class Calibration:
         def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]
 
-        return replace(self, simulator=fixed(self.simulator), bootstraps=tuple(map(fixed, self.bootstraps)))
+        bootstraps, own = tuple(map(fixed, self.bootstraps)), np.asarray(percentiles, np.float64)
+        return replace(self, percentiles=own, simulator=fixed(self.simulator), bootstraps=bootstraps)
