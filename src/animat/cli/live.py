@@ -107,7 +107,7 @@ class Live(Stimulating):
         )
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
-        settings = {**self._of_the_loop(), "adaptive": self.thresholds == "adaptive"}
+        settings = self._of_the_loop()
         check_plan(training, protocol, self.out, timetable, self.episodes, settings)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
@@ -128,6 +128,7 @@ class Live(Stimulating):
                 timetable=timetable,
                 episodes=self.episodes,
                 with_controls=self.controls == "all",
+                adaptive=self.thresholds == "adaptive",
                 kind=self.simulator,
                 account=account,
                 progress=progress,

@@ -24,7 +24,7 @@ from animat.writing import LOCK
 
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
-_NOT_OF_THE_LOOP = ("adaptive", "greedy")
+_NOT_OF_THE_LOOP = ("greedy",)
 
 
 @record

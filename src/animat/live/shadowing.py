@@ -84,6 +84,7 @@ def live(
     timetable: Timetable | None = None,
     episodes: int = 5,
     with_controls: bool = False,
+    adaptive: bool = True,
     kind: Kind | None = None,
     account: Account | None = None,
     progress: Progress | None = None,
@@ -109,6 +110,7 @@ def live(
         timetable: when to record.
         episodes: of each policy in closed loop.
         with_controls: all of them between the policies' episodes; if not, only the random one.
+        adaptive: whether the closed loop's thresholds adapt, or are fixed.
         kind: of simulator; None: what suits the protocol (`fit_timeline`).
         account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
         progress: told as the culture's time goes by, and in the closed loop.
@@ -126,7 +128,7 @@ def live(
     run = _Run(training, culture, protocol, Path(folder), timetable, kind, account or Account(), progress)
     try:
         policies = run.shadow()
-        calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, kind=kind)
+        calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, adaptive=adaptive, kind=kind)
         if training.percentiles == "first":
             calibration = calibration.with_percentiles(pooled_percentiles(run.used[0]))
         # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
