@@ -21,7 +21,7 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile
 from animat.watch.app import stop_session
-from animat.watch.session import SessionView
+from animat.watch.session import SessionView, _thinned
 from animat.watch.tail import Tail
 from watching import session_in
 
@@ -243,3 +243,11 @@ def test_a_view_is_plain_finite_json(folder: Path) -> None:
         json.dumps(found, allow_nan=False)
     with pytest.raises(InvalidArgument, match="span"):
         view.view(None, 1e6)
+
+
+@pytest.mark.parametrize("n", [0, 1, 99, 100, 101, 400, 401, 5_000])
+def test_of_thousands_of_thresholds_the_first_comes_and_the_last_hundred(n: int) -> None:
+    thinned = _thinned(list(range(n)))
+    assert len(thinned) <= 400 and thinned == sorted(set(thinned))
+    assert thinned[-100:] == list(range(n))[-100:] and thinned[:1] == list(range(n))[:1]
+    assert len(set(np.diff(thinned[:-100]))) <= 1

@@ -302,7 +302,7 @@ def _unanswered(outline: Outline) -> int | None:
         return None
 
 
-def _thinned(rows: list[Any], most: int = 400) -> list[Any]:
-    """At most so many of them, evenly, the last one among them."""
-    step = max(1, math.ceil(len(rows) / most))
-    return [*rows[:-1:step], *rows[-1:]]
+def _thinned(rows: list[Any], most: int = 400, whole: int = 100) -> list[Any]:
+    """At most so many of them: the last ones whole, as they are shown trial by trial, and evenly those before."""
+    before, last = rows[:-whole], rows[-whole:]
+    return [*before[:: max(1, math.ceil(len(before) / (most - whole)))], *last]
