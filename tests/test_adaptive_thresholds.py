@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 from scipy.stats import norm, percentileofscore
 
 from animat.closed_loop.adaptive import LATEST, NEWEST, AdaptiveThresholds
 from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
-from animat.coding.mapping import Linear, Thresholds
+from animat.closed_loop.tick import Tick
+from animat.coding.mapping import Thresholds
 from animat.cultures.observed import Observed, Spikes
 from animat.errors import InvalidArgument
 from animat.neurons.adjusted_rank import AdjustedRanks
@@ -52,27 +54,44 @@ def adjusted(recorded: Responses) -> AdjustedRanks:
     return AdjustedRanks.of(recorded, fit_empirical(recorded))
 
 
+Answered = tuple[int, float, float]
+"""Condition, x in Hz, and how much of its rank its history explains."""
+
+
 def thresholds_after(
-    recorded_hz: list[np.ndarray], answered: list[tuple[int, float]], among: np.ndarray | None = None
+    recorded_hz: list[np.ndarray],
+    answered: list[Answered],
+    *,
+    among: np.ndarray | None = None,
+    recorded_ranks: list[np.ndarray] | None = None,
 ) -> np.ndarray:
-    """P0 to P100, computed again with SciPy's ranks, lists and NumPy's quantiles, where nothing is remembered."""
+    """P0 to P100, computed again with SciPy's ranks, lists and NumPy's quantiles."""
     everything = np.concatenate(recorded_hz) if among is None else among
 
-    def mean_rank(values: list[float]) -> float:
-        return float(np.mean([percentileofscore(everything, x, kind="mean") for x in values]) / 100)
+    def ranks(values: list[float]) -> list[float]:
+        return [float(percentileofscore(everything, x, kind="mean")) / 100 for x in values]
 
     part = min(1, NEWEST / max(map(len, recorded_hz)))
     pooled, above = list[float](), []
     for condition, own in enumerate(recorded_hz):
         kept = max(1, round(part * len(own)))
-        latest = mean_rank(own[-kept:].tolist())
-        new = [x for c, x in answered if c == condition]
-        for x in new:
-            latest = (1 - 1 / LATEST) * latest + mean_rank([x]) / LATEST
-        newest = [*own.tolist(), *new][-kept:]
-        pooled += newest
-        above.append(latest - mean_rank(newest))
-    by = np.sqrt(2) * norm.ppf(np.clip(0.5 + np.mean(above), 0.01, 0.99))
+        new = [x for c, x, _ in answered if c == condition]
+        new_ranks = [
+            rank - explained
+            for (c, _, explained), rank in zip(answered, ranks([x for _, x, _ in answered]), strict=True)
+            if c == condition
+        ]
+        own_ranks = ranks(own.tolist()) if recorded_ranks is None else recorded_ranks[condition].ravel().tolist()
+        latest = float(np.mean(own_ranks[-kept:]))
+        for rank in new_ranks:
+            latest = (1 - 1 / LATEST) * latest + rank / LATEST
+        pooled += [*own.tolist(), *new][-kept:]
+        above.append(latest - np.mean([*own_ranks, *new_ranks][-kept:]))
+    # How many responses to others came since the last one to each; of one that was never answered all of them.
+    given = [condition for condition, _, _ in answered]
+    since = [given[::-1].index(c) if c in given else len(given) for c in range(len(recorded_hz))]
+    weights = (1 - 1 / (LATEST * len(recorded_hz))) ** np.array(since)
+    by = np.sqrt(2) * norm.ppf(np.clip(0.5 + np.average(above, weights=weights), 0.01, 0.99))
     return np.quantile(pooled, norm.cdf(norm.ppf(np.linspace(0, 1, 11)) + by)).astype(np.float32)
 
 
@@ -85,47 +104,58 @@ def test_thresholds_follow_the_newest_of_each_condition_and_nothing_else(data: s
     recorded_hz = [rng.gamma(5.0, 2.0, n).round(data.draw(st.integers(0, 2))) for n in sizes]
     responses = responses_of(np.repeat(np.arange(len(sizes)), sizes), np.concatenate(recorded_hz))
     thresholds = AdaptiveThresholds(AdjustedRanks.of(responses, fit_empirical(responses)))
-    answered = list[tuple[int, float]]()
+    answered = list[Answered]()
     for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
-        answered.append((condition, float(rng.gamma(5.0, 1.0))))
+        answered.append((condition, float(rng.gamma(5.0, 1.0)), 0.0))
         thresholds.add(condition, Remembered(), np.array(answered[-1][1]))
     np.testing.assert_allclose(thresholds.percentiles(), thresholds_after(recorded_hz, answered), rtol=1e-5)
 
 
-@pytest.mark.parametrize("by", [-1.5, -0.4, 0.0, 0.1, 1.0])
-def test_when_all_responses_move_on_a_normal_scale_thresholds_move_with_them(by: float) -> None:
+@pytest.mark.parametrize("by", [-1.0, -0.4, 0.0, 0.1, 1.0])
+def test_when_all_responses_rise_on_a_normal_scale_thresholds_rise_with_them(by: float) -> None:
     rng = np.random.default_rng(2)
-    condition, sample = np.tile([0, 1], 50_000), rng.normal(size=100_000)
-    recorded = responses_of(condition, np.exp(sample))
+    recorded = responses_of(np.tile([0, 1], 10_000), np.exp(rng.normal(size=20_000)))
     adjusted = AdjustedRanks.of(recorded, fit_empirical(recorded))
     found = []
-    for each in np.array_split(rng.normal(size=40_000) + by, 200):
-        # Of each condition a hundred of before, then a hundred of now, which count for more than those do.
+    for _ in range(200):
         thresholds = AdaptiveThresholds(adjusted)
-        latest = np.array([thresholds.percentiles()])
-        for turn, x in enumerate(np.exp(each)):
+        for turn, x in enumerate(np.exp(rng.normal(size=60) + by)):
             thresholds.add(turn % 2, Remembered(), np.array(x))
-            latest = np.array([thresholds.percentiles()])
-        found.append(np.log(latest[0, 5]))
-    # Of Gaussian x and of y that is `by` larger on average, P(x < y) = Phi(by / sqrt(2)).
-    assert np.mean(found) == pytest.approx(by, abs=0.06)
+        found.append(np.log(thresholds.percentiles()[5]))
+
+    # Of each condition 70 are standard normal and 30 higher by `by`: of one of each P(x < y) = Phi(by / sqrt(2)).
+    d = 0.7 * (norm.cdf(by / np.sqrt(2)) - 0.5)
+    share = norm.cdf(np.sqrt(2) * norm.ppf(0.5 + d))
+    p50 = brentq(lambda x: 0.7 * norm.cdf(x) + 0.3 * norm.cdf(x - by) - share, -5, 5)
+    assert np.mean(found) == pytest.approx(p50, abs=0.07)
+    # By the newest responses alone the median would be in the middle of the mixture, a third of the way.
+    assert abs(by) < 0.2 or abs(p50) > 0.8 * abs(by)
 
 
-def test_the_latest_responses_move_the_thresholds_at_once(adjusted: AdjustedRanks) -> None:
-    thresholds, high_hz = AdaptiveThresholds(adjusted), float(adjusted.sorted_hz[-20])
-    before_hz = thresholds.percentiles()[5]
-    for _ in range(3):
-        for condition in range(5):
-            thresholds.add(condition, Remembered(), np.array(high_hz))
-    # By 3 of 100 newest responses of each condition the median would hardly move.
-    share = float(np.mean(adjusted.sorted_hz < thresholds.percentiles()[5]))
-    assert share > 0.7 and thresholds.percentiles()[5] > before_hz
+def test_a_condition_that_is_no_longer_given_counts_less_and_less(adjusted: AdjustedRanks) -> None:
+    thresholds, rng = AdaptiveThresholds(adjusted), np.random.default_rng(1)
+
+    def share() -> float:
+        return float(np.mean(adjusted.sorted_hz < thresholds.percentiles()[5]))
+
+    for condition in (0, 1, 2):
+        for _ in range(LATEST):
+            thresholds.add(condition, Remembered(), adjusted.sorted_hz[-5])
+    assert share() > 0.6
+    # Those of the other two are as ever.
+    for _ in range(300):
+        condition = int(rng.integers(3, 5))
+        thresholds.add(condition, Remembered(), rng.choice(adjusted.responses_hz[condition]))
+    assert abs(share() - 0.5) < 0.15
+
+
+def test_whatever_comes_thresholds_are_finite_and_in_order(adjusted: AdjustedRanks) -> None:
     for x in (-1.0, 1e6):
-        for condition in range(5):
-            for _ in range(200):
-                thresholds.add(condition, Remembered(), np.array(x))
-        percentiles = thresholds.percentiles()
-        assert np.all(np.isfinite(percentiles)) and np.all(np.diff(percentiles) >= 0)
+        thresholds = AdaptiveThresholds(adjusted)
+        for condition in [*range(5)] * 100:
+            thresholds.add(condition, Remembered(), np.array(x))
+            percentiles = thresholds.percentiles()
+            assert np.all(np.isfinite(percentiles)) and np.all(np.diff(percentiles) >= 0)
 
 
 def test_an_adjusted_rank_has_nothing_left_of_trace_and_load(recorded: Responses) -> None:
@@ -181,28 +211,55 @@ def test_two_readouts_adapt_each_by_its_own() -> None:
     np.testing.assert_array_equal(together.percentiles(), [each.percentiles() for each in alone])
 
 
-def adapted(session: Session, recorded: Responses, counts: Any) -> None:
+def adapted(session: Session, recorded: Responses, adjusted: AdjustedRanks, counts: Any) -> None:
     """Every command and all that the log says of thresholds, computed again from the responses before it."""
-    recorded_hz = [recorded.rates_of(condition) for condition in range(5)]
-    answered, told = (
-        list[tuple[int, float]](),
-        iter([r.words["percentiles_hz"] for r in session.log.records if r.words["kind"] == "percentiles"]),
-    )
-    percentiles = np.percentile(np.concatenate(recorded_hz), range(0, 101, 10)).astype(np.float32)
-    for tick in session.ticks:
+    recorded_hz, m = [recorded.rates_of(condition) for condition in range(5)], adjusted.remembering.memory
+    percentiles = percentiles_of(adjusted).astype(np.float32)
+    answered, trace, load, before_s = list[Answered](), 0.0, 0.0, -np.inf
+    for record in session.log.records:
+        tick = session_tick(record.words)
+        if tick is None:
+            continue
         if tick.command is not None:
-            assert tick.command == float(Linear().command(np.float32(tick.rate_hz), percentiles))
-        if counts(tick) and not tick.is_burst:
-            answered.append((tick.delivered, tick.rate_hz))
-            percentiles = np.float32(next(told))
-            np.testing.assert_allclose(percentiles, thresholds_after(recorded_hz, answered), rtol=1e-5)
-    assert next(told, None) is None and len(answered) > 10
+            assert tick.command == float(Thresholds(9).command(np.float32(tick.rate_hz), percentiles))
+        assert ("percentiles_hz" in record.words) == (counts(tick) and not tick.is_burst)
+        if not tick.patterns:
+            continue
+        first_s, last_s = tick.pulse_time_s[0], tick.read_after_s
+        trace = 0.0 if first_s - before_s > 1.0 else trace
+        load = load * np.exp((before_s - last_s) / m.load_s) if m.load_s else 0.0
+        if "percentiles_hz" in record.words:
+            explained = float(np.array([trace, load]) @ adjusted.slopes[:, 0])
+            answered.append((tick.delivered, tick.rate_hz, explained))
+            percentiles = np.float32(record.words["percentiles_hz"])
+            again = thresholds_after(recorded_hz, answered, recorded_ranks=list(adjusted.ranks))
+            np.testing.assert_allclose(percentiles, again, rtol=1e-5)
+        rank = percentileofscore(adjusted.sorted_hz, tick.rate_hz, kind="mean") / 100
+        more = (1 - m.decay) * (rank + m.weight * adjusted.remembering.mean_ranks[tick.delivered]) / (1 + m.weight)
+        trace, load, before_s = (
+            0.5 if tick.is_burst else m.decay * trace + more,
+            load + adjusted.remembering.added,
+            last_s,
+        )
+    assert len(answered) > 10
 
 
+def session_tick(words: dict[str, Any]) -> Tick | None:
+    return Tick.from_dict(words["tick"]) if words.get("tick") else None
+
+
+def percentiles_of(adjusted: AdjustedRanks) -> np.ndarray:
+    return np.percentile(adjusted.sorted_hz, range(0, 101, 10))
+
+
+@pytest.mark.parametrize("memory", [None, MEMORY], ids=["nothing remembered", "memory"])
 def test_in_a_session_thresholds_move_after_every_response_that_counts(
-    recorded: Responses, adjusted: AdjustedRanks, tmp_path: Path
+    memory: Memory | None, recorded: Responses, adjusted: AdjustedRanks, tmp_path: Path
 ) -> None:
-    loop = loop_of(mapping=Linear(), percentiles=percentiles_of(adjusted), adaptive_from=adjusted, burst_threshold=0.95)
+    if memory is not None:
+        adjusted = AdjustedRanks.of(recorded, fit_memory(recorded, memory=memory))
+    # After a pause of more than a second nothing is left of the trace.
+    loop = loop_of(percentiles=percentiles_of(adjusted), adaptive_from=adjusted, burst_threshold=0.95, pause_s=1.5)
     agents = [
         RANDOM,
         Agent("always", "", OneCondition(4), calibrates=False),
@@ -210,20 +267,16 @@ def test_in_a_session_thresholds_move_after_every_response_that_counts(
     ]
     with FakeCulture() as culture:
         session = run_session(culture, loop, agents, tmp_path, episodes=6)
-    adapted(session, recorded, lambda tick: tick.agent == "random")
+    adapted(session, recorded, adjusted, lambda tick: tick.agent == "random")
     assert_read_alike(tmp_path, loop)
-    with pytest.raises(InvalidArgument, match="adaptive_from: expected some responses of each of 4 conditions, of 1 "):
-        loop_of(adaptive_from=adjusted, conditions=CONDITIONS[:4])
+    assert ("memory" in session.log.header["loop"]) and (session.log.header["loop"]["memory"]["load_s"] > 0) == (
+        memory is not None
+    )
 
 
 def test_the_warm_up_and_the_settling_count(recorded: Responses, adjusted: AdjustedRanks, tmp_path: Path) -> None:
     loop = loop_of(
-        mapping=Linear(),
-        percentiles=percentiles_of(adjusted),
-        adaptive_from=adjusted,
-        warm_up=3,
-        settling=1,
-        burst_threshold=0.95,
+        percentiles=percentiles_of(adjusted), adaptive_from=adjusted, warm_up=3, settling=1, burst_threshold=0.95
     )
     # Neither a constant control nor what was drawn in place of a response counts, and the culture's own does.
     agents = [
@@ -232,11 +285,25 @@ def test_the_warm_up_and_the_settling_count(recorded: Responses, adjusted: Adjus
     ]
     with FakeCulture() as culture:
         session = run_session(culture, loop, agents, tmp_path, episodes=2)
-    adapted(session, recorded, lambda tick: tick.handled == "warm-up")
+    adapted(session, recorded, adjusted, lambda tick: tick.handled == "warm-up")
 
 
-def percentiles_of(adjusted: AdjustedRanks) -> np.ndarray:
-    return np.percentile(adjusted.sorted_hz, range(0, 101, 10))
+def test_what_thresholds_cannot_start_from_is_refused(recorded: Responses, adjusted: AdjustedRanks) -> None:
+    for wrong, changed, told in (
+        (adjusted, {"conditions": CONDITIONS[:4]}, "expected responses to each of 4 conditions, .* got \\[40, 37"),
+        (
+            replace(adjusted, ranks=(*adjusted.ranks[:4], adjusted.ranks[4][:0])),
+            {},
+            "each of 5 conditions, .* 0\\] in 1",
+        ),
+        (replace(adjusted, slopes=np.zeros((2, 2))), {}, r"as the loop has \(1\), got .* in 2"),
+        (adjusted.responses_hz, {}, "adaptive_from: expected calibration.adjusted, got tuple"),
+    ):
+        with pytest.raises(InvalidArgument, match=told):
+            loop_of(adaptive_from=wrong, **changed)
+    other = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY)).remembering
+    with pytest.raises(InvalidArgument, match=r"remembering: expected adaptive_from\.remembering"):
+        loop_of(adaptive_from=adjusted, remembering=other)
 
 
 class Tiring(FakeCulture):

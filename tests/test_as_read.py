@@ -16,7 +16,7 @@ from animat.reality_gap.as_read import as_read
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
-from test_adaptive_thresholds import responses_of, thresholds_after
+from test_adaptive_thresholds import Answered, responses_of, thresholds_after
 
 
 def mixed(rng: np.random.Generator, n: int, rises: np.ndarray | float = 0.0) -> Responses:
@@ -65,13 +65,13 @@ def test_a_response_is_above_the_median_where_the_threshold_of_its_time_has_it()
     responses = mixed(np.random.default_rng(3), 600, 0.5)
     left = read(responses)
     recorded = [responses.rates_of(c) for c in range(5)]
-    begun, answered, agree = [each[:100] for each in recorded], list[tuple[int, float]](), 0
+    begun, answered, agree = [each[:100] for each in recorded], list[Answered](), 0
     above = left.rate_hz >= np.median(responses.rate_hz)
     for trial in range(150):
         # Ranks are those of the recording, also where thresholds begin with a part of it.
         p50_hz = thresholds_after(begun, answered, among=np.concatenate(recorded))[5]
         agree += bool((responses.rate_hz[trial] >= p50_hz) == above[trial])
-        answered.append((int(responses.condition[trial]), float(responses.rate_hz[trial])))
+        answered.append((int(responses.condition[trial]), float(responses.rate_hz[trial]), 0.0))
     assert agree >= 149
 
 

@@ -114,9 +114,9 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
 
     # The thresholds adapt to each half on its own, computed again here from the responses before.
-    told = iter([w["percentiles_hz"] for w in session.log.records.words() if w["kind"] == "percentiles"])
+    told = iter([w["percentiles_hz"] for w in session.log.records.words() if "percentiles_hz" in w])
     now, in_force, moved = np.asarray(loop.percentiles, np.float32), list[np.ndarray](), 0
-    answered_hz: list[list[tuple[int, float]]] = [[], []]
+    answered_hz: list[list[tuple[int, float, float]]] = [[], []]
     for tick in session.ticks:
         in_force.append(now)
         if tick.handled == "used":
@@ -127,7 +127,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         if (tick.agent != "constant" or tick.handled == "warm-up") and tick.patterns and not tick.is_burst:
             now = np.asarray(next(told), np.float32)
             for d, of_half in enumerate(answered_hz):
-                of_half.append((tick.delivered, tick.readout_hz[d]))
+                of_half.append((tick.delivered, tick.readout_hz[d], 0.0))
     assert next(told, None) is None
     for d, of_half in enumerate(answered_hz):
         recorded_hz = [responses.read_of(i)[:, d] for i in range(5)]

@@ -21,7 +21,7 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.session import read_session
 from animat.errors import InvalidArgument, InvalidFile
 from animat.watch.app import stop_session
-from animat.watch.session import SessionView, _thinned
+from animat.watch.session import SessionView, _in_force
 from animat.watch.tail import Tail
 from watching import session_in
 
@@ -245,9 +245,13 @@ def test_a_view_is_plain_finite_json(folder: Path) -> None:
         view.view(None, 1e6)
 
 
-@pytest.mark.parametrize("n", [0, 1, 99, 100, 101, 400, 401, 5_000])
-def test_of_thousands_of_thresholds_the_first_comes_and_the_last_hundred(n: int) -> None:
-    thinned = _thinned(list(range(n)))
-    assert len(thinned) <= 400 and thinned == sorted(set(thinned))
-    assert thinned[-100:] == list(range(n))[-100:] and thinned[:1] == list(range(n))[:1]
-    assert len(set(np.diff(thinned[:-100]))) <= 1
+@pytest.mark.parametrize("n", [0, 1, 400, 401, 5_000])
+def test_of_thousands_of_thresholds_those_of_the_span_come_all(n: int) -> None:
+    rows: list[tuple[float, list[float | None]]] = [(float(at), [1.0]) for at in range(n)]
+    thinned = _in_force(rows, [])
+    steps = {later[0] - earlier[0] for earlier, later in itertools.pairwise(thinned)}
+    assert len(thinned) <= 400 and thinned[:1] == rows[:1] and len(steps) <= 1
+    shown = rows[n // 2 : n // 2 + 50]
+    both = _in_force(rows, shown)
+    assert both == sorted(both) and [row for row in both if row in shown] == shown
+    assert {row[0] for row in both} == {row[0] for row in (*thinned, *shown)}

@@ -13,10 +13,11 @@ from animat.neurons.remembering import Remembered
 NEWEST = 100
 """Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones adapt late."""
 LATEST = 5
-"""Of a condition: with five of them 25 trials, some seconds."""
+"""Responses of a condition that the running mean is about: of five conditions 25 trials, some seconds."""
 _SCORES = ndtri(np.linspace(0.0, 1.0, N_PERCENTILES))
-_BETWEEN = 0.01, 0.99
-"""The mean rank of a culture that answers nothing any more, or everything, would move thresholds without end."""
+"""P0, P10, ..., P100 of a normal distribution."""
+_LIMITS = 0.01, 0.99
+"""Of the mean rank 1/2 + d: at 0 and 1 thresholds would be infinite."""
 
 
 class AdaptiveThresholds:
@@ -27,8 +28,10 @@ class AdaptiveThresholds:
     condition keeps the share that it has in the recording, however often it is chosen.
 
     Responses rise and fall within seconds too. Let y be a response's rank without what its history explains
-    (`AdjustedRanks`), and d the difference of two means of y, of about the `LATEST` responses of a condition and of all
-    its newest, on average over the conditions. Then the percentile of the share k is
+    (`AdjustedRanks`), and d_c the difference of two means of y, of about the `LATEST` responses to a condition and of
+    all that are kept of it. d is their mean over the conditions, weighted by w_c: 1 when the condition was given last,
+    and smaller by 1 / (`LATEST` C) with each response to another of the C conditions. Then the percentile of the share
+    k is
 
         P_k = Q(Phi(Phi^-1(k) + sqrt(2) Phi^-1(1/2 + d))),
 
@@ -42,8 +45,7 @@ class AdaptiveThresholds:
     """
 
     def __init__(self, recorded: AdjustedRanks) -> None:
-        part = min(1.0, NEWEST / max(map(len, recorded.ranks)))
-        self._kept = np.array([max(1, round(part * len(each))) for each in recorded.ranks])
+        self._kept = np.array(kept_of(recorded))
         self._first = np.cumsum(self._kept) - self._kept
         newest = [slice(len(each) - kept, None) for each, kept in zip(recorded.ranks, self._kept, strict=True)]
         self._hz, self._ranks = (
@@ -51,7 +53,7 @@ class AdaptiveThresholds:
             for values in (recorded.responses_hz, recorded.ranks)
         )
         self._recorded, self._added = recorded, np.zeros(len(newest), np.int64)
-        self._latest = self._means()
+        self._latest, self._weights = self._means(), np.ones(len(newest))
 
     def add(self, condition: int, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
         """A new non-burst response.
@@ -66,12 +68,15 @@ class AdaptiveThresholds:
         self._ranks[row] = rank = self._recorded.of_response(came, read_hz)
         self._latest[condition] += (rank - self._latest[condition]) / LATEST
         self._added[condition] += 1
+        self._weights *= 1 - 1 / (LATEST * len(self._weights))
+        self._weights[condition] = 1.0
 
     def percentiles(self) -> Float32[np.ndarray, "*readouts percentiles"]:
         """P0, P10, ..., P100 of the culture now, in Hz, shape (11,), or (readouts, 11)."""
-        shares = ndtr(_SCORES + self._risen[:, None])
+        shares, places = ndtr(_SCORES + self._risen[:, None]), np.arange(len(self._hz))
         each = zip(self._hz.reshape(len(self._hz), -1).T, shares, strict=True)
-        found = np.array([np.quantile(hz, share) for hz, share in each], np.float32)
+        # As `np.quantile`, which takes longer than a decision.
+        found = np.array([np.interp(share * places[-1], places, np.sort(hz)) for hz, share in each], np.float32)
         return found.reshape(*self._hz.shape[1:], N_PERCENTILES)
 
     def ranks(self, read_hz: Float64[np.ndarray, "*readouts"]) -> Float64[np.ndarray, " readouts"]:
@@ -83,8 +88,14 @@ class AdaptiveThresholds:
     @property
     def _risen(self) -> Float64[np.ndarray, " readouts"]:
         """How far the latest responses are above the newest, on the normal scale."""
-        above = (self._latest - self._means()).mean(axis=0)
-        return np.asarray(np.sqrt(2) * ndtri(np.clip(0.5 + above, *_BETWEEN)))
+        above = np.average(self._latest - self._means(), axis=0, weights=self._weights)
+        return np.asarray(np.sqrt(2) * ndtri(np.clip(0.5 + above, *_LIMITS)))
 
     def _means(self) -> Float64[np.ndarray, "conditions readouts"]:
         return np.asarray(np.add.reduceat(self._ranks, self._first) / self._kept[:, None])
+
+
+def kept_of(recorded: AdjustedRanks) -> list[int]:
+    """How many responses to each condition of a recording count: `NEWEST` of one, of all conditions the same part."""
+    part = min(1.0, NEWEST / max(map(len, recorded.ranks)))
+    return [max(1, round(part * len(each))) for each in recorded.ranks]

@@ -255,21 +255,23 @@ class Driver:
             tick["neurons"] = loop.remembering.observed(self._remembered)
         tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
         self._unmoved = stretch, stimuli, dict(tick)
+        adapted: dict[str, Any] = {}
         try:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and that was to stop it"))
             if not (again or is_warm_up):
                 tick |= self._move(agent, read.x_hz, read.is_burst, iteration)
+            if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
+                self._adaptive.add(delivered, came, np.asarray(read.x_hz))
+                self._percentiles = self._adaptive.percentiles()
+                adapted["percentiles_hz"] = self._percentiles.tolist()
         finally:
             # Whatever happens to the robot, what the culture did is written down.
             finished = Tick(**tick)
-            self.records.append(seen_in(stretch, stimuli, vars(finished)))
+            record = seen_in(stretch, stimuli, vars(finished))
+            record.words.update(adapted)
+            self.records.append(record)
             self._unmoved = None
-        if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not read.is_burst:
-            self._adaptive.add(delivered, came, np.asarray(read.x_hz))
-            self._percentiles = self._adaptive.percentiles()
-            told = {"kind": "percentiles", "episode": episode, "percentiles_hz": self._percentiles.tolist()}
-            self.records.append(Record(told))
         return finished, again
 
     def _move(

@@ -68,8 +68,8 @@ class Loop:
             that has rested answers otherwise than in a recording. The responses count for adaptive thresholds. None:
             2 where an action is one pulse, 0 where it is several, which are each other's past.
         settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode. A recording
-            tires a culture more than a loop does. The culture recovers in the first minute, and thresholds lag behind.
-            None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
+            tires a culture more than a loop does. The culture recovers in the first minute. None: `SETTLINGS` where
+            thresholds adapt and an action is one pulse, else 0.
         patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
             the robot, and whoever acts, may take.
         real_time: whether a culture that is faster is held back to real time.
@@ -116,14 +116,7 @@ class Loop:
         _ = self.presentation
         _ = self.encoder
         if self.adaptive_from is not None:
-            ranks, (_, readouts) = self.adaptive_from.ranks, self.adaptive_from.slopes.shape
-            if (len(ranks), readouts) != (len(self.conditions), len(self.readouts)) or not all(map(len, ranks)):
-                raise InvalidArgument(
-                    f"adaptive_from: expected some responses of each of {len(self.conditions)} conditions, of "
-                    f"{len(self.readouts)} readouts, got {[len(each) for each in ranks]}, of {readouts}"
-                )
-            if self.remembering not in (None, self.adaptive_from.remembering):
-                raise InvalidArgument("remembering: expected that of adaptive_from, got another recording's")
+            self._check_start(self.adaptive_from)
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
@@ -143,6 +136,19 @@ class Loop:
             raise InvalidArgument("patience_s: expected above 0 s, got 0: nothing answers at once")
         if self.patterns is not None and self.patterns < 1:
             raise InvalidArgument(f"patterns: expected at least 1, got {self.patterns}")
+
+    def _check_start(self, recorded: AdjustedRanks) -> None:
+        """Thresholds start from responses that they can be of."""
+        if not isinstance(recorded, AdjustedRanks):
+            raise InvalidArgument(f"adaptive_from: expected calibration.adjusted, got {type(recorded).__name__}")
+        n, shape = [len(each) for each in recorded.ranks], (len(self.conditions), len(self.readouts))
+        if (len(n), recorded.slopes.shape[1]) != shape or not all(n):
+            raise InvalidArgument(
+                f"adaptive_from: expected responses to each of {shape[0]} conditions, in as many readouts as the loop "
+                f"has ({shape[1]}), got {n} in {recorded.slopes.shape[1]}"
+            )
+        if self.remembering not in (None, recorded.remembering):
+            raise InvalidArgument("remembering: expected adaptive_from.remembering, got another one")
 
     def rounds_before(self, episode: int, *, is_silent: bool) -> list[int]:
         """How often each condition is presented after each of the pauses before an episode."""
@@ -203,8 +209,8 @@ class Loop:
         """As plain data, for the log of a session."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain["adaptive"] = plain.pop("adaptive_from") is not None
-        remembering = plain.pop("remembering")
-        plain |= {} if remembering is None else {"memory": remembering.to_dict()}
+        _ = plain.pop("remembering")
+        plain |= {} if self.history is None else {"memory": self.history.to_dict()}
         return plain | {
             **body_and_goal(self.robot),
             "mapping": mapping_to_data(self.mapping),

@@ -25,7 +25,6 @@ from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, Unusa
 from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan
 from animat.live.trainers import Exchange, Trainers
 from animat.neurons.kinds import Kind
-from animat.neurons.simulator import pooled_percentiles
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Part, Progress, in_phase
 from animat.reality_gap import Calibration, RealityGap, run_policies
@@ -128,9 +127,8 @@ def live(
     run = _Run(training, culture, protocol, Path(folder), timetable, kind, account or Account(), progress)
     try:
         policies = run.shadow()
-        calibration = Calibration.of_series(run.used, at_min=run.used[-1].start_min, adaptive=adaptive, kind=kind)
-        if training.percentiles == "first":
-            calibration = calibration.with_percentiles(pooled_percentiles(run.used[0]))
+        first, at_min = next(iter(policies.values())), run.used[-1].start_min
+        calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
         # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
         with exclusive_lock(run.folder / SESSION):
             gap = run_policies(

@@ -95,15 +95,16 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     passes: list[Bool[np.ndarray, "*readouts"]] = []
     read_hz: list[Sequence[float]] = []
     for words in session.log.records.words():
-        if words["kind"] == "percentiles":
+        before_hz, tick = p50_hz, words.get("tick")
+        # Those that a tick moved count from the next one on; logs of before have records of their own.
+        if "percentiles_hz" in words:
             p50_hz = np.array(words["percentiles_hz"], np.float64)[..., N_PERCENTILES // 2]
-        tick = words.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
         if tick["iteration"] >= 0 and tick["episode"] in place:
             moved = tick["handled"] == "used"
             read_hz.append(tick.get("readout_hz") or [tick["rate_hz"]])
-            passes.append(loop.readouts.alone(np.array(read_hz[-1])) >= p50_hz)
+            passes.append(loop.readouts.alone(np.array(read_hz[-1])) >= before_hz)
             acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved))
         presented.append(
             (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])

@@ -1,4 +1,4 @@
-"""A recording's responses as a loop would have read them, whose thresholds adapt."""
+"""A recording's responses as a loop with adaptive thresholds would have read them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from animat.closed_loop.adaptive import NEWEST, AdaptiveThresholds
+from animat.closed_loop.adaptive import AdaptiveThresholds, kept_of
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.remembering import Remembered
 from animat.responses.responses import Responses
@@ -16,9 +16,9 @@ def as_read(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     """Each response at the recording's quantile of the rank that it has for adaptive thresholds at its time.
 
     Responses rise and fall together, over seconds and minutes. Thresholds that adapt follow that, and it disturbs the
-    controller less. A simulator draws responses of all times, and has all of it for chance. So a recording is read
+    controller less. A simulator draws responses of all times, and takes all of it for chance. So a recording is read
     once more, by thresholds that begin with the first responses of each condition and adapt after each trial
-    (`animat.closed_loop.adaptive`). A simulator of what they read has only what is left for chance.
+    (`animat.closed_loop.adaptive`). A simulator of what they read takes only the rest for chance.
 
     Args:
         responses: of a recording that is not in blocks, where conditions and times are one.
@@ -27,8 +27,7 @@ def as_read(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     Returns:
         x of what is read, all channels or readouts; the rest is as it was.
     """
-    part = min(1.0, NEWEST / max(map(len, adjusted.ranks)))
-    first = [slice(max(1, round(part * len(each)))) for each in adjusted.ranks]
+    first = [slice(kept) for kept in kept_of(adjusted)]
     first_hz, first_ranks = (
         tuple(each[of] for each, of in zip(values, first, strict=True))
         for values in (adjusted.responses_hz, adjusted.ranks)

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float64
 
+from animat.coding.mapping import Thresholds
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
@@ -68,7 +69,7 @@ class Calibration:
 
     @property
     def remembering(self) -> Remembering:
-        """How a loop's responses become the history state of its simulator."""
+        """How a loop's responses become the history state, with the memory of the recording's own simulator."""
         return self.adjusted.remembering
 
     @classmethod
@@ -87,10 +88,12 @@ class Calibration:
 
         Args:
             series: in any order.
-            policy: its last simulator in training is the one that is taken, its thresholds fixed if they were then.
+            policy: its last simulator in training is the one that is taken. Where the loop's thresholds are fixed, they
+                are those that it was trained with.
             at_min: the minute whose newest recording is taken instead; None without a policy: the last.
             adaptive: whether the loop's thresholds will adapt, or are fixed. Of thresholds that adapt, simulators are
-                made of responses as these read them (`animat.reality_gap.as_read`), but of recordings in blocks.
+                made of responses as these read them (`animat.reality_gap.as_read`), except for recordings in blocks and
+                for policies with other mappings than 1 and 9 thresholds.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
         Raises:
@@ -105,19 +108,22 @@ class Calibration:
         start_min = float(timeline.start_min[timeline.row_asked_for(at_min)])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
-        simulator = timeline.at(start_min)
-        adjusted = AdjustedRanks.of(responses, simulator)
+        recorded = simulator = timeline.at(start_min)
+        adjusted = AdjustedRanks.of(responses, recorded)
         # All of one shape: what runs on them is compiled once.
         fit["room"] = room_for(series)
         answers = responses
-        if adaptive and not responses.is_blocked:
+        if adaptive and not responses.is_blocked and (policy is None or isinstance(policy.mapping, Thresholds)):
             answers = as_read(responses, adjusted)
-            simulator = fit_simulator(answers, **fit)
+            # The loop shows policies what the recording's own simulator remembers.
+            known = recorded.memory if isinstance(recorded, MemorySimulator) else None
+            sees = policy is not None and policy.neural_observation
+            simulator = fit_simulator(answers, **fit, memory=known if sees else None)
         # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
         fit["memory"] = simulator.memory if isinstance(simulator, MemorySimulator) else None
         calibration = cls(
             adaptive=adaptive,
-            percentiles=np.asarray(timeline.at(start_min).percentiles, np.float64),
+            percentiles=np.asarray(recorded.percentiles, np.float64),
             simulator=simulator,
             bootstraps=tuple(fit_simulator(answers.bootstrapped(rng), **fit) for _ in range(BOOTSTRAPS)),
             burst_threshold=responses.threshold,
@@ -132,7 +138,7 @@ class Calibration:
             readouts=timeline.readouts,
             adjusted=adjusted,
         )
-        if policy is None or policy.percentiles != "first":
+        if adaptive or policy is None or policy.percentiles != "first":
             return calibration
         return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
 

@@ -36,7 +36,7 @@ class Predicted(NamedTuple):
     Attributes:
         returns: of its episodes on the simulator of the recording, shape (episodes,).
         anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
-            as the recording's responses and, a little, as 200 episodes do.
+            as the recording's responses and, a little, as its episodes do.
         passes: in all its episodes on the simulator of the recording, shape (conditions,).
         passes_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
     """

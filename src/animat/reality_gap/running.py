@@ -88,7 +88,7 @@ def run_policies(
     Args:
         policies: by name, of one robot, mapping and set of conditions.
         culture: open.
-        calibration: percentiles, burst threshold and prediction.
+        calibration: percentiles, whether they adapt, burst threshold and prediction.
         episodes: of each policy, and at most of each control.
         with_controls: all of them; if not, only the random one.
         with_coupling: the best coupling on the calibration's simulator too, which is searched for first.

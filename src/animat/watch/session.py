@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,11 @@ class SessionView(View):
         shown = self._between(from_s, to_s)
         ticks = [(at, tick) for at, record in shown if (tick := self._tick(at, record)) is not None]
         ticks = [(at, tick) for at, tick in ticks if (tick["time_s"] or 0.0) <= to_s]
+        adapted = [
+            (span[1], first_readout(record.words["percentiles_hz"]))
+            for _, record in shown
+            if "percentiles_hz" in record.words and (span := _span(record.words)) is not None
+        ]
         spikes, counts = packed([record for _, record in shown], from_s, to_s, len(self._header.channels))
         return {
             "generation": self.tail.generation,
@@ -110,6 +116,7 @@ class SessionView(View):
             "picture": next((at for at, tick in ticks[::-1] if tick["observation"]), None),
             "is_found": is_whole,
             **self._so_far(),
+            "percentiles": _in_force(self._sums.percentiles, adapted),
         }
 
     def tick_at(self, at: int) -> tuple[Record, list[list[float | None]]] | None:
@@ -180,7 +187,6 @@ class SessionView(View):
             "unanswered": _unanswered(outline),
             "faults": sums.faults,
             "n_faults": sums.n_faults,
-            "percentiles": _thinned(sums.percentiles),
             "episodes_done": done,
             "time_left": time_left(left_s, state),
             "agents": self._agents,
@@ -266,6 +272,8 @@ class SessionView(View):
         }
 
 
+_Row = tuple[float, list[float | None]]
+"""When thresholds were set anew, and the percentiles in Hz since then."""
 _TRAIL = 400
 """Ticks that are looked back at for a robot's trail."""
 _NUMBERS = (
@@ -302,7 +310,10 @@ def _unanswered(outline: Outline) -> int | None:
         return None
 
 
-def _thinned(rows: list[Any], most: int = 400, whole: int = 100) -> list[Any]:
-    """At most so many of them: the last ones whole, as they are shown trial by trial, and evenly those before."""
-    before, last = rows[:-whole], rows[-whole:]
-    return [*before[:: max(1, math.ceil(len(before) / (most - whole)))], *last]
+def _in_force(rows: Sequence[_Row], shown: Sequence[_Row], most: int = 400) -> list[_Row]:
+    """Those of a session, at most so many and evenly, and all of the span that is shown."""
+    rows = rows[:: max(1, math.ceil(len(rows) / most))]
+    if not shown:
+        return list(rows)
+    from_s, to_s = shown[0][0], shown[-1][0]
+    return [*(row for row in rows if row[0] < from_s), *shown, *(row for row in rows if row[0] > to_s)]

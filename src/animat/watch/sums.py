@@ -13,6 +13,8 @@ from animat.watch.plain import number, numbers, text, whole
 from animat.watch.tail import Tail
 
 _MOST_TOLD = 50
+_MOST_THRESHOLDS = 20_000
+"""Of a session's; of a longer one every second is kept, and so on."""
 """Faults that are told."""
 _LOOKS = 64
 """Records between two looks at the clock."""
@@ -75,8 +77,11 @@ class Sums:
                 self.n_faults += 1
                 when, what = number(words.get("asked_at_s")), f"{text(words['what'])}: {text(words['message'])}"
                 self.faults = [*self.faults, (when, what)][-_MOST_TOLD:]
-            elif kind == "percentiles":
+            # Sessions of before have records of their own for them.
+            if "percentiles_hz" in words:
                 self.percentiles.append((self._end_s, first_readout(words["percentiles_hz"])))
+                if len(self.percentiles) > _MOST_THRESHOLDS:
+                    del self.percentiles[1::2]
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
             self.strange += 1
         self.totals.append(total)
