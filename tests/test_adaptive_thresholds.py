@@ -66,6 +66,18 @@ def thresholds_after(
     recorded_ranks: list[np.ndarray] | None = None,
 ) -> np.ndarray:
     """P0 to P100, computed again with SciPy's ranks, lists and NumPy's quantiles."""
+    pooled, by = newest_after(recorded_hz, answered, among=among, recorded_ranks=recorded_ranks)
+    return np.quantile(pooled, norm.cdf(norm.ppf(np.linspace(0, 1, 11)) + by)).astype(np.float32)
+
+
+def newest_after(
+    recorded_hz: list[np.ndarray],
+    answered: list[Answered],
+    *,
+    among: np.ndarray | None = None,
+    recorded_ranks: list[np.ndarray] | None = None,
+) -> tuple[list[float], float]:
+    """The newest responses, and how far the latest are above them on the normal scale."""
     everything = np.concatenate(recorded_hz) if among is None else among
 
     def ranks(values: list[float]) -> list[float]:
@@ -91,8 +103,7 @@ def thresholds_after(
     given = [condition for condition, _, _ in answered]
     since = [given[::-1].index(c) if c in given else len(given) for c in range(len(recorded_hz))]
     weights = (1 - 1 / (LATEST * len(recorded_hz))) ** np.array(since)
-    by = np.sqrt(2) * norm.ppf(np.clip(0.5 + np.average(above, weights=weights), 0.01, 0.99))
-    return np.quantile(pooled, norm.cdf(norm.ppf(np.linspace(0, 1, 11)) + by)).astype(np.float32)
+    return pooled, float(np.sqrt(2) * norm.ppf(np.clip(0.5 + np.average(above, weights=weights), 0.01, 0.99)))
 
 
 @settings(max_examples=40, deadline=None)
@@ -115,10 +126,12 @@ def test_thresholds_follow_the_newest_of_each_condition_and_nothing_else(data: s
 def test_when_all_responses_rise_on_a_normal_scale_thresholds_rise_with_them(by: float) -> None:
     rng = np.random.default_rng(2)
     recorded = responses_of(np.tile([0, 1], 10_000), np.exp(rng.normal(size=20_000)))
-    adjusted = AdjustedRanks.of(recorded, fit_empirical(recorded))
-    found = []
-    for _ in range(200):
-        thresholds = AdaptiveThresholds(adjusted)
+    adjusted, found = AdjustedRanks.of(recorded, fit_empirical(recorded)), []
+    for _ in range(300):
+        some = rng.choice(10_000, 100, replace=False)
+        newest = ([each[some] for each in values] for values in (adjusted.responses_hz, adjusted.ranks))
+        responses_hz, ranks = map(tuple, newest)
+        thresholds = AdaptiveThresholds(replace(adjusted, responses_hz=responses_hz, ranks=ranks))
         for turn, x in enumerate(np.exp(rng.normal(size=60) + by)):
             thresholds.add(turn % 2, Remembered(), np.array(x))
         found.append(np.log(thresholds.percentiles()[5]))

@@ -6,17 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import spearmanr
+from scipy.stats import norm, percentileofscore, spearmanr
 
+from animat.coding.mapping import Linear
 from animat.neurons.adjusted_rank import AdjustedRanks
-from animat.neurons.memory import fit_memory
+from animat.neurons.history import Memory, Ranked
+from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import fit_empirical
 from animat.reality_gap import Calibration
 from animat.reality_gap.as_read import as_read
+from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
+from animat.robots import Cartpole
 from animat.stimulation.protocol import Presentation
-from test_adaptive_thresholds import Answered, responses_of, thresholds_after
+from fake_culture import FakeCulture
+from test_adaptive_thresholds import MEMORY, PROTOCOL, Answered, newest_after, responses_of
+from test_reality_gap import policy_of
 
 
 def mixed(rng: np.random.Generator, n: int, rises: np.ndarray | float = 0.0) -> Responses:
@@ -61,18 +67,24 @@ def test_independent_responses_stay_nearly_as_they_are() -> None:
     assert np.corrcoef(np.log(independent.rate_hz), np.log(left.rate_hz))[0, 1] > 0.97
 
 
-def test_a_response_is_above_the_median_where_the_threshold_of_its_time_has_it() -> None:
-    responses = mixed(np.random.default_rng(3), 600, 0.5)
-    left = read(responses)
-    recorded = [responses.rates_of(c) for c in range(5)]
-    begun, answered, agree = [each[:100] for each in recorded], list[Answered](), 0
-    above = left.rate_hz >= np.median(responses.rate_hz)
-    for trial in range(150):
-        # Ranks are those of the recording, also where thresholds begin with a part of it.
-        p50_hz = thresholds_after(begun, answered, among=np.concatenate(recorded))[5]
-        agree += bool((responses.rate_hz[trial] >= p50_hz) == above[trial])
-        answered.append((int(responses.condition[trial]), float(responses.rate_hz[trial]), 0.0))
-    assert agree >= 149
+def test_each_response_is_at_the_rank_that_it_has_for_the_thresholds_before_it() -> None:
+    """Computed again with SciPy's ranks, and with trace and load as a recording has them."""
+    with FakeCulture() as culture:
+        recorded = extract_responses(culture.record(PROTOCOL, 0), burst_threshold=0.95)
+    adjusted = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY))
+    left, ranked = as_read(recorded, adjusted), Ranked(recorded)
+    history = np.stack([ranked.traces(MEMORY), ranked.loads(MEMORY.load_s).at], axis=1)
+    explained, everything = history @ adjusted.slopes[:, 0], np.sort(np.concatenate(adjusted.responses_hz))
+    answered: list[Answered] = []
+    for trial in range(len(recorded)):
+        x, ranks = recorded.rate_hz[trial], list(adjusted.ranks)
+        pooled, by = newest_after(list(adjusted.responses_hz), answered, among=everything, recorded_ranks=ranks)
+        rank = norm.cdf(norm.ppf(percentileofscore(pooled, x, kind="mean") / 100) - by)
+        assert left.rate_hz[trial] == pytest.approx(np.quantile(everything, rank), rel=1e-5)
+        if not recorded.is_burst[trial]:
+            answered.append((int(recorded.condition[trial]), float(x), float(explained[trial])))
+    presented, place = left.presentations
+    np.testing.assert_array_equal(presented.rate_hz[place], left.rate_hz)
 
 
 def test_of_readouts_each_is_read_by_its_own_and_bursts_move_nothing() -> None:
@@ -103,9 +115,24 @@ def test_who_predicts_with_it() -> None:
         for name in ("values_hz", "percentiles"):
             np.testing.assert_array_equal(getattr(found.simulator, name), getattr(fit_empirical(wanted), name))
         np.testing.assert_array_equal(np.concatenate(found.responses_hz), np.concatenate(fixed.responses_hz))
-    # What neurons remember is looked for in what is read, too.
-    remembers = Calibration.of_series([responses], kind="memory")
-    np.testing.assert_array_equal(
-        np.asarray(remembers.simulator.percentiles),
-        np.asarray(fit_memory(as_read(responses, remembers.adjusted)).percentiles),
+    # Thresholds stand between percentiles; other mappings may not, and read the recording as it is.
+    linear = Calibration.of_series([responses], policy_of(0, [responses], mapping=Linear()), kind="empirical")
+    np.testing.assert_array_equal(linear.simulator.percentiles, fixed.simulator.percentiles)
+
+
+def test_what_policies_see_of_the_neurons_is_remembered_as_the_loop_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    with FakeCulture() as culture:
+        recorded = extract_responses(culture.record(PROTOCOL, 0), burst_threshold=0.95)
+    own_hz, other = np.sort(recorded.non_burst_rate_hz), Memory(0.15, 1.0, 0.8, 0.0)
+    found = lambda ranked: MEMORY if np.array_equal(ranked.sorted_hz, own_hz) else other  # noqa: E731
+    monkeypatch.setattr("animat.neurons.memory._found", found)
+    weights = tuple(np.zeros(size, np.float32) for size in ((6, 16), (16, 16), (16, 5)))
+    seeing = policy_of(
+        0, [recorded], Cartpole(), weights=weights, scales=np.ones(6, np.float32), neural_observation=True
     )
+    blind, sees = (Calibration.of_series([recorded], policy, kind="memory") for policy in (None, seeing))
+    # The policy's trace in the loop is made with the memory of the recording, whatever is found in what is read.
+    for each, wanted in ((blind, other), (sees, MEMORY)):
+        assert isinstance(each.simulator, MemorySimulator)
+        assert each.simulator.memory == pytest.approx(wanted)
+        assert each.remembering.memory == pytest.approx(MEMORY)

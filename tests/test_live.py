@@ -156,6 +156,7 @@ def test_the_loop_runs_with_what_was_trained_on_last(ran: tuple[LiveRun, Path, i
     gap = found.gap
     assert gap.session.ending.by == "plan"
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
+    assert gap.loop.adaptive_from is not None
     series = [extract_responses(recording) for recording in read_recordings([folder / "recordings"])]
     expected = fit_timeline(series).simulators.percentiles[-1]
     np.testing.assert_array_equal(gap.loop.percentiles, np.asarray(expected))
@@ -196,8 +197,10 @@ def test_a_virtual_culture_s_state_lies_beside_its_recordings(tmp_path: Path, mo
 def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Path) -> None:
     account = Account(Budget(pulses=2 * PULSES + 100))
     with FakeCulture() as culture:
-        found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1, account=account)
+        given: dict[str, Any] = {"timetable": QUICK, "episodes": 1, "account": account, "adaptive": False}
+        found = live(ONE, culture, PROTOCOL, tmp_path / "live", **given)
         assert culture.delivered == account.pulses <= 2 * PULSES + 100
+    assert found.gap.loop.adaptive_from is None
     assert len(found.recordings) == 2
     assert len(found.swaps) == 1
     assert found.culture_min == pytest.approx(30.0)

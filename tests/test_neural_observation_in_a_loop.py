@@ -68,6 +68,16 @@ def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, r
         )
 
 
+def test_along_a_recording_it_is_the_state_of_its_trials_also_of_those_without_a_condition(
+    responses: Responses,
+) -> None:
+    for each in (responses, responses.only([0, 4])):
+        ranked = Ranked(each)
+        found = Remembering.of(each, fit_memory(each, memory=MEMORY)).along(each)
+        np.testing.assert_allclose(found[:, 0], ranked.traces(MEMORY), atol=1e-6)
+        np.testing.assert_allclose(found[:, 1], ranked.loads(MEMORY.load_s).at, atol=1e-6)
+
+
 def test_without_memory_it_is_what_simulators_without_memory_show(responses: Responses) -> None:
     blank = Remembering.of(responses, fit_simulator(responses, kind="histogram", bins=20, range_hz=None))
     state = blank.after(Remembered(), 2, 30.0, is_burst=False)

@@ -77,7 +77,7 @@ class Remembering:
         return Remembered(float(trace), came.load + self.added, came.at_s)
 
     def along(self, responses: Responses) -> Float64[np.ndarray, "responses 2"]:
-        """Trace and load when the trial of each response of a recording comes."""
+        """Trace and load when the trial of each response comes; where times are not known there is no load."""
         presented, place = responses.presentations
         n = len(presented.condition)
         times_s = np.zeros(n) if presented.time_s is None else presented.time_s
@@ -89,8 +89,6 @@ class Remembering:
             came = self.when(state, at_s, is_rested=is_rested)
             states[trial] = came.trace, came.load
             state = self.after(came, condition, rate_hz, is_burst=is_burst)
-        if presented.time_s is None:
-            states[:, 1] = AT_FIRST[1]
         return np.asarray(states[place])
 
     def observed(self, state: Remembered) -> tuple[float, float]:
