@@ -371,19 +371,22 @@ def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, 
     for each in (fixed.simulator, *fixed.bootstraps):
         np.testing.assert_array_equal(each.percentiles, calibration.simulator.percentiles)
     policy = policy_of(0, series, provenance={"training": {"percentiles": "first"}})
-    first = Calibration.of_series(series, policy, at_min=series[-1].start_min)
-    for each in (first.simulator, *first.bootstraps):
-        np.testing.assert_array_equal(each.percentiles, pooled_percentiles(series[0]))
     for adaptive in (True, False):
+        first = Calibration.of_series(series, policy, at_min=series[-1].start_min, adaptive=adaptive)
+        # Thresholds that adapt are the culture's own, however the policy was trained.
+        held = {tuple(np.asarray(each.percentiles).tolist()) for each in (first.simulator, *first.bootstraps)}
+        assert (held == {tuple(pooled_percentiles(series[0]).tolist())}) == (not adaptive)
+        np.testing.assert_array_equal(first.percentiles, pooled_percentiles(series[-1 if adaptive else 0]))
         with FakeCulture() as culture:
-            calibration = replace(first, adaptive=adaptive)
             folder = tmp_path / str(adaptive)
-            gap = run_policies({"p": policy}, culture, calibration, folder, episodes=1, with_controls=False)
+            gap = run_policies({"p": policy}, culture, first, folder, episodes=1, with_controls=False)
         assert ("moving-percentiles" in [finding.name for finding in gap.findings]) == adaptive
-    gap, _ = run(tmp_path / "fixed", series, with_controls=False, adaptive=False)
-    other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
-    assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
-    np.testing.assert_array_equal(gap.rows[0].predicted, other.rows[0].predicted)
+    gap, policies = run(tmp_path / "fixed", series, with_controls=False, adaptive=False)
+    both = networks_of(list(policies.values()), greedy=True)
+    environment = Animat(policies["p0"].robot, Thresholds(1), 5)
+    recorded = fit_timeline(series).at(series[-1].start_min)
+    rolled = roll_out(environment, recorded, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, 0))
+    np.testing.assert_array_equal(gap.rows[1].predicted[:EPISODES], rolled.returns[0])
 
 
 @pytest.mark.oracle
@@ -585,15 +588,17 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     first, last = series[0].start_min, series[1].start_min
     training = {"shadowing": True, "duration_min": 60.0, "chunks": 60, "percentiles": "moving"}
 
-    def calibrated(**changed: Any) -> Calibration:
-        return Calibration.of_series(series, policy_of(0, series, provenance={"training": training | changed}))
+    def calibrated(adaptive: bool = True, **changed: Any) -> Calibration:
+        policy = policy_of(0, series, provenance={"training": training | changed})
+        return Calibration.of_series(series, policy, adaptive=adaptive)
 
     assert calibrated().start_min == last
     assert calibrated(shadowing=False).start_min == first
     assert calibrated(duration_min=last - first - 0.1).start_min == first
-    held = calibrated(percentiles="first")
+    held = calibrated(percentiles="first", adaptive=False)
     assert held.start_min == last
     np.testing.assert_array_equal(held.percentiles, calibrated(shadowing=False).percentiles)
+    np.testing.assert_array_equal(calibrated(percentiles="first").percentiles, calibrated().percentiles)
     assert calibrated().burst_threshold == series[1].threshold
     assert Calibration.of_series(series).start_min == last
     assert Calibration.of_series(series, at_min=first).start_min == first
