@@ -23,6 +23,7 @@ from animat.neurons.remembering import Remembered, Remembering
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.predicting import EPISODES, roll_out_seed
 from animat.recordings.recording import Recording
+from animat.responses.conditions import NO_CONDITION
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole
@@ -68,14 +69,17 @@ def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, r
         )
 
 
-def test_along_a_recording_it_is_the_state_of_its_trials_also_of_those_without_a_condition(
-    responses: Responses,
-) -> None:
-    for each in (responses, responses.only([0, 4])):
-        ranked = Ranked(each)
-        found = Remembering.of(each, fit_memory(each, memory=MEMORY)).along(each)
-        np.testing.assert_allclose(found[:, 0], ranked.traces(MEMORY), atol=1e-6)
-        np.testing.assert_allclose(found[:, 1], ranked.loads(MEMORY.load_s).at, atol=1e-6)
+def test_trials_without_a_condition_are_remembered_too(responses: Responses) -> None:
+    some = responses.only([0, 4])
+    of_some = Remembering.of(some, fit_memory(some, memory=MEMORY))
+    (presented, place), state, states = some.presentations, Remembered(), []
+    assert presented.time_s is not None and (presented.condition == NO_CONDITION).any()
+    columns = (presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, presented.time_s)
+    for condition, rate_hz, is_burst, is_rested, at_s in zip(*columns, strict=True):
+        came = of_some.when(state, at_s, is_rested=is_rested)
+        states.append((came.trace, came.load))
+        state = of_some.after(came, condition, rate_hz, is_burst=is_burst)
+    np.testing.assert_allclose(np.array(states)[place], Ranked(some).states(MEMORY), atol=1e-6)
 
 
 def test_without_memory_it_is_what_simulators_without_memory_show(responses: Responses) -> None:

@@ -387,6 +387,8 @@ def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, 
     recorded = fit_timeline(series).at(series[-1].start_min)
     rolled = roll_out(environment, recorded, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, 0))
     np.testing.assert_array_equal(gap.rows[1].predicted[:EPISODES], rolled.returns[0])
+    other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
+    assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
 
 
 @pytest.mark.oracle

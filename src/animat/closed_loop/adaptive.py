@@ -8,6 +8,7 @@ from scipy.special import ndtr, ndtri
 
 from animat.coding.mapping import N_PERCENTILES
 from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history import ranks_among
 from animat.neurons.remembering import Remembered
 
 NEWEST = 100
@@ -82,7 +83,7 @@ class AdaptiveThresholds:
     def ranks(self, read_hz: Float64[np.ndarray, "*readouts"]) -> Float64[np.ndarray, " readouts"]:
         """The share of the culture's responses that lie below one, as they are now; ties half."""
         each = zip(self._hz.reshape(len(self._hz), -1).T, np.atleast_1d(read_hz), strict=True)
-        among = np.array([(np.mean(hz < x) + np.mean(hz <= x)) / 2 for hz, x in each])
+        among = np.array([ranks_among(np.sort(hz), np.array([x]))[0] for hz, x in each])
         return np.asarray(ndtr(ndtri(among) - self._risen))
 
     @property

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.history import NO_MEMORY, ranks_among
+from animat.neurons.history import NO_MEMORY, Ranked, ranks_among
 from animat.neurons.remembering import Remembered, Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.responses import Responses
@@ -49,7 +49,7 @@ class AdjustedRanks:
             responses.read_hz[usable],
         )
         sorted_hz, memory = np.sort(read_hz.T, axis=-1), remembering.memory
-        history = remembering.along(responses)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
+        history = Ranked(responses).states(memory)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
         ranks = _ranks(sorted_hz, read_hz)
         given = np.concatenate([np.eye(n_conditions)[condition], history], axis=1)
         slopes = np.linalg.lstsq(given, ranks, rcond=None)[0][n_conditions:]

@@ -89,6 +89,10 @@ class Ranked:
         """The trace before each response."""
         return np.asarray(self.recorded(memory)[0][self._place])
 
+    def states(self, memory: Memory) -> Float64[np.ndarray, "responses 2"]:
+        """Trace and load before each response."""
+        return np.stack([self.traces(memory), self.loads(memory.load_s).at], axis=-1)
+
     def recorded(
         self, memory: Memory
     ) -> tuple[Float64[np.ndarray, " presentations"], Float64[np.ndarray, " presentations"]]:

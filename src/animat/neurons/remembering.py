@@ -76,21 +76,6 @@ class Remembering:
         trace = 0.5 if is_burst else self.memory.decay * came.trace + more
         return Remembered(float(trace), came.load + self.added, came.at_s)
 
-    def along(self, responses: Responses) -> Float64[np.ndarray, "responses 2"]:
-        """Trace and load when the trial of each response comes; where times are not known there is no load."""
-        presented, place = responses.presentations
-        n = len(presented.condition)
-        times_s = np.zeros(n) if presented.time_s is None else presented.time_s
-        each = zip(
-            presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, times_s, strict=True
-        )
-        state, states = Remembered(), np.empty((n, 2))
-        for trial, (condition, rate_hz, is_burst, is_rested, at_s) in enumerate(each):
-            came = self.when(state, at_s, is_rested=is_rested)
-            states[trial] = came.trace, came.load
-            state = self.after(came, condition, rate_hz, is_burst=is_burst)
-        return np.asarray(states[place])
-
     def observed(self, state: Remembered) -> tuple[float, float]:
         """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""
         if self.memory == NO_MEMORY:

@@ -8,6 +8,7 @@ import numpy as np
 
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_of
 from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history import Ranked
 from animat.neurons.remembering import Remembered
 from animat.responses.responses import Responses
 
@@ -33,7 +34,8 @@ def as_read(responses: Responses, adjusted: AdjustedRanks) -> Responses:
         for values in (adjusted.responses_hz, adjusted.ranks)
     )
     thresholds = AdaptiveThresholds(replace(adjusted, responses_hz=first_hz, ranks=first_ranks))
-    read_hz, came, found = responses.read_hz, adjusted.remembering.along(responses), []
+    read_hz, found = responses.read_hz, []
+    came = Ranked(responses).states(adjusted.remembering.memory)
     for condition, x_hz, history, is_burst in zip(responses.condition, read_hz, came, responses.is_burst, strict=True):
         found.append(thresholds.ranks(x_hz))
         if not is_burst:

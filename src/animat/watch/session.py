@@ -311,9 +311,10 @@ def _unanswered(outline: Outline) -> int | None:
 
 
 def _in_force(rows: Sequence[_Row], shown: Sequence[_Row], most: int = 400) -> list[_Row]:
-    """Those of a session, at most so many and evenly, and all of the span that is shown."""
-    rows = rows[:: max(1, math.ceil(len(rows) / most))]
+    """Those of a session, at most so many and evenly, the last one among them, and all of the span that is shown."""
+    step = max(1, math.ceil(len(rows) / most))
+    rows = [*rows[:-1:step], *rows[-1:]]
     if not shown:
-        return list(rows)
+        return rows
     from_s, to_s = shown[0][0], shown[-1][0]
     return [*(row for row in rows if row[0] < from_s), *shown, *(row for row in rows if row[0] > to_s)]

@@ -13,9 +13,9 @@ from animat.watch.plain import number, numbers, text, whole
 from animat.watch.tail import Tail
 
 _MOST_TOLD = 50
+"""Faults that are told."""
 _MOST_THRESHOLDS = 20_000
 """Of a session's; of a longer one every second is kept, and so on."""
-"""Faults that are told."""
 _LOOKS = 64
 """Records between two looks at the clock."""
 
