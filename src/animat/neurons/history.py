@@ -139,7 +139,7 @@ def ranks_among(
     sorted_hz: Float64[np.ndarray, " others"], rate_hz: Float64[np.ndarray, " values"]
 ) -> Float64[np.ndarray, " values"]:
     """The share of some responses, which are sorted, that lies below each of others; ties half."""
-    below, no_larger = (np.searchsorted(sorted_hz, rate_hz, side=side) for side in ("left", "right"))
+    below, no_larger = sorted_hz.searchsorted(rate_hz, "left"), sorted_hz.searchsorted(rate_hz, "right")
     return np.asarray((below + no_larger) / (2 * len(sorted_hz)))
 
 

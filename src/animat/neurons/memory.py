@@ -18,7 +18,8 @@ from animat.responses.responses import Responses
 from animat.tables import briefly
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
-_WEIGHTS = (0.0, 0.5, 1.0)
+_WEIGHTS = (0.0, 0.5, 1.0, 2.0, 4.0)
+"""The larger ones suit few channels, whose response tells less of the network than the stimulus does."""
 _EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
 _LOAD_S = 1.0
 """Settled on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s this one told the responses in their closed loops best."""
@@ -115,7 +116,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     """Keep every condition's non-burst responses, and what was before them, to draw from.
 
     What is remembered, and the neighbour exponent, are found by leaving out each response in turn and telling it, in
-    rank, by the mean of its neighbours. Of twelve ways to make a trace the one with the smallest error is taken, and
+    rank, by the mean of its neighbours. Of twenty ways to make a trace the one with the smallest error is taken, and
     of its exponents the largest that is as good as the best, up to one standard error of the difference. Where nothing
     tells responses better than no history at all does, by two standard errors, there is no memory in the simulator
     either. Where there is, and the times of the trials are known, a load of one second is taken too if it explains
