@@ -548,6 +548,27 @@ def independent(seed: int, n: int = 500) -> Responses:
     )
 
 
+def network(seed: int, spikes: float, n: int = 3000) -> Responses:
+    """Responses of a network that answers less the more active it has just been, read by so many spikes each."""
+    rng = np.random.default_rng(seed)
+    condition, x = rng.integers(0, 5, n), np.zeros(n)
+    before = 0.5
+    for i, c in enumerate(condition):
+        activity = (0.4 + 0.15 * c) * rng.gamma(10, 0.1) * (1.5 - before)
+        x[i] = rng.poisson(spikes * activity)
+        before = 0.3 * before + 0.7 * min(activity, 1.0)
+    return replace(independent(seed, n), condition=condition, rate_hz=x)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_fewer_the_spikes_the_more_the_stimulus_tells_of_what_was_answered(seed: int) -> None:
+    many = fit_memory(network(seed, spikes=300)).memory
+    few = fit_memory(network(seed, spikes=3)).memory
+    # The network's own: what it remembers is its activity, which so many spikes tell as it is.
+    assert (many.decay, many.weight) == (pytest.approx(0.3), 0.0)
+    assert few.weight >= 2
+
+
 @pytest.mark.oracle
 def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator() -> None:
     none = 0
