@@ -97,7 +97,7 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
 
     step = jax.jit(environment.step)
     rng = np.random.default_rng(0)
-    returns, presented, passed = [], np.zeros(3), np.zeros(3)
+    returns, presented, commanded, squared = [], np.zeros(3), np.zeros(3), np.zeros(3)
     for episode in range(100):
         state, total, key = environment.reset(jax.random.key(0)), 0.0, jax.random.key(1000 + episode)
         while True:
@@ -106,7 +106,8 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
             state = step(use, state, jnp.int32(action), simulator)
             total += float(state.reward)
             presented[int(state.info["delivered"])] += 1
-            passed[int(state.info["delivered"])] += float(state.info["rate_hz"]) >= float(simulator.percentiles[5])
+            commanded[int(state.info["delivered"])] += float(state.info["command"])
+            squared[int(state.info["delivered"])] += float(state.info["command"]) ** 2
             if state.ended.terminated or state.ended.truncated:
                 break
         returns.append(total)
@@ -115,9 +116,9 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
     assert rolled.presented.sum() == rolled.lengths.sum()
     often = presented > 30
     np.testing.assert_allclose(rolled.presented[0] / rolled.presented.sum(), presented / presented.sum(), atol=0.05)
-    share, n = passed[often] / presented[often], presented[often]
-    error_of_share = np.sqrt(share * (1 - share) / n + 1e-4)
-    assert np.all(np.abs(rolled.passed[0][often] / rolled.presented[0][often] - share) < 4 * error_of_share)
+    mean, n = commanded[often] / presented[often], presented[often]
+    error_of_mean = np.sqrt((squared[often] / n - mean**2) / n + 1e-4)
+    assert np.all(np.abs(rolled.commanded[0][often] / rolled.presented[0][often] - mean) < 4 * error_of_mean)
 
 
 def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> None:

@@ -256,13 +256,13 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.02, 0.6, high).startswith("the policies do not outperform random (p = 0.02; ")
     at = float(policies.predicted.mean())
     assert verdict(0.001, 0.9, at).endswith("of the pairs of episodes or more)")
-    looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, how often"
+    looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
     for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         told = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
             "(looked for: "
         )
-        assert f"{told}{looked} responses pass P50)" in verdict(0.001, 0.9, measured)
+        assert f"{told}{looked} commands)" in verdict(0.001, 0.9, measured)
     uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
         f"; their measured return is 20.0 less than predicted, within what the recording's responses ({gap.responses}) "
@@ -278,16 +278,17 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
     gap, policies, told = without_controls
     assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
     assert gap.loop.adaptive_from is not None
-    thresholds, passed = AdaptiveThresholds(gap.loop.adaptive_from), []
+    thresholds, commands = AdaptiveThresholds(gap.loop.adaptive_from), []
+    mapping = next(iter(policies.values())).mapping
     ticks = [tick for tick in gap.session.ticks if tick.agent in policies]
     for tick in gap.session.ticks:
         if tick.agent in policies:
-            passed.append(tick.rate_hz >= thresholds.percentiles()[5])
+            commands.append(float(mapping.command(np.float32(tick.rate_hz), thresholds.percentiles())))
         if not tick.is_burst:
             # Two pulses a trial: neurons remember nothing.
             thresholds.add(tick.delivered, Remembered(), np.array(tick.rate_hz))
     found = answered(gap.session, gap.loop, tuple(policies))
-    np.testing.assert_array_equal(found.passed, passed)
+    np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
     np.testing.assert_array_equal(found.responses.rate_hz, [tick.rate_hz for tick in ticks])
     np.testing.assert_array_equal(found.responses.time_s, [tick.read_after_s for tick in ticks])
@@ -295,8 +296,8 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
     np.testing.assert_allclose(np.sort(found.returns), np.sort(gap.rows[0].measured))
     rewards = np.bincount(found.episode, [tick.reward or 0.0 for tick in ticks])
     np.testing.assert_allclose(rewards, found.returns)
-    assert found.passes.presented.sum() == len(ticks)
-    assert found.passes.passed.sum() == sum(passed)
+    assert found.commanded.presented.sum() == len(ticks)
+    np.testing.assert_allclose(found.commanded.total.sum(), sum(commands))
     # What the culture was presented between is there too, for what it may remember.
     assert len(found.responses.presentations[0].condition) == len(list(gap.session.ticks))
 

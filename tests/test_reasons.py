@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
-from animat.reality_gap.answered import Answered, Passes
+from animat.reality_gap.answered import Answered, Commanded
 from animat.reality_gap.predicting import Predicted
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.responses.condition import Condition
@@ -24,21 +24,31 @@ RECORDED, EPISODES, ACTIONS = 200, 20, 40
 EVERY = np.arange(EPISODES * ACTIONS)
 
 
-def session(seed: int, *, gap: int = -1, **changed: Any) -> Evidence:
+def session(
+    seed: int, *, gap: int = -1, thresholds: int = 1, means_hz: np.ndarray = MEANS_HZ, **changed: Any
+) -> Evidence:
     """A synthetic one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
     one condition more or less; what is told of it is changed by functions of the arrays."""
     rng = np.random.default_rng(seed)
-    recorded = rng.normal(MEANS_HZ[:, None], 4.0, (2, RECORDED))
+    recorded = rng.normal(means_hz[:, None], 4.0, (2, RECORDED))
 
-    def passed(responses: np.ndarray) -> np.ndarray:
-        median = np.median(responses, axis=(-2, -1), keepdims=True)
-        return np.asarray(np.count_nonzero(responses >= median, axis=-1))
+    def commands(responses: np.ndarray, recorded: np.ndarray) -> np.ndarray:
+        """The share of the thresholds that are passed, from -1 to +1."""
+        shares = np.arange(1, thresholds + 1) / (thresholds + 1)
+        at = np.quantile(recorded, shares, axis=(-2, -1))[..., None, None]
+        return np.asarray(2 * np.mean(responses >= at, axis=0) - 1)
+
+    def summed(responses: np.ndarray) -> np.ndarray:
+        return commands(responses, responses).sum(axis=-1)
 
     drawn = rng.integers(0, RECORDED, (100, 2, RECORDED))
-    anew = passed(np.take_along_axis(np.broadcast_to(recorded, drawn.shape), drawn, axis=-1))
+    anew = summed(np.take_along_axis(np.broadcast_to(recorded, drawn.shape), drawn, axis=-1))
     everywhere = np.full(2, RECORDED)
     predicted = Predicted(
-        np.zeros(1), np.zeros(1), Passes(everywhere, passed(recorded)), Passes(everywhere + 0 * anew, anew)
+        np.zeros(1),
+        np.zeros(1),
+        Commanded(everywhere, summed(recorded)),
+        Commanded(everywhere + 0 * drawn[..., 0], anew),
     )
     calibration: Any = SimpleNamespace(
         responses_hz=tuple(recorded),
@@ -50,7 +60,7 @@ def session(seed: int, *, gap: int = -1, **changed: Any) -> Evidence:
     episode = np.repeat(np.arange(EPISODES), ACTIONS)
     prefers = rng.uniform(0.2, 0.8, EPISODES)
     condition = (rng.random(len(EVERY)) < prefers[episode]).astype(np.int64)
-    rate_hz = rng.normal(MEANS_HZ[condition], 4.0)
+    rate_hz = rng.normal(means_hz[condition], 4.0)
     is_burst = rng.random(len(EVERY)) < 0.02
     late_s = np.where(rng.random(len(EVERY)) < 0.02, 0.0002, 0.0)
     returns = rng.normal(0.0, 30.0, EPISODES)
@@ -72,8 +82,8 @@ def session(seed: int, *, gap: int = -1, **changed: Any) -> Evidence:
         presented=Presented(condition, told["rate_hz"], told["is_burst"], np.zeros(len(EVERY), bool)),
         place=EVERY,
     )
-    above = told["rate_hz"] >= np.median(recorded)
-    answered = Answered(responses, episode, told["late_s"], np.ones(len(EVERY), bool), above, told["returns"])
+    command = commands(told["rate_hz"][None], recorded)[0]
+    answered = Answered(responses, episode, told["late_s"], np.ones(len(EVERY), bool), command, told["returns"])
     return Evidence(answered, calibration, predicted, gap)  # type: ignore[arg-type]
 
 
@@ -112,7 +122,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "memory": ({"rate_hz": remembering}, "the culture remembers: after a response that passes the median"),
     "answers": (
         {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
-        "responses pass P50 more or less often than predicted: 80 Hz in 0.",
+        "conditions lead to other mean commands than predicted: 80 Hz to ",
     ),
 }
 
@@ -125,7 +135,7 @@ def test_a_reason_is_named_with_its_number_where_the_session_has_it(name: str) -
     for seed in range(20):
         named = {found.name: found.message for found in reasons(session(seed, **changed))}
         assert words in named.pop(name)
-        # What is changed may show in the share that passes P50 too.
+        # What is changed may show in the commands too.
         others += [other for other in named if other != "answers"]
     assert len(others) <= binom.isf(1e-4, 20, len(CHECKS) * LEVEL)
 
@@ -142,7 +152,7 @@ def test_where_there_is_no_reason_hardly_one_is_named() -> None:
 
 
 def test_what_differs_between_episodes_is_no_reason() -> None:
-    """Each episode's responses are larger or smaller as a whole: that is no trend, and no other share in all."""
+    """Each episode's responses are larger or smaller as a whole: that is no trend, and no other command in all."""
 
     def uneven(seed: int) -> Any:
         offsets = np.random.default_rng([seed, 1]).normal(0.0, 2.0, EPISODES)
@@ -171,7 +181,7 @@ def test_a_simulator_that_remembers_is_not_told_that_it_does_not() -> None:
     assert "memory" not in {f.name for f in reasons(session(1, rate_hz=remembering, calibration=knows))}
 
 
-def test_of_few_episodes_no_trend_and_no_share_is_told() -> None:
+def test_of_few_episodes_no_trend_and_no_command_is_told() -> None:
     evidence = session(1, **CASES["answers"][0])
     answered = evidence.answered
     kept = answered.episode < 7
@@ -184,10 +194,31 @@ def test_of_few_episodes_no_trend_and_no_share_is_told() -> None:
                 for name in ("condition", "rate_hz", "active_ratio", "is_burst", "time_s", "place")
             },
         ),
-        **{name: getattr(answered, name)[kept] for name in ("episode", "late_s", "moved", "passed")},
+        **{name: getattr(answered, name)[kept] for name in ("episode", "late_s", "moved", "command")},
         returns=answered.returns[:7],
     )
     assert reasons(replace(evidence, answered=few)) == ()
+
+
+def test_of_nine_thresholds_commands_tell_what_the_median_alone_does_not() -> None:
+    """80 Hz passes the median always, and less of the thresholds above it: its responses fall, and stay above."""
+
+    def lower(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
+        return rate_hz - 6.0 * (condition == 1)
+
+    for seed in range(20):
+        of_one, of_nine = (
+            {
+                found.name: found
+                for found in reasons(session(seed, thresholds=n, means_hz=np.array([0.0, 30.0]), rate_hz=lower))
+            }
+            for n in (1, 9)
+        )
+        assert "answers" not in of_one
+        assert "80 Hz to " in of_nine["answers"].message
+        # Of the four thresholds above the median, which are P20 to P80 of 80 Hz, lower by 1.5 standard deviations.
+        of_each = norm.sf(norm.ppf([0.2, 0.4, 0.6, 0.8]) + 1.5) - [0.8, 0.6, 0.4, 0.2]
+        assert of_nine["answers"].value == pytest.approx(2 * of_each.sum() / 9, abs=0.15)
 
 
 def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
@@ -198,18 +229,20 @@ def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
             readouts=Readouts(("left", "right"), ((1,), (2,))),
             readout_hz=np.stack([one.responses.rate_hz for one in each], axis=1),
         )
-        answered = replace(each[0], responses=responses, passed=np.stack([one.passed for one in each], axis=1))
+        answered = replace(each[0], responses=responses, command=np.stack([one.command for one in each], axis=1))
         told = left.predicted
-        passes, anew = (Passes(p.presented, np.stack([p.passed] * 2, -1)) for p in (told.passes, told.passes_anew))
+        once, anew = (
+            Commanded(each.presented, np.stack([each.total] * 2, -1)) for each in (told.commanded, told.commanded_anew)
+        )
         recorded = tuple(np.stack([x, x], axis=1) for x in left.calibration.responses_hz)
         calibration: Any = SimpleNamespace(**{**vars(left.calibration), "responses_hz": recorded})
-        return Evidence(answered, calibration, told._replace(passes=passes, passes_anew=anew), -1)
+        return Evidence(answered, calibration, told._replace(commanded=once, commanded_anew=anew), -1)
 
-    check = CHECKS["how often responses pass P50"]
+    check = CHECKS["mean commands"]
     same, other = session(3), session(3, rate_hz=lambda condition, rate_hz: rate_hz - 3.0)
     assert check(on_halves(same, same)) is None
     found, alone = check(on_halves(same, other)), check(other)
     assert found is not None and alone is not None
-    assert "80 Hz on right in " in found.message and "on left" not in found.message
+    assert "80 Hz on right to " in found.message and "on left" not in found.message
     # What is told of it is what would be told of it alone.
     assert found.message.replace(" on right", "") == alone.message

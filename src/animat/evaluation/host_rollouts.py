@@ -8,11 +8,9 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from animat.coding.mapping import N_PERCENTILES
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
@@ -39,7 +37,7 @@ class Counts(NamedTuple):
     lengths: np.ndarray
     terminated: np.ndarray
     presented: np.ndarray
-    passed: np.ndarray
+    commanded: np.ndarray
 
 
 def roll_out_on_host(
@@ -76,7 +74,7 @@ def roll_out_on_host(
             for whole, part in zip(counts[:3], wave[:3], strict=True):
                 whole[some, here] = part[:, : here.stop - first]
             counts.presented[some] += wave.presented
-            counts.passed[some] += wave.passed
+            counts.commanded[some] += wave.commanded
     return counts
 
 
@@ -104,7 +102,7 @@ def paths_on_host(
         state = _started(environment, alone, 1)._replace(robot=bodies.begin()[None])
         observations[number] = state.robot[0]
         for iteration in range(robot.episode_limit):
-            command, state, _, _ = _iteration(environment, simulator, actor, alone, np.int32(iteration), state)
+            command, state, _ = _iteration(environment, simulator, actor, alone, np.int32(iteration), state)
             stepped = bodies.step(np.asarray(command).reshape(1, -1))
             commands[number, iteration] = np.asarray(command)[0].reshape(of_each)
             observations[number, iteration + 1 :] = stepped.observation
@@ -136,7 +134,7 @@ def _wave(
     counts = _nothing(environment, simulator, shape)
     of_actor = np.indices(shape)[0]
     for iteration in range(robot.episode_limit):
-        command, state, delivered, passes = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
+        command, state, delivered = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
         stepped = bodies.step(np.asarray(command).reshape(len(seeds), -1))
         counts.returns[:] += np.where(going, stepped.reward.reshape(shape), 0.0)
         counts.lengths[:] += going
@@ -144,7 +142,7 @@ def _wave(
         if counts.presented.size:
             at = of_actor[going], np.asarray(delivered)[going]
             np.add.at(counts.presented, at, 1)
-            np.add.at(counts.passed, at, np.asarray(passes)[going])
+            np.add.at(counts.commanded, at, np.asarray(command)[going])
         going &= ~stepped.ended.reshape(shape)
         if not going.any():
             break
@@ -167,13 +165,13 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
 def _nothing(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
     """Of so many actors and episodes."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    readouts = () if simulator is None else simulator.percentiles.shape[:-1]
+    commands = () if environment.robot.n_commands == 1 else (environment.robot.n_commands,)
     return Counts(
         np.zeros(shape),
         np.zeros(shape, np.int64),
         np.zeros(shape, bool),
         np.zeros((shape[0], n), np.int64),
-        np.zeros((shape[0], n, *readouts), np.int64),
+        np.zeros((shape[0], n, *commands)),
     )
 
 
@@ -190,10 +188,10 @@ def _iteration(
     keys: Key[Array, " actors"],
     iteration: Array,
     state: State,
-) -> tuple[Float[Array, "actors episodes *commands"], State, Array, Array]:
-    """Commands, the state that the neurons leave, what was delivered, and whether the answer was P50 or more."""
+) -> tuple[Float[Array, "actors episodes *commands"], State, Array]:
+    """Commands, the state that the neurons leave, and what was delivered."""
 
-    def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array, Array]:
+    def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn
         uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales
@@ -201,9 +199,6 @@ def _iteration(
         delivered, answer, command = jax.vmap(environment.respond, (0, 0, 0, None))(
             uniforms[:, n_drawn:], state, action, simulator
         )
-        passes = jnp.zeros(n, bool)
-        if simulator is not None:
-            passes = answer.rate_hz >= simulator.percentiles[..., N_PERCENTILES // 2]
-        return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered, passes
+        return command, state._replace(iteration=state.iteration + 1, neurons=answer.history), delivered
 
     return jax.vmap(of_actor)(actors, keys, state)

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
-from animat.coding.mapping import N_PERCENTILES
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.errors import InvalidArgument, shown
@@ -109,8 +108,8 @@ class Episodes:
         terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
         presented: how often the neurons got each condition, in all episodes together, shape (actors, conditions); no
             conditions without neurons.
-        passed: how often the response was P50 or more, the same shape; of several readouts each on its own, shape
-            (actors, conditions, readouts).
+        commanded: the sum of the commands that each condition led to, the same shape; of several commands each on its
+            own, shape (actors, conditions, commands).
         outcome: what each came to, of a robot with a goal; shapes (actors, episodes), and with a last axis of
             objectives.
     """
@@ -121,7 +120,7 @@ class Episodes:
     lengths: Int64[np.ndarray, "actors episodes"]
     terminated: Bool[np.ndarray, "actors episodes"]
     presented: Int64[np.ndarray, "actors conditions"]
-    passed: Int64[np.ndarray, "actors conditions *readouts"]
+    commanded: Float64[np.ndarray, "actors conditions *commands"]
     outcome: Outcome | None = None
 
 
@@ -195,10 +194,18 @@ def roll_out(
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
-    returns, *counted, terminated, outcome = _roll_out(environment, episodes, simulator, actors, keys)
-    lengths, presented, passed = (np.asarray(each, np.int64) for each in counted)
+    returns, lengths, presented, commanded, terminated, outcome = _roll_out(
+        environment, episodes, simulator, actors, keys
+    )
     came_to = None if outcome is None else Outcome(*(np.asarray(each) for each in outcome))  # type: ignore[arg-type]
-    return Episodes(np.asarray(returns, np.float64), lengths, np.asarray(terminated), presented, passed, came_to)
+    return Episodes(
+        np.asarray(returns, np.float64),
+        np.asarray(lengths, np.int64),
+        np.asarray(terminated),
+        np.asarray(presented, np.int64),
+        np.asarray(commanded, np.float64),
+        came_to,
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)
@@ -210,7 +217,7 @@ def _roll_out(
     keys: Key[Array, " actors"],
 ) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    readouts = () if simulator is None else simulator.percentiles.shape[:-1]
+    commands = () if environment.robot.n_commands == 1 else (environment.robot.n_commands,)
     n_drawn = environment.n_drawn
 
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
@@ -221,13 +228,13 @@ def _roll_out(
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),
             jnp.zeros(n_conditions, jnp.int32),
-            jnp.zeros((n_conditions, *readouts), jnp.int32),
+            jnp.zeros((n_conditions, *commands)),
             jnp.zeros(episodes, bool),
         )
         return carry, jax.random.split(key, environment.robot.episode_limit)
 
     def iteration(carry: tuple[Any, ...], actor: Actor, key: PRNGKeyArray) -> tuple[Any, ...]:
-        state, going, returns, lengths, presented, passed, terminated = carry
+        state, going, returns, lengths, presented, commanded, terminated = carry
         uniforms = jax.random.uniform(key, (episodes, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales
         action = actor.act(environment, observation, uniforms[:, :n_drawn])
@@ -238,12 +245,10 @@ def _roll_out(
         lengths = lengths + going
         if simulator is not None:
             delivered = going[:, None] & (after.info["delivered"][:, None] == jnp.arange(n_conditions))
-            passes = after.info["rate_hz"] >= simulator.percentiles[..., N_PERCENTILES // 2]
             presented = presented + delivered.sum(axis=0)
-            of_each = delivered.reshape(*delivered.shape, *(1 for _ in readouts))
-            passed = passed + (of_each & passes[:, None]).sum(axis=0)
+            commanded = commanded + jnp.tensordot(delivered.T.astype(jnp.float32), after.info["command"], 1)
         going = going & ~jnp.logical_or(*after.ended)
-        return after.carried, going, returns, lengths, presented, passed, terminated
+        return after.carried, going, returns, lengths, presented, commanded, terminated
 
     # The loop is outside of the `vmap`, and ends with the last episode: controls fail long before the limit.
     first, of_iteration = jax.vmap(begin)(keys)

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session
-from animat.coding.mapping import N_PERCENTILES
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
 from animat.responses.extraction import SILENCE_S
@@ -19,28 +18,28 @@ from animat.responses.responses import Presented, Responses
 from animat.robots.base import Robot
 
 
-class Passes(NamedTuple):
-    """Counts of each condition.
+class Commanded(NamedTuple):
+    """What each condition led to.
 
     Attributes:
-        presented: how often, shape (..., conditions).
-        passed: how often the response was P50 or more, the same shape; of several readouts each on its own, shape
-            (..., conditions, readouts).
+        presented: how often it was presented, shape (..., conditions).
+        total: the sum of its commands, the same shape; of several commands each on its own, shape (..., conditions,
+            commands).
     """
 
     presented: Int64[np.ndarray, "*any conditions"]
-    passed: Int64[np.ndarray, "*any"]
+    total: Float64[np.ndarray, "*any"]
 
     @property
-    def share(self) -> Float64[np.ndarray, "*any"]:
-        """P(x >= P50) of each condition, in the shape of `passed`; NaN for one that was never presented."""
-        of_several = self.passed.ndim > self.presented.ndim
+    def mean(self) -> Float64[np.ndarray, "*any"]:
+        """The mean command of each condition, in the shape of `total`; NaN for one that was never presented."""
+        of_several = self.total.ndim > self.presented.ndim
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.passed / (self.presented[..., None] if of_several else self.presented))
+            return np.asarray(self.total / (self.presented[..., None] if of_several else self.presented))
 
-    def summed(self, axis: int) -> Passes:
+    def summed(self, axis: int) -> Commanded:
         """Over policies or episodes."""
-        return Passes(self.presented.sum(axis=axis), self.passed.sum(axis=axis))
+        return Commanded(self.presented.sum(axis=axis), self.total.sum(axis=axis))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +51,8 @@ class Answered:
         episode: which of `returns` each one belongs to, shape (responses,).
         late_s: by how much its pulses came late, shape (responses,).
         moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
-        passed: whether it was P50 or more, as P50 was held or had followed by then, shape (responses,); of several
-            readouts each on its own, shape (responses, readouts).
+        command: that it moved the robot with, shape (responses,); of several commands each on its own, shape
+            (responses, commands). NaN where it did not move it.
         returns: of the episodes, in the order of time, shape (episodes,).
     """
 
@@ -61,17 +60,18 @@ class Answered:
     episode: Int64[np.ndarray, " responses"]
     late_s: Float64[np.ndarray, " responses"]
     moved: Bool[np.ndarray, " responses"]
-    passed: Bool[np.ndarray, "responses *readouts"]
+    command: Float64[np.ndarray, "responses *commands"]
     returns: Float64[np.ndarray, " episodes"]
 
     @property
-    def passes(self) -> Passes:
+    def commanded(self) -> Commanded:
         """Of the responses that moved the robot in each episode, shape (episodes, conditions)."""
-        shape, readouts = (len(self.returns), len(self.responses.conditions)), self.passed.shape[1:]
-        presented, passed = np.zeros(shape, np.int64), np.zeros((*shape, *readouts), np.int64)
-        np.add.at(presented, (self.episode, self.responses.condition), self.moved)
-        np.add.at(passed, (self.episode[self.moved], self.responses.condition[self.moved]), self.passed[self.moved])
-        return Passes(presented, passed)
+        shape, moved = (len(self.returns), len(self.responses.conditions)), self.moved
+        presented, total = np.zeros(shape, np.int64), np.zeros((*shape, *self.command.shape[1:]))
+        at = self.episode[moved], self.responses.condition[moved]
+        np.add.at(presented, at, 1)
+        np.add.at(total, at, self.command[moved])
+        return Commanded(presented, total)
 
     @property
     def span_min(self) -> float:
@@ -89,22 +89,19 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     """
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
     place = {each.number: row for row, each in enumerate(whole)}
-    p50_hz = np.asarray(loop.percentiles, np.float64)[..., N_PERCENTILES // 2]
     presented: list[tuple[int, float, bool, float, float]] = []
     acted: list[tuple[int, int, float, float, bool]] = []
-    passes: list[Bool[np.ndarray, "*readouts"]] = []
+    of_each = loop.decoder.percentiles_shape[:-1]
+    nothing, commands = np.full(of_each, np.nan).tolist(), []
     read_hz: list[Sequence[float]] = []
     for words in session.log.records.words():
-        before_hz, tick = p50_hz, words.get("tick")
-        # Those that a tick moved count from the next one on; logs of before have records of their own.
-        if "percentiles_hz" in words:
-            p50_hz = np.array(words["percentiles_hz"], np.float64)[..., N_PERCENTILES // 2]
+        tick = words.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
         if tick["iteration"] >= 0 and tick["episode"] in place:
             moved = tick["handled"] == "used"
             read_hz.append(tick.get("readout_hz") or [tick["rate_hz"]])
-            passes.append(loop.readouts.alone(np.array(read_hz[-1])) >= before_hz)
+            commands.append(tick["command"] if moved else nothing)
             acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved))
         presented.append(
             (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])
@@ -134,8 +131,8 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
         readout_hz=None if loop.readouts.are_all else x_hz,
     )
     returns = np.array([each.total for each in whole], np.float64)
-    passed = np.array(passes, bool).reshape(len(acted), *loop.decoder.percentiles_shape[:-1])
-    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), passed, returns)
+    command = np.array(commands, np.float64).reshape(len(acted), *of_each)
+    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
 
 
 def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:

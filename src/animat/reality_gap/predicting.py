@@ -17,7 +17,7 @@ from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
 from animat.evaluation.rollouts import Episodes, Uniform, roll_out
 from animat.progress import Progress, Silent
-from animat.reality_gap.answered import Passes
+from animat.reality_gap.answered import Commanded
 from animat.reality_gap.calibration import Calibration
 from animat.robots.host import HostRobot
 
@@ -37,19 +37,19 @@ class Predicted(NamedTuple):
         returns: of its episodes on the simulator of the recording, shape (episodes,).
         anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
             as the recording's responses and, a little, as its episodes do.
-        passes: in all its episodes on the simulator of the recording, shape (conditions,).
-        passes_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
+        commanded: in all its episodes on the simulator of the recording, shape (conditions,).
+        commanded_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
     """
 
     returns: Float64[np.ndarray, " episodes"]
     anew: Float64[np.ndarray, " bootstraps"]
-    passes: Passes
-    passes_anew: Passes
+    commanded: Commanded
+    commanded_anew: Commanded
 
     @property
     def presented(self) -> Float64[np.ndarray, " conditions"]:
         """How often each condition is presented in an episode, on average."""
-        return np.asarray(self.passes.presented / len(self.returns))
+        return np.asarray(self.commanded.presented / len(self.returns))
 
 
 def together(predicted: Sequence[Predicted]) -> Predicted:
@@ -57,13 +57,13 @@ def together(predicted: Sequence[Predicted]) -> Predicted:
     return Predicted(
         np.concatenate([each.returns for each in predicted]),
         np.mean([each.anew for each in predicted], axis=0),
-        _stacked([each.passes for each in predicted]).summed(0),
-        _stacked([each.passes_anew for each in predicted]).summed(0),
+        _stacked([each.commanded for each in predicted]).summed(0),
+        _stacked([each.commanded_anew for each in predicted]).summed(0),
     )
 
 
-def _stacked(passes: Sequence[Passes]) -> Passes:
-    return Passes(*(np.array(counts) for counts in zip(*passes, strict=True)))
+def _stacked(commanded: Sequence[Commanded]) -> Commanded:
+    return Commanded(*(np.array(sums) for sums in zip(*commanded, strict=True)))
 
 
 def predict(
@@ -114,15 +114,15 @@ def predict(
             progress.update(number, len(acting), control.name)
             episodes = list(side_by_side(rolled, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
-            passes = _stacked([Passes(each.presented, each.passed) for each in episodes])
+            commanded = _stacked([Commanded(each.presented, each.commanded) for each in episodes])
             rows = {control.name: [*range(control.n_actors)]} if number else {name: [i] for i, name in enumerate(names)}
             for name, of in rows.items():
-                each = Passes(*(counts[:, of] for counts in passes)).summed(1)
+                each = Commanded(*(sums[:, of] for sums in commanded)).summed(1)
                 found[name] = Predicted(
                     returns[:ROLL_OUTS, of].ravel(),
                     returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
-                    Passes(*(counts[:ROLL_OUTS] for counts in each)).summed(0),
-                    Passes(*(counts[ROLL_OUTS:] for counts in each)),
+                    Commanded(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
+                    Commanded(*(sums[ROLL_OUTS:] for sums in each)),
                 )
     return found
 

@@ -26,8 +26,8 @@ LEAST_LATE = 0.05
 LEAST_BURSTS, _FEWEST_BURSTS = 0.05, 5
 LEAST_TREND = 0.1
 """Change over the session, of a condition's mean response."""
-LEAST_SHARE = 0.05
-"""Difference in P(x >= P50)."""
+LEAST_COMMAND = 0.1
+"""Difference in a condition's mean command."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,19 +150,20 @@ def memory(evidence: Evidence) -> Finding | None:
 
 
 def answers(evidence: Evidence) -> Finding | None:
-    """Responses to a condition pass P50 more or less often than those of the simulator did under the same policies.
+    """Conditions lead to other commands than they did on the simulator under the same policies.
 
-    t = (p - q) / sqrt(s^2 + r^2), with episodes - 1 degrees of freedom; p: of the session, s its error from what
-    differs between episodes; q: on the simulator, r its error from simulators of responses drawn anew. Neither error is
-    taken to be smaller than that of as many independent responses (Agresti and Coull 1998).
+    t = (u - v) / sqrt(s^2 + r^2), with episodes - 1 degrees of freedom; u: the mean command of the session, s its error
+    from what differs between episodes; v: on the simulator, r its error from simulators of responses drawn anew.
+    Neither error is taken to be smaller than that of as many independent responses, if each were -1 or +1 (Agresti and
+    Coull 1998).
     """
     from scipy.stats import t as student
 
-    measured, predicted = evidence.answered.passes, evidence.predicted
-    episodes, recorded_hz = len(measured.passed), evidence.calibration.responses_hz
+    measured, predicted = evidence.answered.commanded, evidence.predicted
+    episodes, recorded_hz = len(measured.presented), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
         return None
-    conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.passes.presented > 0))
+    conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
     names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
     # Of one readout there is no axis.
     of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
@@ -170,26 +171,27 @@ def answers(evidence: Evidence) -> Finding | None:
     told, most = [], 0.0
     for i, of in tested:
         at: Any = (i, *of)
-        n, passed = measured.presented[:, i], measured.passed[:, *at]
-        share, expected = float(passed.sum() / n.sum()), float(predicted.passes.share[at])
-        between = episodes / (episodes - 1) * float(np.sum((passed - share * n) ** 2)) / float(n.sum()) ** 2
-        error = max(between, _variance(share, int(n.sum()))) ** 0.5
-        anew = float(np.nanvar(predicted.passes_anew.share[:, *at]))
+        n, total = measured.presented[:, i], measured.total[:, *at]
+        mean, expected = float(total.sum() / n.sum()), float(predicted.commanded.mean[at])
+        between = episodes / (episodes - 1) * float(np.sum((total - mean * n) ** 2)) / float(n.sum()) ** 2
+        error = max(between, _variance(mean, int(n.sum()))) ** 0.5
+        anew = float(np.nanvar(predicted.commanded_anew.mean[:, *at]))
         expected_error = max(anew, _variance(expected, len(recorded_hz[i]))) ** 0.5
-        difference = share - expected
+        difference = mean - expected
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
-        if p < LEVEL / len(tested) and abs(difference) >= LEAST_SHARE:
+        if p < LEVEL / len(tested) and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
             measured_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
             on = f" on {names[of[0]]}" if of else ""
             told.append(
-                f"{_conditions(evidence)[i].label}{on} in {share:.2f} +- {error:.2f} ({expected:.2f} +- "
+                f"{_conditions(evidence)[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
                 f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, "
                 f"{recorded_hz[i][:, *of].mean():.3g} in the recording)"
             )
     if not told:
         return None
-    return Finding("answers", "note", f"responses pass P50 more or less often than predicted: {', '.join(told)}", most)
+    message = f"conditions lead to other mean commands than predicted: {', '.join(told)}"
+    return Finding("answers", "note", message, most)
 
 
 CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
@@ -199,14 +201,15 @@ CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
     "bursts": bursts,
     "a trend over the session": trend,
     "memory": memory,
-    "how often responses pass P50": answers,
+    "mean commands": answers,
 }
 """What is looked for, in words."""
 
 
-def _variance(share: float, n: int) -> float:
-    near = (share * n + 2) / (n + 4)
-    return near * (1 - near) / (n + 4)
+def _variance(command: float, n: int) -> float:
+    """Of the mean of n commands that are -1 or +1."""
+    near = ((command + 1) / 2 * n + 2) / (n + 4)
+    return 4 * near * (1 - near) / (n + 4)
 
 
 def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
