@@ -7,6 +7,7 @@ import os
 import random
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import pytest
 from animat.cli import _parse, main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.execution.cluster import Cluster
-from animat.execution.dask_worker import made_of
+from animat.execution.dask_worker import _own_cores, made_of
 from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.local_cluster import local_cluster
 from animat.execution.task import Task
@@ -41,6 +42,27 @@ def test_without_dask_or_a_scheduler_it_is_a_line(
         "animat: a cluster needs Dask, which is not installed: pip install 'animat[cluster]'\n"
     )
     assert not (tmp_path / "out").exists()
+
+
+def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    folder, victim = tmp_path / f"animat-cores-{os.getuid()}", tmp_path / "victim.txt"
+    victim.write_text("all there")
+    (core,) = _own_cores(1)
+    assert (folder.stat().st_mode & 0o777) == 0o700
+    for place in os.sched_getaffinity(0):
+        (folder / str(place)).unlink(missing_ok=True)
+        (folder / str(place)).symlink_to(victim)
+    with pytest.raises(OSError, match="symbolic links"):
+        _own_cores(1)
+    shutil.rmtree(folder)
+    (tmp_path / "elsewhere").mkdir()
+    folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InvalidFile, match="expected a folder of this user's"):
+        _own_cores(1)
+    assert victim.read_text() == "all there" and core in os.sched_getaffinity(0)
 
 
 def test_the_page_has_commands_that_animat_knows() -> None:

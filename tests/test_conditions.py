@@ -159,6 +159,7 @@ def test_the_tolerance_can_be_typed_or_left_out() -> None:
         ("electrode:1+2,2+1", "expected each set of electrodes once"),
         ("pattern:1.5", "expected whole numbers"),
         ("pattern:3,3", "each once"),
+        (" x ".join(["frequency"] * 5_000), "expected frequency or interval before x"),
         ("pattern:99999999999999999999", "expected whole numbers of an electrode or a pattern"),
         ("electrode:1+99999999999999999999", "expected whole numbers of an electrode or a pattern"),
     ],

@@ -298,6 +298,10 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
     assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is another" in text
     assert f"{rows['policies']['normalised_score']:.2f}  as trained" in text
 
+    # Without random actions there is nothing to score against.
+    unscored = replace(found, rows=tuple(row for row in found.rows if row.name != "random"))
+    assert {row["normalised_score"] for row in unscored.to_dict()["rows"]} == {None}
+
     # Nothing else changes by it, and nothing is told of it where it was not asked for.
     assert plainly.optimum is None and plainly.no_optimum is None
     # The best coupling is the last row; it comes with the optimum alone.

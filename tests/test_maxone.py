@@ -337,6 +337,16 @@ def test_messages_of_the_stream_in_both_versions(layout: np.dtype, size: int) ->
     assert (stream.frame(), stream.lost_frames) == (45, 2)
 
 
+def test_spikes_that_come_out_of_order_are_taken_by_their_frame() -> None:
+    stream = ZmqSpikes()
+    for message, frames in ((1000, [1010, 990]), (1020, [1015, 1004])):
+        spikes = np.zeros(2, EVENT_16)
+        spikes["frame"], spikes["channel"] = frames, [1, 2]
+        stream.hear([np.uint64(message).tobytes(), b"", spikes.tobytes()])
+    assert stream.take(980, 1005)[0].tolist() == [990, 1004]
+    assert stream.take(1005, 1030)[0].tolist() == [1010, 1015]
+
+
 @pytest.mark.parametrize("layout", [EVENT_24, EVENT_16])
 def test_a_message_that_is_laid_out_in_no_known_way_is_refused(layout: np.dtype) -> None:
     stream = ZmqSpikes()

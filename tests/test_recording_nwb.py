@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -17,7 +18,7 @@ from hypothesis.extra import numpy as npst
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.recording import Channels, Recording
+from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
@@ -313,3 +314,19 @@ def test_a_cache_that_another_process_is_writing_is_not_read(tmp_path: Path) -> 
     )
     assert done.returncode == 0, done.stderr
     assert len(read_nwb(tmp_path / "a.nwb").channels) > 0
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"provenance": {"protocol": "five frequencies, blocked"}},
+        {"provenance": {"note: slice": "7"}},
+        {"culture": RecordedCulture("virtual", 3)},
+        {"provenance": {"source": "virtual culture of a colleague", "seed": "7"}},
+    ],
+)
+def test_what_would_be_read_back_as_something_else_is_not_written(changed: dict[str, object], tmp_path: Path) -> None:
+    recording = replace(synthetic_recording(seed=1), **{"culture": None, "provenance": {}, **changed})
+    with pytest.raises(InvalidArgument, match=r"^(provenance|culture): expected "):
+        write_nwb(recording, tmp_path / "recording.nwb")
+    assert not list(tmp_path.iterdir())

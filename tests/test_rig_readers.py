@@ -70,6 +70,19 @@ def test_maxwell_spikes_stimuli_and_electrodes(tmp_path: Path, linked: bool) -> 
     assert recording.provenance["recorded_at"].startswith("2023-11-14T22:13:20")
 
 
+def test_maxwell_events_with_strange_words_are_read_without_them(tmp_path: Path) -> None:
+    words = {"frequency_hz": 20, "order": [1, 2], "pulses": {"a": 1}, "electrodes": {"b": 2}, "pattern": "x"}
+    path = write_maxwell(
+        tmp_path / "a.h5",
+        mapping=TABLE,
+        spikes=spike_table([0.5], [9]),
+        events=event_table([0.2, 0.4], [json.dumps(words)] * 2),
+    )
+    recording = read_recording(path)
+    assert recording.stimuli.frequency_hz.tolist() == [20, 20]
+    assert recording.presentation is None
+
+
 def test_maxwell_channels_named_twice_are_one_channel(tmp_path: Path) -> None:
     twice = mapping_table([3, 9, 9, 40, 40], [1000, 2000, 2000, 26_399, 7])
     path = write_maxwell(

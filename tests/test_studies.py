@@ -739,7 +739,10 @@ def test_a_value_has_as_many_digits_as_its_error(value: float, error: float | No
 # --- the specification ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("study", [paper_study(), paper_study(3, quick=True), read_study(TINY)])
+ODD = replace(read_study(TINY), title='odd \x7f \\ " \u2028 signs')
+
+
+@pytest.mark.parametrize("study", [paper_study(), paper_study(3, quick=True), read_study(TINY), ODD])
 def test_a_study_written_as_toml_is_read_as_the_same(study: Study, tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(study_to_toml(study))
     assert read_study(tmp_path / "study.toml") == study

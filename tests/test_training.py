@@ -364,11 +364,26 @@ def test_the_error_of_a_worker_comes_in_one_line(tmp_path: Path) -> None:
         ({"duration_min": float("nan")}, "duration_min"),
         ({"percentiles": "last"}, "percentiles"),
         ({"delivery": "lost"}, "delivery"),
+        ({"shadowing": 1}, "shadowing"),
+        ({"neural_observation": 0}, "neural_observation"),
     ],
 )
 def test_settings_without_meaning_are_refused_by_name(change: dict[str, object], words: str) -> None:
     with pytest.raises(InvalidArgument, match=words):
         replace(SHORT, **change)
+
+
+def test_a_number_is_the_same_training_whatever_kind_of_number_it_is() -> None:
+    plain = replace(SHORT, mapping=None, policies=2, iterations=1_000, seed=3, duration_min=60.0, pulse_cost=0.0)
+    other = replace(
+        plain,
+        policies=np.int64(2),
+        iterations=np.int32(1_000),
+        seed=np.uint32(3),
+        duration_min=60,
+        pulse_cost=np.float32(0),
+    )
+    assert describe(other, None) == describe(plain, None)
 
 
 def test_neurons_and_mapping_come_together(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def description_in(path: Path, what: str) -> dict[str, Any] | None:
     try:
         found: dict[str, Any] = json.loads(path.read_text())
         _ = found["fingerprint"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise InvalidFile(f"{path}: expected a {what}'s description, got a file that cannot be read") from error
     return found
 

@@ -273,5 +273,5 @@ def _difference(expected: Mapping[str, str], protocol: Protocol, recording: Reco
 def _parsed(words: str) -> Any:
     try:
         return json.loads(words)
-    except ValueError:
+    except (ValueError, RecursionError):
         return words

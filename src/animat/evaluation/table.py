@@ -93,13 +93,13 @@ class Evaluation:
     def score(self, row: Row) -> float | None:
         """The normalised score of a row's mean return, (mean - random) / (optimum - random).
 
-        None where no optimum is known or it is not above random actions, where conditions are left out of it, which the
-        rows act on too, and for controls that act in something else than what the optimum is of: under shuffled
-        delivery nothing can be chosen, and a silent culture is another one.
+        None where random actions were not run, no optimum is known or it is not above them, where conditions are left
+        out of it, which the rows act on too, and for controls that act in something else than what the optimum is of:
+        under shuffled delivery nothing can be chosen, and a silent culture is another one.
         """
-        if self.optimum is None or self.optimum.left_out or row.changed:
+        random = next((each for each in self.rows if each.name == "random"), None)
+        if random is None or self.optimum is None or self.optimum.left_out or row.changed:
             return None
-        random = next(each for each in self.rows if each.name == "random")
         try:
             return normalised_score(
                 float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value

@@ -175,7 +175,7 @@ def _address(where: str | os.PathLike[str]) -> str:
     if path.is_file():
         try:
             return str(json.loads(path.read_text())["address"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
             raise InvalidFile(f"cluster: {path}: expected a scheduler's file, got one that holds no address") from error
     if ":" not in str(where):
         raise InvalidArgument(

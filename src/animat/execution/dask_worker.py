@@ -23,7 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TextIO
 
-from animat.errors import AnimatError
+from animat.errors import AnimatError, InvalidFile
 from animat.execution.apart import store
 from animat.execution.pinned import PinnedProcesses
 
@@ -158,10 +158,13 @@ def _times_starved() -> int:
 def _own_cores(threads: int) -> list[int]:
     """Cores that no other worker on this machine has; where there are too few, some are shared."""
     folder = Path(tempfile.gettempdir()) / f"animat-cores-{os.getuid()}"
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+        raise InvalidFile(f"{folder}: expected a folder of this user's, got another's or a link: remove it")
     allowed, own = sorted(os.sched_getaffinity(0)), []
     for core in allowed:
-        file = (folder / str(core)).open("w")
+        # No other user can have put a link there that leads to a file of ours.
+        file = os.fdopen(os.open(folder / str(core), os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600), "r+")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -59,8 +59,8 @@ class Receipt:
             return None
         try:
             words = json.loads(path.read_text())
-            return Receipt(words["job"], words["study"], words["inputs"], words["outputs"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            return Receipt(words["job"], words["study"], dict(words["inputs"]), dict(words["outputs"]))
+        except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
             raise InvalidFile(f"{path}: expected a job's receipt, got a file that cannot be read; remove it") from error
 
 

@@ -167,7 +167,7 @@ def reported(path: Path) -> Any:
     """What was reported last (`report`); None if nothing was."""
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 

@@ -300,11 +300,11 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
 
     Raises:
         InvalidArgument: for none.
-        Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, or in how the
-            simulators were made that they were trained on.
+        Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, percentiles,
+            delivery, or in how the simulators were made that they were trained on.
     """
-    alike = ("robot", "mapping", "readouts", "conditions", "presentation", "window_ms", "fitted", "pulse_cost")
-    return first_of_alike(policies, alike, "run it alone")
+    alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
+    return first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
 
 
 def check_conditions(first: Policy, calibration: Calibration) -> None:

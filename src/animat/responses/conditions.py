@@ -251,10 +251,11 @@ def conditions_named(text: str) -> Conditions:
         InvalidArgument: for anything else, saying what was expected.
     """
     first, is_product, second = text.partition(" x ")
-    if is_product:
+    if is_product and " x " not in second:
         when, where = conditions_named(first), conditions_named(second)
         if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
             return ByBoth(when, where)
+    if is_product:
         raise _unread(text, "frequency or interval before x, and electrode or pattern after it")
     name, _, rest = text.strip().partition(":")
     name, rest = name.strip(), rest.strip()

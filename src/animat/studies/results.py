@@ -30,7 +30,7 @@ def read_typed(path: Path, kind: type[T]) -> T:
     """Read what `write_typed` wrote; raises InvalidFile if it cannot be read, or is of another version."""
     try:
         return read_record(kind, json.loads(path.read_text()))
-    except (OSError, ValueError, InvalidArgument) as error:
+    except (OSError, ValueError, RecursionError, InvalidArgument) as error:
         raise InvalidFile(f"{path}: expected results of this study, got a file that cannot be read: {error}") from error
 
 
@@ -46,7 +46,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file, np.load(file) as arrays:
             return dict(arrays)
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile, zlib.error) as error:
         raise InvalidFile(f"{path}: expected arrays of this study, got a file that cannot be read: {error}") from error
 
 

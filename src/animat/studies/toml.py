@@ -118,8 +118,8 @@ def _is_tables(value: Any) -> bool:
 def _written(value: Any) -> str:
     if isinstance(value, tuple | list):
         return f"[{', '.join(_written(each) for each in value)}]"
-    # JSON's text, numbers and booleans are TOML's too; an empty table is {} in both.
-    return json.dumps(value, ensure_ascii=False)
+    # JSON's text, numbers and booleans are TOML's too, but for one sign; an empty table is {} in both.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 TABLES = ("robots", "arms", "comparisons")

@@ -74,7 +74,7 @@ _EXPECTED: dict[str, Any] = {
     "assess": Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None,
     "pulse_cost": PulseCost,
 }
-"""What fields are checked for that hold what they are given: as a record's, numbers would be made ones with a point."""
+"""What fields are expected to hold."""
 
 
 @dataclass(frozen=True)
@@ -134,11 +134,13 @@ class Training:
             least = 0 if name == "seed" else 1
             if not isinstance(number, int | np.integer) or isinstance(number, bool) or not least <= number <= most:
                 raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
-        read = {name: read_record(expected, getattr(self, name), name) for name, expected in _EXPECTED.items()}
-        if read["commands"] is not None:
-            if not read["commands"]:
+            object.__setattr__(self, name, int(number))
+        for name, expected in _EXPECTED.items():
+            # What was read: 60 and 60.0 are one training, and a number of numpy cannot be written to a file.
+            object.__setattr__(self, name, read_record(expected, getattr(self, name), name))
+        if self.commands is not None:
+            if not self.commands:
                 raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
-            object.__setattr__(self, "commands", tuple(map(float, read["commands"])))
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.neural_observation not in (False, self.mapping is not None):
             raise InvalidArgument(
@@ -159,8 +161,9 @@ class Training:
             ("shadowing", (True, False, "drawn")),
             ("percentiles", get_args(Percentiles)),
             ("delivery", get_args(Delivery)),
+            ("neural_observation", (True, False)),
         ):
-            if getattr(self, name) not in allowed:
+            if getattr(self, name) not in allowed or not isinstance(getattr(self, name), bool | str):
                 raise InvalidArgument(
                     f"{name}: expected one of {', '.join(map(str, allowed))}, got {getattr(self, name)!r}"
                 )

@@ -59,7 +59,7 @@ def read_journal(folder: Path) -> list[Told]:
             raise ValueError("trials are missing")
         if not all(math.isfinite(x) for each in told for of in each.returns for x in of):
             raise ValueError("a return is no finite number")
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, RecursionError, TypeError) as error:
         raise InvalidFile(
             f"{path}: expected the journal of a tuning, got a file that cannot be read ({error}); remove it, and its "
             "trials are made again"

@@ -113,11 +113,10 @@ class ZmqSpikes:
             time.sleep(1e-4)
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-        self.forget(start)
-        taken = []
-        while self._spikes and self._spikes[0][0] < stop:
-            taken.append(self._spikes.popleft())
-        table = np.array(taken, dtype=np.int64).reshape(-1, 2)
+        # All that came, as it need not come in order; the listener may add to it meanwhile.
+        came = [self._spikes.popleft() for _ in range(len(self._spikes))]
+        self._spikes.extendleft(spike for spike in reversed(came) if spike[0] >= stop)
+        table = np.array([spike for spike in came if start <= spike[0] < stop], dtype=np.int64).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
     def forget(self, before: int) -> None:

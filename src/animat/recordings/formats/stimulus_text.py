@@ -74,7 +74,7 @@ def stimulus_columns(lines: Sequence[str]) -> dict[str, Any]:
     electrodes = [_electrodes(words.get("electrodes")) for words in read]
     if any(electrodes):
         columns["stimulus_electrodes"] = padded(electrodes)
-    orders = {words.get("order") for words in read}
+    orders = {order if isinstance(order := words.get("order"), str) else None for words in read}
     pulses = {_whole(words.get("pulses")) for words in read}
     if len(orders) == 1 and orders <= {"blocked", "mixed"}:
         n_pulses = next(iter(pulses)) if len(pulses) == 1 else UNKNOWN

@@ -46,6 +46,11 @@ def open_traces(
             raise InvalidFile(f"{path}: expected raw traces in MaxWell, CL1 or NWB, got another HDF5 file")
     if found == "MaxWell":
         base = read_maxwell(path, part=part, stimuli=stimuli, spikes=False)
+        if len(base.stimuli) and any(finding.name == "clock-from-first-event" for finding in base.findings):
+            raise InvalidFile(
+                f"{path}: expected the first frame of the traces (frame_nos), by which they are aligned with stimuli, "
+                "found none"
+            )
     elif found == "CL1":
         base = read_cl1(path, spikes=False)
     else:
