@@ -14,7 +14,7 @@ from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import Thresholds
-from animat.cultures.devices.cl1 import CL1_LIMITS, LEAD_US
+from animat.cultures.devices.cl1 import CL1_LIMITS
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.recordings.reading import read_recording
@@ -28,7 +28,6 @@ from stand_in_cl import install
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "hardware.md").read_text()
-LOOP_PAGE = (DOCS / "closed-loop.md").read_text()
 
 
 def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,23 +41,12 @@ def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert recording.presentation.pulses == 5
 
 
-@pytest.mark.parametrize(
-    ("row", "cl1", "maxone"),
-    [
-        ("amplitude", f"{CL1_LIMITS.amplitude:g} uA", f"{MAXONE_LIMITS.amplitude:g} mV"),
-        ("charge of a phase", f"{CL1_LIMITS.charge_per_phase:g} nC", f"{MAXONE_LIMITS.charge_per_phase:g} mV ms"),
-        ("phases", f"steps of {CL1_LIMITS.phase_step_us:g} us", f"steps of {MAXONE_LIMITS.phase_step_us:g} us"),
-        ("phases", f"at most {CL1_LIMITS.phases_per_pulse}", f"at most {MAXONE_LIMITS.phases_per_pulse}"),
-        ("one electrode", f"{CL1_LIMITS.interval_us / 1000:g} ms", f"{MAXONE_LIMITS.interval_us / 1000:g} ms"),
-        ("one electrode", f"{CL1_LIMITS.stimuli_per_electrode_s} a s", f"{MAXONE_LIMITS.stimuli_per_electrode_s} a s"),
-        ("all together", f"{LEAD_US} us apart", f"{MAXONE_LIMITS.gap_us / 1000:g} ms apart"),
-        ("all together", f"{CL1_LIMITS.stimuli_per_s} stimuli", f"{MAXONE_LIMITS.stimuli_per_s} a second"),
-    ],
-)
-def test_the_limits_are_those_of_the_code(row: str, cl1: str, maxone: str) -> None:
-    cells = next(line for line in PAGE.splitlines() if line.startswith(f"| {row} |")).split("|")
-    assert cl1 in cells[2]
-    assert maxone in cells[3]
+def test_the_example_of_a_selection_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (example,) = (each for each in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "draw_patterns" in each)
+    exec(compile(example, "hardware.md", "exec"), {})
+    selection = Selection.load(tmp_path / "selection.json")
+    assert (len(selection.recording), selection.patterns.shape) == (8, (20, 5))
 
 
 @pytest.mark.parametrize(
@@ -86,8 +74,8 @@ def test_the_limits_are_those_of_the_code(row: str, cl1: str, maxone: str) -> No
         ("in a session", lambda limits: f" {limits.stimuli_per_session:,} "),
     ],
 )
-def test_the_limits_at_the_rig_are_those_of_the_code(row: str, of: Callable[[Limits], str]) -> None:
-    cells = next(line for line in LOOP_PAGE.splitlines() if line.startswith(f"| {row}")).split("|")
+def test_the_limits_are_those_of_the_code(row: str, of: Callable[[Limits], str]) -> None:
+    cells = next(line for line in PAGE.splitlines() if line.startswith(f"| {row}")).split("|")
     for cell, limits in zip(cells[3:6], (CL1_LIMITS, MAXONE_LIMITS, SIMULATED_LIMITS), strict=True):
         assert of(limits) in cell
 

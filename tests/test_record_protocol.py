@@ -67,7 +67,7 @@ def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path
     (tmp_path / "mine.json").write_text('{"trials": 6}')
     assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 0
     recording = read_recording(tmp_path / "out" / "recording_0000_min.nwb")
-    assert recording.protocol == Protocol(patterns=6, trials=6, pulse=pulse_for("replay"))
+    assert recording.protocol == Protocol(order="mixed", patterns=6, trials=6, pulse=pulse_for("replay"))
 
 
 def test_electrodes_that_the_culture_does_not_have_are_told_with_their_file(
@@ -98,8 +98,13 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
     assert main(["record", "--out", str(tmp_path / "out")]) == 0
     assert main(["record", "--paper", "--out", str(tmp_path / "out")]) == 0
     mixed = Protocol(order="mixed", trials=1000)
-    # What a file leaves out is the paper's.
-    assert asked == [Protocol((5, 20), setup_s=0), replace(mixed, pulses=5, trials=200), mixed, Protocol()]
+    # What a file leaves out is as without one.
+    assert asked == [
+        replace(mixed, frequencies_hz=(5, 20), setup_s=0),
+        replace(mixed, pulses=5, trials=200),
+        mixed,
+        Protocol(),
+    ]
 
 
 @pytest.mark.parametrize("culture", ["virtual", "replay"])

@@ -49,7 +49,8 @@ class Record:
     electrodes, [[1, 2], [3, 4]]: each at each frequency is a condition then, presented so often; default: at each
     frequency all of the culture's patterns"""
     protocol: Path | None = None
-    """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too"""
+    """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too; what it
+    leaves out is as by default"""
     out: Path = Path("recordings")
     """Folder for the files"""
     watch: bool = False
@@ -131,10 +132,8 @@ class Record:
         from animat.stimulation.places import read_places
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER, TWO_COMMANDS, read_protocol
 
-        # What a file leaves out is the paper's: it stands alone.
-        paper = self.paper or self.protocol is not None
         living = TWO_COMMANDS if self.places == "corners" else CLOSED_LOOP
-        usual = replace(PAPER if paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
+        usual = replace(PAPER if self.paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
         asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
