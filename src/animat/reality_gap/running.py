@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -109,45 +109,8 @@ def run_policies(
     """
     first = check_policies(policies)
     check_conditions(first, calibration)
-    settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if calibration.adaptive:
-        settings["adaptive_from"] = calibration.adjusted
-    # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
-    settings["conditions"] = calibration.conditions
-    if first.neural_observation:
-        settings["remembering"] = calibration.remembering
-    loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
-    findings += tuple(other_calibration(first.presentation, calibration.presentation))
-    if first.delivery == "shuffled":
-        message = (
-            "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
-            "what they choose is delivered"
-        )
-        findings += (Finding("trained-as-control", "warning", message),)
-    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
-        message = (
-            "episodes begin after a rest (--warm-up 0), and those of the simulator as after stimuli of all conditions: "
-            "the measured return will be less than predicted"
-        )
-        findings += (Finding("no-warm-up", "warning", message),)
-    if calibration.adaptive and first.percentiles == "first":
-        message = (
-            "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
-            "--thresholds fixed they are as in training"
-        )
-        findings += (Finding("moving-percentiles", "warning", message),)
-    findings += (
-        *other_simulator(first.fitted, calibration.fitted),
-        *old_calibration(calibration.start_min, culture.now_s / 60),
-        *no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory),
-    )
-    if isinstance(loop.robot, HostRobot):
-        episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
-        message = (
-            f"{loop.robot.name} is stepped on the host: predicted returns are of {episodes_predicted} episodes, and "
-            f"their intervals of {BOOTSTRAPS_ON_HOST} bootstraps"
-        )
-        findings += (Finding("few-predicted", "note", message),)
+    loop, findings = _loop_of(first, calibration, pulses, settings)
+    findings += tuple(_warned(first, loop, calibration, culture.now_s / 60))
     account = account or Account()
     of_trials = electrode_pulses(loop.conditions, loop.pulses)
 
@@ -254,6 +217,53 @@ def run_policies(
         found,
         () if ideal is None else replaced(rows, *ideal),
     )
+
+
+def _loop_of(
+    first: Policy, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
+) -> tuple[Loop, tuple[Finding, ...]]:
+    """The loop that policies like the first one act in, and what is to be said of it."""
+    settings = {"burst_threshold": calibration.burst_threshold, **settings}
+    if calibration.adaptive:
+        settings["adaptive_from"] = calibration.adjusted
+    # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
+    settings["conditions"] = calibration.conditions
+    if first.neural_observation:
+        settings["remembering"] = calibration.remembering
+    return Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
+
+
+def _warned(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
+    """Why less or other than the prediction may be measured, as far as it is known before the session."""
+    yield from other_calibration(first.presentation, calibration.presentation)
+    if first.delivery == "shuffled":
+        message = (
+            "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
+            "what they choose is delivered"
+        )
+        yield Finding("trained-as-control", "warning", message)
+    if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
+        message = (
+            "episodes begin after a rest (--warm-up 0), and those of the simulator as after stimuli of all conditions: "
+            "the measured return will be less than predicted"
+        )
+        yield Finding("no-warm-up", "warning", message)
+    if calibration.adaptive and first.percentiles == "first":
+        message = (
+            "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
+            "--thresholds fixed they are as in training"
+        )
+        yield Finding("moving-percentiles", "warning", message)
+    yield from other_simulator(first.fitted, calibration.fitted)
+    yield from old_calibration(calibration.start_min, now_min)
+    yield from no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory)
+    if isinstance(loop.robot, HostRobot):
+        episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
+        message = (
+            f"{loop.robot.name} is stepped on the host: predicted returns are of {episodes_predicted} episodes, and "
+            f"their intervals of {BOOTSTRAPS_ON_HOST} bootstraps"
+        )
+        yield Finding("few-predicted", "note", message)
 
 
 def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
