@@ -319,20 +319,22 @@ def evaluate(
         phase = in_phase(progress, "whose work it is")
         trained_in = trained.within(environment, simulator)
         work = whose_work(*trained_in, networks, n, episodes=episodes, seed=seed, progress=phase)
+    for each in (optimum, net_optimum):
+        findings += () if each is None else tuple(each.findings())
     return Evaluation(
-        body.name,
-        None if first.mapping is None else first.mapping.name,
-        minute,
-        tuple(policies),
-        tuple(rows),
-        (*findings, *(finding for each in (optimum, net_optimum) if each is not None for finding in each.findings())),
-        optimum,
-        no_optimum,
-        fixed_from_min,
-        context,
-        objectives_of(body),
-        work,
-        net_optimum,
+        robot=body.name,
+        mapping=None if first.mapping is None else first.mapping.name,
+        recorded_at_min=minute,
+        names=tuple(policies),
+        rows=tuple(rows),
+        findings=findings,
+        optimum=optimum,
+        no_optimum=no_optimum,
+        fixed_from_min=fixed_from_min,
+        context=context,
+        objectives=objectives_of(body),
+        whose_work=work,
+        net_optimum=net_optimum,
     )
 
 

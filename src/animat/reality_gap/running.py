@@ -203,19 +203,19 @@ def run_policies(
         )
         found = reasons(evidence)
     return RealityGap(
-        loop.robot.name,
-        loop.mapping.name,
-        loop,
-        calibration.start_min,
-        best,
-        rows,
-        session,
-        account,
-        findings,
-        sum(map(len, calibration.responses_hz)),
-        ahead,
-        found,
-        () if ideal is None else replaced(rows, *ideal),
+        robot=loop.robot.name,
+        mapping=loop.mapping.name,
+        loop=loop,
+        calibrated_at_min=calibration.start_min,
+        optimum=best,
+        rows=rows,
+        session=session,
+        account=account,
+        findings=findings,
+        responses=sum(map(len, calibration.responses_hz)),
+        outlook=ahead,
+        reasons=found,
+        whose_work=() if ideal is None else replaced(rows, *ideal),
     )
 
 
