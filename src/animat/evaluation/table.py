@@ -319,8 +319,8 @@ def evaluate(
         phase = in_phase(progress, "whose work it is")
         trained_in = trained.within(environment, simulator)
         work = whose_work(*trained_in, networks, n, episodes=episodes, seed=seed, progress=phase)
-    for each in (optimum, net_optimum):
-        findings += () if each is None else tuple(each.findings())
+    for best in (optimum, net_optimum):
+        findings += () if best is None else tuple(best.findings())
     return Evaluation(
         robot=body.name,
         mapping=None if first.mapping is None else first.mapping.name,
