@@ -44,4 +44,4 @@ def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
 def episodes_of(returns: np.ndarray) -> Episodes:
     """Episodes of a hundred iterations each."""
     none = np.zeros((len(returns), 0), np.int64)
-    return Episodes(returns, np.full(returns.shape, 100), np.zeros(returns.shape, bool), none, none)
+    return Episodes(returns, np.full(returns.shape, 100), np.zeros(returns.shape, bool), none, none.astype(np.float64))

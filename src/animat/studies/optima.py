@@ -9,6 +9,7 @@ from typing import Any, final
 from animat.environment import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
 from animat.evaluation.resampling import Counted, few_of
+from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress
 from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
@@ -86,47 +87,68 @@ class FindOptima(StudyTask):
         if self.over_time and timeline is not None:
             kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
             resolution, episodes = min(ROUGH, resolution), 0
-        asked = [(kind, at) for kind in kinds for at in (minutes if kind.through_neurons else [last])]
-        cases: dict[int, Case] = {}
-        counted: dict[int, Counted] = {}
-        left_out: dict[int, tuple[str, ...]] = {}
         if timeline is not None:
             series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
             timeline = replace(timeline, responses=tuple(series))
-        for i, (kind, at) in enumerate(asked):
-            environment = setting_of(study, self.spec, kind, timeline).environment
-            if timeline is None or not isinstance(environment, Animat):
-                cases[i] = environment, None
-                continue
-            responses = timeline.responses[timeline.row_at(at)]
-            left_out[i] = few_of(responses)
-            if len(left_out[i]) < len(responses.conditions):
-                of = Counted.of(environment, timeline, at, are_fixed=kind.percentiles == "first")
-                counted[i], cases[i] = of, (of.environment, of.simulator)
+        asked = [
+            self._asked(kind, at, timeline) for kind in kinds for at in (minutes if kind.through_neurons else [last])
+        ]
         # Cases side by side all have as many actions as the one with the most, and as many commands as all together: a
         # continuous one has many, and over time there are many cases.
-        alike: dict[object, list[int]] = {}
-        for i, (environment, _) in cases.items():
-            alike.setdefault(asked[i][0] if self.over_time else environment.n_actions is None, []).append(i)
-        known = {} if self.over_time else {i: counted[i] for i in counted if asked[i] in _compared(study, first, last)}
-        steps = len(cases) + len(known)
-        found: dict[int, Optimum] = {}
+        alike: dict[object, list[_Asked]] = {}
+        for each in asked:
+            if each.case is not None:
+                alike.setdefault(each.kind if self.over_time else each.case[0].n_actions is None, []).append(each)
+        compared = [] if self.over_time else _compared(study, first, last)
+        known = [each for each in asked if each.counted is not None and (each.kind, each.at_min) in compared]
+        done, steps = 0, sum(map(len, alike.values())) + len(known)
         for same in alike.values():
-            part = Part(progress, len(found), len(same), steps)
-            best = best_returns(
-                [cases[i] for i in same], resolution=resolution, episodes=episodes, seed=study.seed, progress=part
-            )
-            found |= dict(zip(same, best, strict=True))
-        for done, (i, of) in enumerate(known.items(), len(cases) + 1):
-            found[i] = of.known(found[i], resolution=COARSER * resolution, seed=study.seed)
+            part = Part(progress, done, len(same), steps)
+            cases = [each.case for each in same if each.case is not None]
+            best = best_returns(cases, resolution=resolution, episodes=episodes, seed=study.seed, progress=part)
+            for each, optimum in zip(same, best, strict=True):
+                each.optimum = optimum
+            done += len(same)
+        for each in known:
+            assert each.counted is not None and each.optimum is not None
+            each.optimum = each.counted.known(each.optimum, resolution=COARSER * resolution, seed=study.seed)
+            done += 1
             progress.update(done, steps, "how well it is known")
-        optima = []
-        for i, (kind, at) in enumerate(asked):
-            few = "; ".join(left_out.get(i, ())) or None
-            optima.append(
-                StudyOptimum(self.spec.name, kind.mapping, kind.percentiles, at, **_known(found.get(i)), left_out=few)
-            )
-        return [write_typed(file, optima)]
+        return [write_typed(file, [each.told(self.spec.name) for each in asked])]
+
+    def _asked(self, kind: Arm, at_min: float, timeline: SimulatorTimeline | None) -> _Asked:
+        environment = setting_of(self.study, self.spec, kind, timeline).environment
+        if timeline is None or not isinstance(environment, Animat):
+            return _Asked(kind, at_min, case=(environment, None))
+        responses = timeline.responses[timeline.row_at(at_min)]
+        few = few_of(responses)
+        if len(few) == len(responses.conditions):
+            return _Asked(kind, at_min, left_out=few)
+        of = Counted.of(environment, timeline, at_min, are_fixed=kind.percentiles == "first")
+        return _Asked(kind, at_min, case=(of.environment, of.simulator), counted=of, left_out=few)
+
+
+@dataclass
+class _Asked:
+    """An optimum that is asked for.
+
+    Attributes:
+        case: where it is; None where no condition has enough responses.
+        counted: the responses that it is of; None without neurons.
+        left_out: conditions with too few responses.
+    """
+
+    kind: Arm
+    at_min: float
+    case: Case | None = None
+    counted: Counted | None = None
+    left_out: tuple[str, ...] = ()
+    optimum: Optimum | None = None
+
+    def told(self, robot: str) -> StudyOptimum:
+        """A row of the table."""
+        kind, few = self.kind, "; ".join(self.left_out) or None
+        return StudyOptimum(robot, kind.mapping, kind.percentiles, self.at_min, **_known(self.optimum), left_out=few)
 
 
 def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]]:
