@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import pytest
 
@@ -48,6 +48,7 @@ def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("animat.execution.dask_worker._HELD", held := list[TextIO]())
     folder, victim = tmp_path / f"animat-cores-{os.getuid()}", tmp_path / "victim.txt"
     victim.write_text("all there")
     (core,) = _own_cores(1)
@@ -63,6 +64,7 @@ def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
     with pytest.raises(InvalidFile, match="expected a folder of this user's"):
         _own_cores(1)
     assert victim.read_text() == "all there" and core in os.sched_getaffinity(0)
+    held.pop().close()
 
 
 def test_the_page_has_commands_that_animat_knows() -> None:
