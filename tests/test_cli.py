@@ -230,6 +230,20 @@ def test_recordings_that_were_there_already_are_said_to_be(
         assert capsys.readouterr().out == f"1 recording in {tmp_path / 'out'}{were_there}\n"
 
 
+def test_evaluate_writes_over_no_file_but_an_evaluation(
+    recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "2", "--out"]
+    assert main([*command, str(tmp_path / "found.json")]) == 0
+    assert main([*command, str(tmp_path / "found.json")]) == 0
+    for name, content in (("recording.nwb", b"\x89HDF"), ("list.json", b"[]"), ("other.json", b'{"a": 1}')):
+        (tmp_path / name).write_bytes(content)
+        capsys.readouterr()
+        assert main([*command, str(tmp_path / name)]) == 1
+        assert "--out: expected a new file or one of an earlier evaluation" in capsys.readouterr().err
+        assert (tmp_path / name).read_bytes() == content
+
+
 @pytest.mark.oracle
 def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "3"]
@@ -650,7 +664,11 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --pulse-cost -1", "--pulse-cost: expected at least 0, got -1"),
         ("train --pulse-cost 1 --mapping none", "--pulse-cost: expected 0 without neurons, got 1"),
         ("train --pulse-cost 1 --assess 3", "--pulse-cost: expected 0 with assessments"),
-        ("train --neural-observation --mapping none", "--neural-observation: expected True only with a mapping"),
+        ("train --neural-observation --mapping none", "--neural-observation: expected none without a mapping"),
+        ("train --mapping none --delivery shuffled", "--delivery: expected none without neurons"),
+        ("train --mapping none --recordings .", "--recordings: expected none without neurons, got ."),
+        ("record --culture replay", "--recordings: expected some for --culture replay, got none"),
+        ("record --recordings .", "--recordings: expected none for --culture virtual, got 1"),
         ("train --shadowing drawn --mapping none", "--shadowing: expected a mapping with 'drawn', got none"),
         ("train --goal higher", "--goal: 'higher': expected avoid"),
         ("inspect --optimum unicycle .", "--optimum: expected one of arm, cartpole"),

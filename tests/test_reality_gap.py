@@ -428,6 +428,24 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
             check_policies({"p": policy_of(0, series), "q": policy_of(0, series, **other)})
 
 
+def test_what_the_loop_refuses_is_refused_before_anything_is_predicted(
+    series: list[Responses], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever refuses while an optimum is computed in another thread ends the program with it."""
+
+    def predict(*_: object, **__: object) -> None:
+        raise AssertionError("predicted")
+
+    monkeypatch.setattr("animat.reality_gap.running.predict", predict)
+    elsewhere = replace(series[0].conditions[0], electrodes=((99_999,),))
+    calibration = Calibration.of_series(series)
+    calibration = replace(calibration, conditions=(elsewhere, *calibration.conditions[1:]))
+    policy = policy_of(0, series, conditions=calibration.conditions)
+    with FakeCulture() as culture, pytest.raises(Mismatch, match=r"can stimulate .*, got 99999: run on the culture"):
+        run_policies({"p": policy}, culture, calibration, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def drawn_responses(rng: np.random.Generator, n: int) -> Responses:
     """n synthetic responses to each of five conditions; of culture and recording alike."""
     return Responses(

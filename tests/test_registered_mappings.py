@@ -114,6 +114,11 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     assert "expected a policy with the mapping linear, got one with steep" in capsys.readouterr().err
     assert main(["run", *asked, "--culture", "replay"]) == 0
     assert "cartpole, steep" in capsys.readouterr().out
+    forget()
+    film = ["replay", "policies", "--recordings", "recordings", "--span-s", "0", "1"]
+    assert main([*film, "--mapping", STEEP]) == 0
+    assert main(["replay", "session", "--mapping", STEEP]) == 1
+    assert "--mapping: expected none with a session" in capsys.readouterr().err
 
 
 @pytest.mark.oracle

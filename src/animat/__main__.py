@@ -2,7 +2,17 @@
 
 import sys
 
-from animat.cli import main
+
+def main() -> int:
+    """Run one command (`animat.cli.main`); Ctrl-C ends it in a line, also while it is being loaded."""
+    try:
+        from animat.cli import main as run
+
+        return run()
+    except KeyboardInterrupt:
+        print("animat: interrupted", file=sys.stderr)
+        return 130
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from animat.errors import AnimatError, InvalidArgument
+from animat.writing import expect_writable
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class ClusterCommand:
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         if workers < 1:
             raise InvalidArgument(f"--workers: expected at least 1, got {workers}")
+        expect_writable(self.file.parent)
         with local_cluster(workers, self.file) as processes:
             print(f"{workers} workers; to use them: --cluster {self.file}; to end them: Ctrl-C", flush=True)
             try:

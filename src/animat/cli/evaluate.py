@@ -9,9 +9,12 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.responses import Fitting, policies_for, say_findings
-from animat.errors import InvalidArgument
-from animat.records import write_json
+from animat.errors import AnimatError, InvalidArgument
+from animat.plain_file import read_plain_text
+from animat.records import json_data, write_json
 from animat.writing import expect_writable
+
+_MOST_BYTES = 256 * 1024 * 1024
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class Evaluate(Fitting):
         if self.out is not None:
             if self.out.is_dir():
                 raise InvalidArgument(f"--out: expected a file, got the folder {self.out}")
+            _expect_no_other(self.out)
             expect_writable(self.out.parent)
         policies = policies_for(self.robot, self.mapping, self.policies)
         check_at_once("--episodes", self.episodes, len(policies))
@@ -80,3 +84,17 @@ class Evaluate(Fitting):
         if self.out is not None:
             write_json(self.out, evaluation.to_dict())
         return evaluation.to_dict()
+
+
+def _expect_no_other(out: Path) -> None:
+    """Raise for a file that is no earlier evaluation: a recording or a policy would be gone."""
+    if not out.exists():
+        return
+    try:
+        found = json_data(read_plain_text(out, _MOST_BYTES), "--out")
+    except AnimatError:
+        found = None
+    if not isinstance(found, dict) or "recorded_at_min" not in found:
+        raise InvalidArgument(
+            f"--out: expected a new file or one of an earlier evaluation, got {out}, which is neither"
+        )

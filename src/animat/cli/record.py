@@ -64,13 +64,15 @@ class Record:
 
         if (self.culture == "replay") != bool(self.recordings):
             raise InvalidArgument(
-                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
-                f"--culture {self.culture}"
+                "--recordings: expected some for --culture replay, got none"
+                if self.culture == "replay"
+                else f"--recordings: expected none for --culture {self.culture}, got {len(self.recordings)}"
             )
         if (self.culture == "maxone") != (self.selection is not None):
             raise InvalidArgument(
-                f"--selection: expected a file of electrodes for a maxone and none for others, got {self.selection} "
-                f"for --culture {self.culture}"
+                "--selection: expected a file of electrodes for --culture maxone, got none"
+                if self.culture == "maxone"
+                else f"--selection: expected none for --culture {self.culture}, got {self.selection}"
             )
         # Before any device is powered.
         if self.seed < 0:

@@ -27,6 +27,8 @@ class Replay(Fitting):
     """What to show, in s from the start; default: a minute, of a session from just before the first move"""
     robot: str | None = None
     """The robot that is expected, and imported: my_package.robots:Rover"""
+    mapping: str | None = None
+    """Of policies: the mapping that is expected, and imported: my_package.mappings:Steep"""
     seed: int = 1
     """Of policies: decides every random draw"""
     out: Path = Path("film.gif")
@@ -51,7 +53,11 @@ class Replay(Fitting):
         if is_nothing(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
-            for option, given in (("--recordings", self.recordings or None), ("--at-min", self.at_min)):
+            for option, given in (
+                ("--recordings", self.recordings or None),
+                ("--at-min", self.at_min),
+                ("--mapping", self.mapping),
+            ):
                 if given is not None:
                     raise InvalidArgument(f"{option}: expected none with a session, which is shown as it was")
             scene = scene_of_session(self.source, self.span_s)
@@ -77,6 +83,6 @@ class Replay(Fitting):
             raise InvalidArgument(
                 f"{self.source}: expected a session (session.log) or policies in this folder, got neither"
             )
-        policies = policies_for(self.robot, None, self.source)
+        policies = policies_for(self.robot, self.mapping, self.source)
         timeline = self.timeline_for(policies, self.recordings)
         return scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)

@@ -78,7 +78,7 @@ class Train(Fitting):
     cluster: str | None = None
     """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
     shared_folder: bool = True
-    """Whether its workers see --out at the same place; without, files go to them and back through this process"""
+    """With --cluster: workers do not see --out at the same place, and files go to them and back through this process"""
     tensorboard: Path | None = None
     """Folder for TensorBoard: the learning curves as they come, a run a policy; needs animat[tensorboard]"""
     out: Path = Path("policies")
@@ -114,6 +114,10 @@ class Train(Fitting):
             expect_fit(robot.name, robot.n_commands, count_readouts(readouts))
         elif readouts != ALL:
             raise InvalidArgument(f"--readouts: expected none without neurons, got {self.readouts}")
+        elif self.delivery != "chosen":
+            raise InvalidArgument(f"--delivery: expected none without neurons, got {self.delivery}")
+        elif self.recordings:
+            raise InvalidArgument(f"--recordings: expected none without neurons, got {self.recordings[0]}")
         training = Training(
             robot=robot,
             mapping=None if mapping == "none" else mapping_named(mapping),

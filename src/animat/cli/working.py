@@ -23,7 +23,7 @@ class Working:
     cluster: str | None = None
     """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
     shared_folder: bool = True
-    """Whether its workers see --out at the same place; without, files go to them and back through this process"""
+    """With --cluster: workers do not see --out at the same place, and files go to them and back through this process"""
     out: Path = Path("study")
     """Folder for everything; the report is report.html in it"""
     watch: bool = False

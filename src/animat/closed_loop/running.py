@@ -31,7 +31,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.observed import more_left_out
-from animat.errors import AnimatError, InvalidArgument, Mismatch, shown
+from animat.errors import AnimatError, InvalidArgument, Mismatch, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
 
@@ -91,7 +91,7 @@ def run_session(
         InvalidFile: if a file is in the folder's place, or the log cannot be begun.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
-    _check(culture, loop, agents, planned, seed)
+    check_session(culture, loop, agents, planned, seed)
     if strange := sorted({*(predicted or {})} - {agent.name for agent in agents}):
         raise InvalidArgument(f"predicted: expected names of agents, got {', '.join(strange)}")
     expect_no_session(folder)
@@ -338,7 +338,8 @@ def check_episodes(name: str, episodes: int) -> None:
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(episodes)}")
 
 
-def _check(culture: Culture, loop: Loop, agents: Sequence[Agent], episodes: Sequence[int], seed: int) -> None:
+def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episodes: Sequence[int], seed: int) -> None:
+    """Refuse what `run_session` would, of culture, loop and agents, before anything else is done."""
     if not culture.is_open or culture.is_stopped:
         state = "stopped" if culture.is_open else "closed"
         raise InvalidArgument(f"culture: expected an open one that may stimulate, got one that is {state}")
@@ -364,6 +365,6 @@ def _check(culture: Culture, loop: Loop, agents: Sequence[Agent], episodes: Sequ
     if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(
             f"conditions: expected electrodes that the {culture.name} culture can stimulate "
-            f"({', '.join(map(str, culture.stimulation_electrodes))}), got {', '.join(map(str, strange))}: run on the "
-            "culture that was recorded, or train on recordings of this one"
+            f"({some_of(culture.stimulation_electrodes)}), got {some_of(strange)}: run on the culture that was "
+            "recorded, or train on recordings of this one"
         )

@@ -57,7 +57,7 @@ def _check_commands(mapping: Mapping) -> None:
                     f"{kind}.command: expected the same for one response as among several, {u[i]:g}, got "
                     f"{shown(one.tolist())}"
                 )
-        _expect_same(kind, compiled, u, percentiles)
+        _expect_same(kind, compiled, u, percentiles, where)
 
 
 def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
@@ -85,14 +85,22 @@ def _expect_commands(kind: str, u: Any, where: str) -> None:
         )
 
 
-def _expect_same(kind: str, compiled: Callable[..., Any], u: Any, percentiles: Any) -> None:
+def _expect_same(kind: str, compiled: Callable[..., Any], u: Any, percentiles: Any, where: str) -> None:
     """Training asks for commands under `jax.jit`, and a closed loop in numpy."""
     try:
         same = np.asarray(compiled(_RESPONSES_HZ, percentiles))
     except Exception as error:
-        raise InvalidArgument(f"{kind}.command: expected it to run under jax.jit, got {first_line(error)}") from error
-    if same.shape != u.shape or not np.allclose(same, u, atol=1e-4):
         raise InvalidArgument(
-            f"{kind}.command: expected the same under jax.jit as in numpy, {shown(u.tolist())}, got "
-            f"{shown(same.tolist())}"
+            f"{kind}.command: expected it to run under jax.jit (in place of if, use where of namespace_of(x)), got "
+            f"{first_line(error)}"
+        ) from error
+    if same.shape != u.shape:
+        raise InvalidArgument(
+            f"{kind}.command: expected {u.size} commands under jax.jit too, got {shown(same.tolist())}"
+        )
+    if not np.allclose(same, u, atol=1e-4):
+        i = int(np.argmax(np.abs(same - u)))
+        raise InvalidArgument(
+            f"{kind}.command: expected the same under jax.jit as in numpy{where}, {u[i]:g} for "
+            f"{_RESPONSES_HZ[i]:g} Hz, got {same[i]:g}"
         )

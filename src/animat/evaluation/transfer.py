@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from animat.errors import Mismatch
+from animat.errors import Mismatch, some_of
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, other_stimulus
@@ -123,8 +123,8 @@ def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts:
     """
     if policy.conditions != tuple(conditions):
         raise Mismatch(
-            f"conditions: expected {', '.join(c.label for c in policy.conditions)}, which the policies pick from, got "
-            f"recordings with {', '.join(c.label for c in conditions)}"
+            f"conditions: expected {some_of([c.label for c in policy.conditions])}, which the policies pick from, got "
+            f"recordings with {some_of([c.label for c in conditions])}: take those that the policies were trained on"
         )
     if others := other_stimulus(policy.conditions, conditions):
         raise Mismatch(f"conditions: {others} in the recordings: take those that the policies were trained on")
@@ -140,7 +140,8 @@ def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding
     expect_conditions(policy, timeline.conditions, timeline.readouts)
     found = []
     if policy.window_ms != timeline.window_ms:
-        message = f"the policies were trained on responses in {policy.window_ms} ms, these lie in {timeline.window_ms}"
+        trained, these = in_window(policy.window_ms), in_window(timeline.window_ms)
+        message = f"the policies were trained on responses {trained}, these lie {these}"
         found.append(Finding("other-window", "warning", message))
     found += other_simulator(policy.fitted, timeline.fitted)
     first_min = next(iter(policy.recorded_at_min), None)
@@ -164,3 +165,8 @@ def not_of_a_loop(policy: Policy, timeline: SimulatorTimeline, minute: float) ->
     trained_until = policy.trained_until_min(float(timeline.start_min[0]))
     if trained_until is not None:
         yield from other_recording(float(timeline.start_min[timeline.row_at(trained_until)]), minute)
+
+
+def in_window(window_ms: tuple[float, float] | None) -> str:
+    """Of responses, as messages say it."""
+    return "in a window that is not known" if window_ms is None else f"from {window_ms[0]:g} to {window_ms[1]:g} ms"

@@ -6,7 +6,9 @@ import json
 import logging
 import os
 import pickle
+import socket
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from concurrent.futures import wait as wait_for
@@ -61,6 +63,7 @@ class Cluster(Executor):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         address = _address(where)
         try:
+            _expect_listener(address)
             self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise AnimatError(
@@ -168,6 +171,23 @@ def on_cluster(where: str | None, shared_folder: bool) -> Iterator[Cluster | Non
         return
     with Cluster(where, has_shared_folder=shared_folder) as cluster:
         yield cluster
+
+
+def _expect_listener(address: str) -> None:
+    """Wait until something listens there: Dask's own wait cannot be interrupted. OSError or ValueError if none does."""
+    kind, has_kind, place = address.rpartition("://")
+    host, _, port = place.rpartition(":")
+    if has_kind and kind != "tcp":
+        return
+    until_s = time.monotonic() + _CONNECT_S
+    while True:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
+            return
+        except OSError:
+            if time.monotonic() > until_s:
+                raise
+        time.sleep(0.2)
 
 
 def _address(where: str | os.PathLike[str]) -> str:

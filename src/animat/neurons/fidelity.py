@@ -66,9 +66,7 @@ class Fidelity:
                 )
                 found.append(Finding("few-neighbours", "warning", message, value))
             else:
-                remedy = (
-                    "leave the range out (edges are then percentiles), or take more bins or the empirical simulator"
-                )
+                remedy = "take more bins, no range (edges are then percentiles) or the empirical simulator"
                 found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
             message = f"responses above the histogram's range, which count into its last bin: {self.n_above_range}"

@@ -6,7 +6,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.running import run_session
+from animat.closed_loop.running import check_session, run_session
 from animat.closed_loop.session import Session
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.cultures.base import Culture
@@ -143,6 +143,9 @@ def run_policies(
     agents = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
     agents += [agent_of(control, animat, acting, pooled) for control in controls]
 
+    of_each = planned_episodes(n_policies, len(controls), episodes)
+    check_session(culture, loop, agents, of_each, seed)
+
     why_not = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
@@ -163,7 +166,6 @@ def run_policies(
     in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
     if in_real_time and optimum is not None:
         _wait_for(optimum, progress)
-    of_each = planned_episodes(n_policies, len(controls), episodes)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
@@ -176,17 +178,23 @@ def run_policies(
         report(str(ahead))
     forecast = {name: between(of.returns.mean(), of.anew) for name, of in predicted.items()}
     watched = in_phase(progress, "closed loop", sum(of_each), "episodes")
-    session = run_session(
-        culture,
-        loop,
-        agents,
-        folder,
-        episodes=of_each,
-        seed=seed,
-        account=account,
-        progress=watched,
-        predicted=forecast,
-    )
+    try:
+        session = run_session(
+            culture,
+            loop,
+            agents,
+            folder,
+            episodes=of_each,
+            seed=seed,
+            account=account,
+            progress=watched,
+            predicted=forecast,
+        )
+    except Exception:
+        # A program that ends while JAX computes in another thread is ended by a signal.
+        if optimum is not None:
+            wait([optimum])
+        raise
     best = None
     # Whoever stopped the session does not wait for it.
     if optimum is not None and (optimum.done() or session.ending.by == "plan"):

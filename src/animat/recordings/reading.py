@@ -184,7 +184,7 @@ def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
         if earlier.start_min == later.start_min:
             raise InvalidFile(
                 f"{other}: expected recordings of different times, but this one and {file} both start at "
-                f"{later.start_min:g} min; leave one out, or save it anew with read_recording(path, start_min=...)"
+                f"{later.start_min:g} min; leave one out, or give it another time (animat convert --start-min)"
             )
     return [recording for recording, _ in read]
 

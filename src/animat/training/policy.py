@@ -117,9 +117,7 @@ class Policy:
     def _expect_network(self) -> None:
         """Refuse weights of which no action can be made, or one that means nothing."""
         if self.neural_observation not in (False, self.mapping is not None):
-            raise InvalidArgument(
-                f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
-            )
+            raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         seen = len(self.robot.observation_spec) + len(AT_FIRST) * self.neural_observation
         widths = [seen, *(bias.size for bias in self.biases)]

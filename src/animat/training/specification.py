@@ -143,9 +143,7 @@ class Training:
                 raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
             expect_one_command(self.robot.name, self.robot.n_commands)
         if self.neural_observation not in (False, self.mapping is not None):
-            raise InvalidArgument(
-                f"neural_observation: expected True only with a mapping, got {shown(self.neural_observation)}"
-            )
+            raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
         expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
         if self.pulse_cost and self.mapping is None:
             raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
