@@ -288,7 +288,7 @@ def test_the_heuristic_policy_takes_the_nearest_in_the_plane() -> None:
 
 def test_it_is_a_gymnasium_environment(recording: Recording, timeline: SimulatorTimeline) -> None:
     place = f"{Wheels.__module__}:Wheels"
-    with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of two-wheels, got 1"):
+    with pytest.raises(InvalidArgument, match="recordings: expected some for two-wheels, which takes 2 commands"):
         gymnasium.make("animat:Animat/Robot-v0", robot=place)
     env = gymnasium.make("animat:Animat/Robot-v0", robot=place, simulator=timeline.at(0.0), mapping="linear")
     env.reset(seed=1)

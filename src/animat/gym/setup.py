@@ -24,7 +24,7 @@ from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
-from animat.responses.readouts import ALL, Readouts
+from animat.responses.readouts import USUAL_READOUTS, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS
 from animat.robots.host import HostRobot
@@ -71,7 +71,7 @@ def set_up(
     conditions: str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     kind: Kind | None = None,
-    readouts: str | Readouts = ALL,
+    readouts: str | Readouts | None = None,
     delivery: Delivery = "chosen",
     **parameters: float,
 ) -> Setup:
@@ -89,7 +89,8 @@ def set_up(
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
         window_ms: when a response is read after its stimulus.
         kind: `histogram` (the paper), `empirical` or `memory`; None: what suits the recordings (`fit_timeline`).
-        readouts: of the recordings, as many as the robot takes commands: `halves`, `quadrants`, or groups.
+        readouts: of the recordings, as many as the robot takes commands: `halves`, `quadrants`, or groups; None: all
+            channels as one, or of several commands those that `animat train` takes.
         delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
         parameters: of the robot, `pole_mass_kg=0.55`.
 
@@ -112,13 +113,14 @@ def set_up(
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     if recordings is None:
         reading: dict[str, Any] = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
-        reading["readouts"] = (readouts, ALL)
+        reading["readouts"] = (readouts, None)
         for name, (got, usual) in (reading | {"window_ms": (tuple(window_ms), DEFAULT_WINDOW_MS)}).items():
             if got != usual:
                 raise InvalidArgument(f"{name}: expected only with recordings, of which it says how they are read")
     if recordings is not None:
         by = None if conditions is None else conditions_named(conditions)
-        timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=readouts), kind=kind)
+        read = readouts or USUAL_READOUTS.get(body.n_commands, "all")
+        timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=read), kind=kind)
         for message in warnings_once(timeline.findings):
             warnings.warn(message, stacklevel=2)
         row = 0 if at_min is None else timeline.row_asked_for(at_min)
@@ -126,6 +128,11 @@ def set_up(
         labels = tuple(condition.label for condition in timeline.conditions)
     elif simulator is not None:
         labels = tuple(f"condition {i}" for i in range(simulator.n_conditions))
+    elif body.n_commands > 1:
+        raise InvalidArgument(
+            f"recordings: expected some for {body.name}, which takes {body.n_commands} commands: synthetic responses "
+            "have one readout"
+        )
     else:
         simulator, labels = synthetic_simulator(), LABELS
     if delivery not in ("chosen", "shuffled"):
