@@ -66,7 +66,7 @@ class Remembering:
         Args:
             came: the state when it came.
             condition: of the trial; `NO_CONDITION` where it has none.
-            rate_hz: the response of all channels, Hz a channel.
+            rate_hz: the response of all channels, Hz per channel.
             is_burst: whether the response was a burst, after which nothing is known of the trace.
         """
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))

@@ -61,7 +61,7 @@ class Frames:
             top = 178
         height = (HEIGHT_PX - 26 - top) // 3
         strips = [(top + i * height, top + (i + 1) * height - 26) for i in range(3)]
-        response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), "response", "Hz a channel")
+        response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), "response", "Hz per channel")
         for each in past:
             if math.isfinite(each.rate_hz):
                 response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
