@@ -423,9 +423,10 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
     assert "kind empirical, here memory" in other
     with pytest.raises(Mismatch, match="the same fitted as p"):
         check_policies({"p": policy, "q": policy_of(0, series)})
-    for name, other in (("percentiles", {"percentiles": "first"}), ("delivery", {"delivery": "shuffled"})):
+    for name, other in (("percentiles", "first"), ("delivery", "shuffled")):
+        changed = policy_of(0, series, provenance={"training": {name: other}})
         with pytest.raises(Mismatch, match=f"the same {name} as p"):
-            check_policies({"p": policy_of(0, series), "q": policy_of(0, series, **other)})
+            check_policies({"p": policy_of(0, series), "q": changed})
 
 
 def test_what_the_loop_refuses_is_refused_before_anything_is_predicted(

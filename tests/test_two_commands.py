@@ -173,7 +173,7 @@ def test_a_policy_carries_its_readouts_through_its_file(
     assert policies["p0"].readouts == timeline.readouts
     evaluation = evaluate(policies, timeline, episodes=5)
     assert np.all(np.isfinite(evaluation.rows[0].episodes.returns))
-    assert evaluation.rows[0].episodes.passed.shape[1:] == (5, 2)
+    assert evaluation.rows[0].episodes.commanded.shape[1:] == (5, 2)
     with pytest.raises(InvalidArgument, match="readouts: expected 2, one for each command of two-wheels, got 1"):
         replace(policies["p0"], readouts=ALL)
     other = replace(timeline, readouts=replace(timeline.readouts, names=("a", "b")))
