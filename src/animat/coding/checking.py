@@ -91,8 +91,8 @@ def _expect_same(kind: str, compiled: Callable[..., Any], u: Any, percentiles: A
         same = np.asarray(compiled(_RESPONSES_HZ, percentiles))
     except Exception as error:
         raise InvalidArgument(
-            f"{kind}.command: expected it to run under jax.jit (in place of if, use where of namespace_of(x)), got "
-            f"{first_line(error)}"
+            f"{kind}.command: expected it to run under jax.jit, got {first_line(error)}: use functions of "
+            "namespace_of(x), and where in place of if"
         ) from error
     if same.shape != u.shape:
         raise InvalidArgument(
