@@ -116,7 +116,9 @@ class Policy:
 
     def _expect_network(self) -> None:
         """Refuse weights of which no action can be made, or one that means nothing."""
-        if self.neural_observation not in (False, self.mapping is not None):
+        if not isinstance(self.neural_observation, bool):
+            raise InvalidArgument(f"neural_observation: expected True or False, got {shown(self.neural_observation)}")
+        if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         seen = len(self.robot.observation_spec) + len(AT_FIRST) * self.neural_observation

@@ -142,7 +142,9 @@ class Training:
             if not self.commands:
                 raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
             expect_one_command(self.robot.name, self.robot.n_commands)
-        if self.neural_observation not in (False, self.mapping is not None):
+        if not isinstance(self.neural_observation, bool):
+            raise InvalidArgument(f"neural_observation: expected True or False, got {shown(self.neural_observation)}")
+        if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
         expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
         if self.pulse_cost and self.mapping is None:
@@ -159,7 +161,6 @@ class Training:
             ("shadowing", (True, False, "drawn")),
             ("percentiles", get_args(Percentiles)),
             ("delivery", get_args(Delivery)),
-            ("neural_observation", (True, False)),
         ):
             if getattr(self, name) not in allowed or not isinstance(getattr(self, name), bool | str):
                 raise InvalidArgument(
