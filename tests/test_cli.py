@@ -230,6 +230,14 @@ def test_recordings_that_were_there_already_are_said_to_be(
         assert capsys.readouterr().out == f"1 recording in {tmp_path / 'out'}{were_there}\n"
 
 
+def test_help_says_what_a_number_of_one_is_without_the_option(capsys: pytest.CaptureFixture[str]) -> None:
+    """1 is True to Python, and a flag's default is not said."""
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Decides every random draw (default: 1)" in said and "(default: True)" not in said
+
+
 def test_evaluate_writes_over_no_file_but_an_evaluation(
     recordings: Path, policies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,7 +14,7 @@ from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.coding.mapping import Thresholds
-from animat.cultures.devices.cl1 import CL1_LIMITS
+from animat.cultures.devices.cl1 import CL1_LIMITS, LEAD_US
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.safety import SIMULATED_LIMITS, Limits
 from animat.recordings.reading import read_recording
@@ -78,6 +78,11 @@ def test_the_limits_are_those_of_the_code(row: str, of: Callable[[Limits], str])
     cells = next(line for line in PAGE.splitlines() if line.startswith(f"| {row}")).split("|")
     for cell, limits in zip(cells[3:6], (CL1_LIMITS, MAXONE_LIMITS, SIMULATED_LIMITS), strict=True):
         assert of(limits) in cell
+
+
+def test_the_time_between_stimuli_is_that_of_the_code() -> None:
+    cells = next(line for line in PAGE.splitlines() if line.startswith("| in all |")).split("|")
+    assert f"{LEAD_US} us apart" in cells[3] and f"{MAXONE_LIMITS.gap_us / 1000:g} ms apart" in cells[4]
 
 
 @pytest.mark.parametrize(("frequency_hz", "late_ms"), [(40.0, 0.0), (80.0, 2.6)])

@@ -115,10 +115,9 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
 
     # The thresholds adapt to each half on its own, computed again here from the responses before.
     told = iter([w["percentiles_hz"] for w in session.log.records.words() if "percentiles_hz" in w])
-    now, in_force, moved = np.asarray(loop.percentiles, np.float32), list[np.ndarray](), 0
+    now, moved = np.asarray(loop.percentiles, np.float32), 0
     answered_hz: list[list[tuple[int, float, float]]] = [[], []]
     for tick in session.ticks:
-        in_force.append(now)
         if tick.handled == "used":
             each = zip(tick.readout_hz, now, strict=True)
             wanted = [Thresholds(9).command(np.float32(x), p) for x, p in each]

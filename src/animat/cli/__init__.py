@@ -292,7 +292,7 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
         if expected is not None:
             kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None)]
     # A flag that turns something off would say that its default is True.
-    if option.default in (None, (), True):
+    if option.default is None or option.default == () or option.default is True:
         kind = Annotated[kind, arg(help_behavior_hint="")]
     said = option.helptext() if callable(option.helptext) else option.helptext
     # Help takes an indented line of a docstring for a new paragraph.

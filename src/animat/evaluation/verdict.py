@@ -37,7 +37,7 @@ class Beside(NamedTuple):
     @property
     def is_worse(self) -> bool:
         """Whether they are smaller."""
-        return self.p < OUTPERFORMED_P and self.wins < 0.5
+        return is_worse(self.p, self.wins)
 
     @property
     def can_tell(self) -> bool:
@@ -59,6 +59,11 @@ def beside(policies: ArrayLike, control: ArrayLike) -> Beside:
     test = mannwhitneyu(ours, theirs, alternative="two-sided", method="asymptotic")
     # By its continuity correction p can exceed 1 where U is at its mean.
     return Beside(min(1.0, float(test.pvalue)), float(test.statistic) / ours.size / theirs.size, len(ours), len(theirs))
+
+
+def is_worse(p: float, wins: float) -> bool:
+    """Whether returns are smaller than a control's, by the test and the share of pairs of episodes that they win."""
+    return p < OUTPERFORMED_P and wins < 0.5
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from animat.evaluation.verdict import OUTPERFORMED_P, beside
+from animat.evaluation.verdict import beside, is_worse
 from animat.report.results import BesideHeuristic, Results
 from animat.studies.episodes import POLICY, DataFrame
 from animat.studies.evaluating import is_usual
@@ -36,7 +36,7 @@ def not_outperforming(results: Results) -> list[str]:
     return [
         f"{row.robot}, {row.arm}, at {row.at_min:g} min: the policies do not outperform the heuristic policy "
         f"({row.mean_return:.1f} against {row.heuristic:.1f}; p = {row.p:.2g} over episodes"
-        f"{'; they are worse' if row.p < OUTPERFORMED_P and row.wins < 0.5 else ''})"
+        f"{'; they are worse' if is_worse(row.p, row.wins) else ''})"
         for row in results.heuristic
         if row.outcome == NOT
     ]
