@@ -548,6 +548,16 @@ BAD = {
         ["record", "--out", "{folder}/taken"],
         ["taken: cannot be made or read: it is no folder; choose another --out"],
     ),
+    "a file for the folder of a cluster's address": (
+        lambda folder, *_: (folder / "taken").write_text("x"),
+        ["cluster", "local", "--file", "{folder}/taken/cluster.json"],
+        ["taken: cannot be written: ", "taken is no folder; choose another --file"],
+    ),
+    "a training's description that somebody edited": (
+        lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),
+        ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
+        ["expected a folder of this training, got one of another (training.robot.name: None there, 'cartpole' now)"],
+    ),
     "zero sessions": (
         nothing,
         ["record", "--sessions", "0", "--out", "{folder}/r"],

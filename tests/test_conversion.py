@@ -144,6 +144,8 @@ def test_an_age_that_is_none_is_refused_before_anything_is_read(
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert f"age: expected an ISO 8601 duration such as P42D (days), P6W or P3M, got {age!r}" in said
+    with pytest.raises(InvalidArgument, match=r"species: expected the name in Latin, .* got 'mouse'"):
+        Origin(species="mouse")
     with pytest.raises(InvalidArgument, match="recorded_at: expected an ISO 8601 date"):
         Origin(recorded_at="yesterday")
 

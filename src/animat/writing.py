@@ -60,8 +60,12 @@ def write_whole(path: Path, content: str | bytes) -> Path:
     return path
 
 
-def expect_writable(folder: str | os.PathLike[str]) -> None:
+def expect_writable(folder: str | os.PathLike[str], option: str = "--out") -> None:
     """Refuse a folder that could not be written to, or not be made, before any work; nothing is left of the trial.
+
+    Args:
+        folder: it may be missing.
+        option: of the command line, by which another can be chosen.
 
     Raises:
         InvalidFile: naming the folder, and what stands in its way.
@@ -75,7 +79,7 @@ def expect_writable(folder: str | os.PathLike[str]) -> None:
             pass
     except OSError as error:
         what = f"{there} is no folder" if there.is_file() else (error.strerror or str(error))
-        raise InvalidFile(f"{folder}: cannot be written: {what}; choose another --out") from error
+        raise InvalidFile(f"{folder}: cannot be written: {what}; choose another {option}") from error
 
 
 @contextmanager

@@ -34,7 +34,7 @@ class ClusterCommand:
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         if workers < 1:
             raise InvalidArgument(f"--workers: expected at least 1, got {workers}")
-        expect_writable(self.file.parent)
+        expect_writable(self.file.parent, "--file")
         with local_cluster(workers, self.file) as processes:
             print(f"{workers} workers; to use them: --cluster {self.file}; to end them: Ctrl-C", flush=True)
             try:

@@ -29,6 +29,9 @@ DURATION = re.compile(
 )
 """ISO 8601: P, years, months, weeks and days, and after a T hours, minutes and seconds; one of them at least."""
 
+SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
+"""Genus and species, and perhaps the subspecies, or an address of NCBI's taxonomy."""
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -47,7 +50,8 @@ class Origin:
         experiment_description: in words.
 
     Raises:
-        InvalidArgument: for an `age` that is no duration, or a `recorded_at` that is no date.
+        InvalidArgument: for a `species` that is not in Latin, an `age` that is no duration, or a `recorded_at` that is
+            no date.
     """
 
     subject_id: str | None = None
@@ -64,6 +68,9 @@ class Origin:
 
     def __post_init__(self) -> None:
         # Here and not when the file is written: finding spikes takes minutes.
+        if self.species is not None and not SPECIES.fullmatch(self.species):
+            expected = "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy"
+            raise InvalidArgument(f"species: expected {expected}, got {self.species!r}")
         if self.age is not None:
             first, _, last = self.age.partition("/")
             # The one duration of an age, or the two of a range, of which the last may be open.

@@ -190,8 +190,16 @@ def _description_in(folder: Path) -> dict[str, Any] | None:
 
 def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
     # What follows from the robot, such as the usual iterations, is not what differs.
-    there, now = (each.get("training", {}).get("robot", {}).get("name") for each in (found, manifest))
+    there, now = map(_robot_in, (found, manifest))
     return first_difference(there, now, "training.robot.name") or first_difference(found, manifest, ignoring=ignoring)
+
+
+def _robot_in(manifest: dict[str, Any]) -> Any:
+    """The robot's name; None where a description that somebody edited has none."""
+    try:
+        return manifest["training"]["robot"]["name"]
+    except (KeyError, TypeError):
+        return None
 
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
