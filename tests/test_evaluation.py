@@ -273,7 +273,7 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
 
     class Noting:
         def update(self, done: float, total: float, note: str = "") -> None:
-            assert done <= total == 10
+            assert done <= total
             told.append(note)
 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
@@ -281,7 +281,8 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
     environment = Animat(SHORT, Thresholds(1), 3)
     assert found.optimum is not None
     assert replace(found.optimum, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
-    assert told[-2:] == ["coupling", "optimal return"]
+    assert list(dict.fromkeys(told))[-4:-2] == ["coupling", "optimal return"]
+    assert told[-1] == "its interval"
     assert set(found.optimum.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))

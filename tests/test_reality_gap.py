@@ -226,7 +226,7 @@ def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
     def fail(*_: Any, **__: Any) -> Any:
         raise MemoryError("no room")
 
-    monkeypatch.setattr("animat.reality_gap.running.rough_values", fail)
+    monkeypatch.setattr("animat.reality_gap.optimum.rough_values", fail)
     of = {"p0": policy_of(0, series)}, FakeCulture(), Calibration.of_series(series)
     # On a device it is known before the loop begins.
     with of[1], pytest.raises(MemoryError):

@@ -19,6 +19,7 @@ from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
+    from animat.responses.readouts import Readouts
     from animat.training.policy import Policy
     from animat.training.specification import Training
 
@@ -90,20 +91,56 @@ class Train(Fitting):
 
     def run(self) -> dict[str, Any]:
         """Train."""
-        from animat.coding.decoder import expect_fit
-        from animat.coding.mapping import mapping_named
-        from animat.goals.robot import with_goal
+        from animat.execution.cluster import on_cluster
+        from animat.execution.training import train
         from animat.progress import Bar
-        from animat.responses.readouts import ALL, USUAL_READOUTS, count_readouts, read_readouts
-        from animat.robots.registry import robot_named
-        from animat.training.lessons import read_lessons
-        from animat.training.specification import Training
+        from animat.report.tensorboard import TensorBoard
+        from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
 
         # What can be refused is refused before recordings are read, which can take a while.
         if self.workers is not None and self.workers < 1:
             raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
         if not self.out.is_dir():
             expect_writable(self.out)
+        training, readouts = self._asked_for()
+        board = nullcontext() if self.tensorboard is None else TensorBoard(self.tensorboard)
+        expect_trainable(training, is_saved=True)
+        expect_folder_for(training, self.out)
+        for caveat in training.robot.caveats():
+            print(f"warning: {caveat}", file=sys.stderr)
+        timeline = None if training.mapping is None else self._timeline(readouts)
+        training.environment_on(timeline)
+        was_finished = is_finished(training, self.out)
+        if timeline is not None:
+            print(_control(timeline))
+        # Of a training that goes on it was told before.
+        random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
+        with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
+            trained = train(
+                training,
+                timeline,
+                self.out,
+                workers=self.workers,
+                executor=executor,
+                progress=progress,
+                sources=[str(path) for path in self.recordings],
+                random_return=random,
+                callbacks=() if on_row is None else (on_row,),
+            )
+        if was_finished:
+            print(f"this training was finished before: its policies are in {self.out}, as they were")
+        return self._told(trained, timeline)
+
+    def _asked_for(self) -> tuple[Training, str | Readouts]:
+        """The training, and what is read of the neurons."""
+        from animat.coding.decoder import expect_fit
+        from animat.coding.mapping import mapping_named
+        from animat.goals.robot import with_goal
+        from animat.responses.readouts import ALL, USUAL_READOUTS, count_readouts, read_readouts
+        from animat.robots.registry import robot_named
+        from animat.training.lessons import read_lessons
+        from animat.training.specification import Training
+
         robot = robot_named(self.robot, **read_numbers("--parameters", self.parameters))
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
@@ -135,45 +172,22 @@ class Train(Fitting):
             lessons=() if self.lessons is None else read_lessons(self.lessons),
             assess=self.assess,
         )
-        from animat.execution.cluster import on_cluster
-        from animat.execution.training import train
-        from animat.report.tensorboard import TensorBoard
-        from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
+        return training, readouts
 
-        board = nullcontext() if self.tensorboard is None else TensorBoard(self.tensorboard)
-        expect_trainable(training, is_saved=True)
-        expect_folder_for(training, self.out)
-        for caveat in robot.caveats():
-            print(f"warning: {caveat}", file=sys.stderr)
+    def _timeline(self, readouts: str | Readouts) -> SimulatorTimeline:
+        """The simulators of the recordings."""
         fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
-        timeline = None if mapping == "none" else fitting.timeline(self.recordings, readouts=readouts)
-
-        if timeline is not None and len(timeline.conditions) < 2 and "one-condition" not in self.allow:
+        timeline = fitting.timeline(self.recordings, readouts=readouts)
+        if len(timeline.conditions) < 2 and "one-condition" not in self.allow:
             raise UnusableData(
                 "--conditions: expected two or more for an agent to choose from, got one "
                 f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
                 "(to allow it: --allow one-condition)"
             )
-        training.environment_on(timeline)
-        was_finished = is_finished(training, self.out)
-        if timeline is not None:
-            print(_control(timeline))
-        # Of a training that goes on it was told before.
-        random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
-        with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
-            trained = train(
-                training,
-                timeline,
-                self.out,
-                workers=self.workers,
-                executor=executor,
-                progress=progress,
-                sources=[str(path) for path in self.recordings],
-                random_return=random,
-                callbacks=() if on_row is None else (on_row,),
-            )
-        if was_finished:
-            print(f"this training was finished before: its policies are in {self.out}, as they were")
+        return timeline
+
+    def _told(self, trained: dict[str, Policy], timeline: SimulatorTimeline | None) -> dict[str, Any]:
+        """How good the policies are beside random actions, and how they got on at their assessments."""
         from animat.evaluation.table import evaluate
 
         first = next(iter(trained.values()))

@@ -75,10 +75,16 @@ class Counted:
         spread = "histogram" if simulator.has_memory else kind
         return cls(environment, simulator, responses, left_out, lambda these: fit(these, spread))
 
-    def known(self, optimum: Optimum, *, resolution: float, seed: int) -> Optimum:
+    def known(self, optimum: Optimum, *, resolution: float, seed: int, progress: Progress | None = None) -> Optimum:
         """The optimum in this environment with its interval, and with what was left out."""
         known = with_intervals(
-            [optimum], [self.environment], self.responses, self.fit, resolution=resolution, seed=seed
+            [optimum],
+            [self.environment],
+            self.responses,
+            self.fit,
+            resolution=resolution,
+            seed=seed,
+            progress=progress,
         )
         return replace(known[0], left_out=self.left_out)
 

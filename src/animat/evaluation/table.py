@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from animat.evaluation.controls import Control, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import Counted
-from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.rollouts import Networks, networks_of, roll_out
 from animat.evaluation.row import Row
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
@@ -26,7 +26,7 @@ from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Progress, Silent, in_phase
+from animat.progress import Part, Progress, Silent, in_phase
 from animat.recordings.findings import Finding
 from animat.robots.base import Robot, lacking
 from animat.robots.host import HostRobot
@@ -226,7 +226,7 @@ def evaluate(
         optimum_resolution: of the grid for the optimal return in the same environment (`best_returns`; a study's is
             1), which takes seconds, as the best coupling does, which is then among the controls; None: neither is.
         interventions: whether to run the policies with all interventions too (`animat.evaluation.whose_work`).
-        progress: told after the policies and each control, before the optimum and each intervention.
+        progress: told after the policies and each control, of the optimum how far it is, and before each intervention.
 
     Raises:
         InvalidArgument: for no policies, fewer episodes than one, interventions without neurons, or an `at_min`, a
@@ -237,120 +237,153 @@ def evaluate(
     first = first_of_alike(policies, alike, "evaluate it alone")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, which the policies were trained on, got {robot.name}")
-    body, progress = robot or first.robot, progress or Silent()
-
-    findings: tuple[Finding, ...] = ()
-    simulator: NeuronSimulator | None = None
-    environment: Environment[Any]
-    minute, fixed_from_min = None, None
-    if first.mapping is None:
-        environment = WithoutNeurons(body, first.commands)
-    else:
-        if timeline is None:
-            raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
-        row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
-        minute = float(timeline.start_min[row])
-        findings = (*transfer.other_timeline(first, timeline), *transfer.not_of_a_loop(first, timeline, minute))
-        fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
-        simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
-        environment = Animat(body, first.mapping, len(timeline.conditions))
-        if first.neural_observation:
-            environment = NeuralObservation(environment)
-
-    networks = networks_of(list(policies.values()), greedy=greedy)
-    n = len(policies)
-    # A policy that was trained as a control is one here too: what it chooses decides nothing.
-    trained = Control("policies", "as trained", networks, n)
-    if simulator is not None and first.delivery == "shuffled":
-        meaning = "as trained: what is delivered is drawn anew"
-        trained = replace(trained, meaning=meaning, delivery="shuffled")
     if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):
         raise InvalidArgument(f"optimum_resolution: expected a positive number, got {optimum_resolution!r}")
-    if interventions and simulator is None:
+    if interventions and first.mapping is None:
         raise InvalidArgument("interventions: expected policies that act through neurons, got ones without")
-    labels = [condition.label for condition in first.conditions]
-    if first.mapping is None:
-        labels = [f"{command:+g}" for command in first.commands or ()]
-    every = controls_of(environment, simulator, labels, networks, n)
+    body, progress = robot or first.robot, progress or Silent()
+    world = _World.of(first, body, timeline, at_min)
+    within = world.environment, world.simulator
+    networks, n = networks_of(list(policies.values()), greedy=greedy), len(policies)
+    trained = _as_trained(first, networks, n)
+    every = controls_of(*within, _labels(first), networks, n)
     acting = [trained, *(control for control in every if controls is None or control.name in controls)]
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
-    steps = len(acting) + searches + (optimum_resolution is not None)
+    steps = len(acting) + searches
     if searches:
         progress.update(0, steps, "best coupling")
-        acting.append(coupling_of(environment, simulator, seed=seed))
+        acting.append(coupling_of(*within, seed=seed))
+    findings = world.findings
     if controls is None and (without := lacking(body).get("heuristic")):
         findings += (Finding("no-heuristic", "note", without),)
-    pulses = 1 if first.presentation is None else first.presentation.pulses
-    of_trials = electrode_pulses(first.conditions, pulses) if simulator is not None else None
-    rows = []
+    rows: list[Row] = []
     for each in acting:
-        within = each.within(environment, simulator)
-        ran = roll_out(*within, each.actor, each.n_actors, episodes=episodes, seed=seed)
-        changed = within[0] is not environment or within[1] is not simulator
-        given = None if of_trials is None else ran.presented @ of_trials * (each.delivery != "silent") / episodes
-        rows.append(Row(each.name, each.meaning, ran, changed, given, first.pulse_cost))
+        rows.append(world.row_of(each, episodes=episodes, seed=seed))
         progress.update(len(rows), steps, each.name)
     optimum, no_optimum, net_optimum = None, None, None
     if optimum_resolution is not None:
-        progress.update(len(rows), steps, "optimal return")
-        are_fixed = fixed_from_min is not None
+        phase = in_phase(progress, "optimal return")
         try:
-            optimum = _optimum(environment, simulator, timeline, minute, are_fixed, optimum_resolution, seed)
+            optimum = world.optimum(optimum_resolution, seed, phase)
         except (InvalidArgument, UnusableData) as error:
             no_optimum = str(error)
         # Conditions of few responses would promise what is not there.
-        if optimum is not None and not optimum.left_out and first.pulse_cost and of_trials is not None:
-            costs = tuple(first.pulse_cost * count for count in of_trials)
-            costing = TrialCosts(unwrapped(environment), costs)
-            net_optimum = best_return(costing, simulator, resolution=optimum_resolution, seed=seed)
-    context = None
-    by_name = {each.name: each.episodes.returns[0] for each in rows}
-    if {"coupling", "random"} <= set(by_name):
-        beside = by_name["coupling"], by_name["random"]
-        if optimum is None:
-            agents = [row.episodes.returns for row in rows if row.name in ("policies", "heuristic") and not row.changed]
-            if agents:
-                context = least_context_gap(*beside, np.concatenate(agents), body.return_range[1])
-        elif not optimum.left_out:
-            context = context_gap(*beside, optimum)
+        if optimum is not None and not optimum.left_out:
+            net_optimum = world.net_optimum(optimum_resolution, seed)
     work = None
     if interventions:
         phase = in_phase(progress, "whose work it is")
-        trained_in = trained.within(environment, simulator)
-        work = whose_work(*trained_in, networks, n, episodes=episodes, seed=seed, progress=phase)
+        work = whose_work(*trained.within(*within), networks, n, episodes=episodes, seed=seed, progress=phase)
     for best in (optimum, net_optimum):
         findings += () if best is None else tuple(best.findings())
     return Evaluation(
         robot=body.name,
         mapping=None if first.mapping is None else first.mapping.name,
-        recorded_at_min=minute,
+        recorded_at_min=world.minute,
         names=tuple(policies),
         rows=tuple(rows),
         findings=findings,
         optimum=optimum,
         no_optimum=no_optimum,
-        fixed_from_min=fixed_from_min,
-        context=context,
+        fixed_from_min=world.fixed_from_min,
+        context=_context(rows, optimum, body.return_range[1]),
         objectives=objectives_of(body),
         whose_work=work,
         net_optimum=net_optimum,
     )
 
 
-def _optimum(
-    environment: Environment[Any],
-    simulator: NeuronSimulator | None,
-    timeline: SimulatorTimeline | None,
-    minute: float | None,
-    are_fixed: bool,
-    resolution: float,
-    seed: int,
-) -> Optimum:
-    """The optimal return; with its interval, without conditions of few responses, where responses are known."""
-    environment = unwrapped(environment)
-    if not isinstance(environment, Animat) or minute is None or timeline is None or not timeline.responses:
-        return best_return(environment, simulator, resolution=resolution, seed=seed)
-    case = Counted.of(environment, timeline, minute, are_fixed=are_fixed)
-    best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed)
-    return case.known(best, resolution=resolution, seed=seed)
+@dataclass(frozen=True, eq=False)
+class _World:
+    """What policies are evaluated in.
+
+    Attributes:
+        first: of the policies; it stands for all.
+        environment: a robot, and neurons where policies act through them.
+        simulator, timeline, minute: of these neurons, and the recording that the simulator is of; None without.
+        fixed_from_min, findings: as in `Evaluation`.
+    """
+
+    first: Policy
+    environment: Environment[Any]
+    simulator: NeuronSimulator | None = None
+    timeline: SimulatorTimeline | None = None
+    minute: float | None = None
+    fixed_from_min: float | None = None
+    findings: tuple[Finding, ...] = ()
+
+    @classmethod
+    def of(cls, first: Policy, body: Robot[Any], timeline: SimulatorTimeline | None, at_min: float | None) -> Self:
+        """That of policies like the first one; arguments and errors as in `evaluate`."""
+        if first.mapping is None:
+            return cls(first, WithoutNeurons(body, first.commands))
+        if timeline is None:
+            raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
+        minute = float(timeline.start_min[timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)])
+        findings = (*transfer.other_timeline(first, timeline), *transfer.not_of_a_loop(first, timeline, minute))
+        fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
+        simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
+        animat = Animat(body, first.mapping, len(timeline.conditions))
+        environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
+        return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings)
+
+    def row_of(self, control: Control, *, episodes: int, seed: int) -> Row:
+        """Run a control, or the policies, and tell what came of it."""
+        environment, simulator = control.within(self.environment, self.simulator)
+        ran = roll_out(environment, simulator, control.actor, control.n_actors, episodes=episodes, seed=seed)
+        changed = environment is not self.environment or simulator is not self.simulator
+        of_trials = self._electrode_pulses()
+        given = None if of_trials is None else ran.presented @ of_trials * (control.delivery != "silent") / episodes
+        return Row(control.name, control.meaning, ran, changed, given, self.first.pulse_cost)
+
+    def optimum(self, resolution: float, seed: int, progress: Progress) -> Optimum:
+        """The optimal return; with its interval, without conditions of few responses, where responses are known."""
+        environment = unwrapped(self.environment)
+        timeline, minute = self.timeline, self.minute
+        if not isinstance(environment, Animat) or minute is None or timeline is None or not timeline.responses:
+            whole = Part(progress, 0, 1, 1, "optimal return")
+            return best_return(environment, self.simulator, resolution=resolution, seed=seed, progress=whole)
+        case = Counted.of(environment, timeline, minute, are_fixed=self.fixed_from_min is not None)
+        alone, resampled = (Part(progress, i, 1, 2, note) for i, note in enumerate(("optimal return", "its interval")))
+        best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed, progress=alone)
+        return case.known(best, resolution=resolution, seed=seed, progress=resampled)
+
+    def net_optimum(self, resolution: float, seed: int) -> Optimum | None:
+        """The same less what the pulses cost; None where they cost nothing."""
+        cost, of_trials = self.first.pulse_cost, self._electrode_pulses()
+        if not cost or of_trials is None:
+            return None
+        costing = TrialCosts(unwrapped(self.environment), tuple(cost * count for count in of_trials))
+        return best_return(costing, self.simulator, resolution=resolution, seed=seed)
+
+    def _electrode_pulses(self) -> tuple[float, ...] | None:
+        """Of a trial of each condition, where neurons are stimulated and it is known."""
+        pulses = 1 if self.first.presentation is None else self.first.presentation.pulses
+        return electrode_pulses(self.first.conditions, pulses) if self.simulator is not None else None
+
+
+def _as_trained(first: Policy, networks: Networks, n: int) -> Control:
+    """The policies themselves; one that was trained as a control is one here too: what it chooses decides nothing."""
+    if first.mapping is None or first.delivery != "shuffled":
+        return Control("policies", "as trained", networks, n)
+    return Control("policies", "as trained: what is delivered is drawn anew", networks, n, delivery="shuffled")
+
+
+def _labels(first: Policy) -> list[str]:
+    """Of the actions."""
+    if first.mapping is None:
+        return [f"{command:+g}" for command in first.commands or ()]
+    return [condition.label for condition in first.conditions]
+
+
+def _context(rows: Sequence[Row], optimum: Optimum | None, largest_return: float) -> ContextGap | None:
+    """How much the best coupling leaves undone; None where it, or random actions, were not run."""
+    by_name = {each.name: each.episodes.returns[0] for each in rows}
+    if not {"coupling", "random"} <= set(by_name):
+        return None
+    beside = by_name["coupling"], by_name["random"]
+    if optimum is not None:
+        return None if optimum.left_out else context_gap(*beside, optimum)
+    agents = [row.episodes.returns for row in rows if row.name in ("policies", "heuristic") and not row.changed]
+    return least_context_gap(*beside, np.concatenate(agents), largest_return) if agents else None

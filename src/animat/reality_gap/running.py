@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +22,6 @@ from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import RANDOM, Control, controls_of, coupling_of, interventions_of
-from animat.evaluation.optimum import rough_values
 from animat.evaluation.resampling import too_few
 from animat.evaluation.rollouts import networks_of
 from animat.evaluation.transfer import (
@@ -36,10 +33,10 @@ from animat.evaluation.transfer import (
 )
 from animat.evaluation.verdict import beside
 from animat.goals.tally import Outcome
-from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.reality_gap.answered import answered, outcomes
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.optimum import OptimumBeside
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Predicted, episodes_on_host, predict, together
 from animat.reality_gap.reasons import Evidence, reasons
@@ -48,15 +45,13 @@ from animat.reality_gap.table import RealityGap
 from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
-from animat.robots.grid import grid_for, no_grid
+from animat.robots.grid import no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
 """Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
-OPTIMUM_RESOLUTION = 0.5
-"""Of the grid of the optimal return: fast and rough, 0.8 of the cartpole's 200."""
 
 
 def run_policies(
@@ -112,8 +107,6 @@ def run_policies(
     loop, findings = _loop_of(first, calibration, pulses, settings)
     findings += tuple(_warned(first, loop, calibration, culture.now_s / 60))
     account = account or Account()
-    of_trials = electrode_pulses(loop.conditions, loop.pulses)
-
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
@@ -146,11 +139,9 @@ def run_policies(
     of_each = planned_episodes(n_policies, len(controls), episodes)
     check_session(culture, loop, agents, of_each, seed)
 
-    why_not = no_grid(loop.robot)
-    if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
-        why_not = f"these conditions have too few responses: {', '.join(few)}"
-    if why_not is not None:
-        findings += (Finding("no-optimum", "note", lacks.get("value_grid", f"no optimal return: {why_not}")),)
+    why_no_optimum = _why_no_optimum(loop, calibration)
+    if why_no_optimum is not None:
+        findings += (Finding("no-optimum", "note", why_no_optimum),)
     predicted = predict(
         trained,
         tuple(policies),
@@ -161,11 +152,10 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    # Beside a loop that takes what time it takes, on another core; before one in real time, which has no time to lose.
-    optimum = _meanwhile(lambda: _best_return(animat, simulator)) if why_not is None else None
-    in_real_time = loop.real_time or not isinstance(culture, VirtualCulture)
-    if in_real_time and optimum is not None:
-        _wait_for(optimum, progress)
+    optimum = OptimumBeside(animat, simulator) if why_no_optimum is None else None
+    if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
+        # Such a loop has no time to lose.
+        optimum.value(progress)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
@@ -176,8 +166,6 @@ def run_policies(
         for message in warnings_once(findings):
             report(f"warning: {message}")
         report(str(ahead))
-    forecast = {name: between(of.returns.mean(), of.anew) for name, of in predicted.items()}
-    watched = in_phase(progress, "closed loop", sum(of_each), "episodes")
     try:
         session = run_session(
             culture,
@@ -187,23 +175,21 @@ def run_policies(
             episodes=of_each,
             seed=seed,
             account=account,
-            progress=watched,
-            predicted=forecast,
+            progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
+            predicted={name: between(of.returns.mean(), of.anew) for name, of in predicted.items()},
         )
     except Exception:
-        # A program that ends while JAX computes in another thread is ended by a signal.
         if optimum is not None:
-            wait([optimum])
+            optimum.let_end()
         raise
     best = None
     # Whoever stopped the session does not wait for it.
-    if optimum is not None and (optimum.done() or session.ending.by == "plan"):
+    if optimum is not None and (optimum.is_known or session.ending.by == "plan"):
         try:
-            best = _wait_for(optimum, progress)
+            best = optimum.value(progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
-    met = outcomes(loop.robot, session)
-    rows = _rows(agents, tuple(policies), predicted, session, met, of_trials, first.pulse_cost)
+    rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
@@ -285,32 +271,12 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
 
-def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
-    """The value alone, which is told as "about": how well it is known would take a third as long again."""
-    grid = grid_for(environment.robot).scaled(OPTIMUM_RESOLUTION)
-    (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
-    return float(value)
-
-
-def _meanwhile(compute: Callable[[], float]) -> Future[float]:
-    """Begin to compute in a thread of its own."""
-    found: Future[float] = Future()
-
-    def work() -> None:
-        try:
-            found.set_result(compute())
-        except BaseException as error:
-            found.set_exception(error)
-
-    # A daemon: whoever stops while it computes need not wait for it.
-    threading.Thread(target=work, name="optimal return", daemon=True).start()
-    return found
-
-
-def _wait_for(optimum: Future[float], progress: Progress | None) -> float:
-    if not optimum.done():
-        in_phase(progress, "optimal return").update(0, 1, "working it out on the simulator")
-    return optimum.result()
+def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
+    """What keeps the optimal return from being computed; None where nothing does."""
+    why_not = no_grid(loop.robot)
+    if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
+        why_not = f"these conditions have too few responses: {', '.join(few)}"
+    return None if why_not is None else lacking(loop.robot).get("value_grid", f"no optimal return: {why_not}")
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
@@ -340,10 +306,10 @@ def _rows(
     names: tuple[str, ...],
     predicted: Mapping[str, Predicted],
     session: Session,
-    came_to: Mapping[int, Outcome],
-    of_trials: tuple[float, ...] | None,
+    loop: Loop,
     pulse_cost: float,
 ) -> tuple[Row, ...]:
+    came_to, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
     unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
 
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:

@@ -192,7 +192,7 @@ class Judge(RobotTask):
             seed=self.drawn("judge"),
             optimum_resolution=self.study.optimum_resolution,
             interventions=True,
-            progress=InTurn(progress, 2),
+            progress=InTurn(progress, 3),
         )
         return [write_json(self.beside(folder, SIMULATED), evaluation.to_dict())]
 
