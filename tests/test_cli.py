@@ -137,12 +137,12 @@ def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The optimal return on a coarse grid, and a short search for the coupling; returns the resolutions asked for."""
     asked = []
 
-    def rough(*case: Any, resolution: float, seed: int) -> Optimum:
+    def rough(*case: Any, resolution: float, **options: Any) -> Optimum:
         asked.append(resolution)
-        return best_return(*case, resolution=0.25, episodes=0, seed=seed)
+        return best_return(*case, resolution=0.25, episodes=0, **options)
 
-    def narrow(*of: Any, resolution: float, seed: int) -> tuple[Optimum, ...]:
-        return with_intervals(*of, resolution=0.25, resamples=3, seed=seed)
+    def narrow(*of: Any, resolution: float, **options: Any) -> tuple[Optimum, ...]:
+        return with_intervals(*of, resolution=0.25, resamples=3, **options)
 
     monkeypatch.setattr("animat.evaluation.table.best_return", rough)
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
