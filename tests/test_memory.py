@@ -718,6 +718,26 @@ def test_what_a_simulator_with_memory_keeps_is_told_by_what_it_answers() -> None
     assert not np.array_equal(kept.in_simulator, kept.in_data)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_simulator_without_memory_keeps_is_all_of_its_responses(seed: int) -> None:
+    responses = independent(seed, 1500)
+    simulator = fit_memory(responses, memory=NO_MEMORY)
+    kept = fidelity(responses, simulator)
+    np.testing.assert_allclose(kept.in_simulator, kept.in_data, atol=1e-6)
+    assert not kept.findings(of_memory=True)
+
+
+def test_what_a_simulator_with_memory_keeps_is_what_many_draws_come_to() -> None:
+    responses = chain(400, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
+    simulator = fit_memory(responses)
+    rng, above, median_hz = np.random.default_rng(0), [], np.asarray(simulator.percentiles, np.float32)[5]
+    for condition, n in enumerate(np.asarray(simulator.followers)):
+        histories = np.asarray(simulator.histories)[condition, rng.integers(n, size=40_000)]
+        drawn = jax.vmap(simulator.answer, (None, 0, 0))(condition, rng.random(40_000, np.float32), histories)
+        above.append(np.mean(np.asarray(drawn.rate_hz) >= median_hz))
+    np.testing.assert_allclose(fidelity(responses, simulator).in_simulator, above, atol=0.015)
+
+
 def test_too_few_to_draw_the_nearest_from_is_told() -> None:
     few = chain(40, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
     # Always the nearest alone: what had an outlying history is drawn most often.

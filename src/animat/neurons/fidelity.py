@@ -78,32 +78,38 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     """Compare a simulator with the responses it was fitted to, at the pooled median P50.
 
     The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; of a
-    simulator with memory, of 200 after each history that it knows.
+    simulator with memory, the mean share of the responses nearest to each history that it knows.
     """
     median_hz = np.asarray(simulator.percentiles, np.float32)[..., 5]
     kept, read_hz = ~responses.is_burst, responses.read_hz.astype(np.float32)
     conditions = range(len(responses.conditions))
     in_data = np.array([np.mean(read_hz[kept & (responses.condition == c)] >= median_hz, axis=0) for c in conditions])
-    x = _drawn_after_each(simulator) if isinstance(simulator, MemorySimulator) else _evenly_drawn(simulator, 20_000)
     above = 0
     if isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
         above = int(np.count_nonzero(read_hz[kept] > np.asarray(simulator.edges_hz)[..., -1]))
     labels = tuple(condition.label for condition in responses.conditions)
-    in_simulator = np.asarray(np.mean(np.asarray(x) >= median_hz, axis=1, dtype=np.float32), np.float64)
-    return Fidelity(labels, in_data, in_simulator, above, responses.readouts.names)
+    if isinstance(simulator, MemorySimulator):
+        shares = _shares_after_each(simulator, median_hz)
+    else:
+        shares = np.mean(np.asarray(_evenly_drawn(simulator, 20_000)) >= median_hz, axis=1, dtype=np.float32)
+    return Fidelity(labels, in_data, np.asarray(shares, np.float64), above, responses.readouts.names)
 
 
 @jax.jit
-def _drawn_after_each(simulator: MemorySimulator) -> Float[Array, "conditions draws *readouts"]:
-    """Evenly spaced answers to every condition after each history that one of its own responses had."""
-    uniforms = (jnp.arange(200) + 0.5) / 200
-    answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
+def _shares_after_each(
+    simulator: MemorySimulator, median_hz: Float[Array, "*readouts"]
+) -> Float[Array, "conditions *readouts"]:
+    """How many answers to every condition reach the median, over all histories that its own responses had."""
     rows = jnp.arange(simulator.before.shape[1])
 
-    def of_condition(condition: Int[Array, ""]) -> Float[Array, "draws *readouts"]:
-        # What is padded is stood for by those that are there, over and over.
-        before = simulator.histories[condition][rows % simulator.followers[condition]]
-        rate_hz = answer(condition, uniforms, before).rate_hz
-        return rate_hz.reshape(-1, *rate_hz.shape[2:])
+    def of_condition(condition: Int[Array, ""]) -> Float[Array, "*readouts"]:
+        above = jnp.asarray(simulator.after_hz)[condition] >= median_hz
+        before_each = jnp.concatenate([jnp.zeros((1, *above.shape[1:]), jnp.int32), jnp.cumsum(above, axis=0)])
+        trace, load = jnp.asarray(simulator.histories)[condition].T
+        near = jax.vmap(simulator.rows_near, (None, 0, 0))
+        first, end = near(condition, trace, jnp.asarray(simulator.kept)[condition] * load)
+        per_row = (-1, *[1] * (above.ndim - 1))
+        shares = (before_each[end] - before_each[first]) / (end - first).reshape(per_row)
+        return shares.mean(axis=0, where=(rows < simulator.followers[condition]).reshape(per_row))
 
     return jax.vmap(of_condition)(jnp.arange(simulator.n_conditions))
