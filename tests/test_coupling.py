@@ -92,6 +92,53 @@ def test_the_best_coupling_through_neurons_is_found() -> None:
     assert abs(mean_return(environment, simulator, found) - best) < 0.01 * best + 3 * 0.05
 
 
+class Hovering(NamedTuple):
+    at: jax.Array
+    speed: jax.Array
+
+
+@dataclass(frozen=True)
+class Hover(Robot[Hovering]):
+    """Paid for being near the middle of a plane, and ended far from it: whoever leaves at once is soon paid no less."""
+
+    episode_limit: int = 40
+    name = "hover"
+    n_commands = 2
+
+    @property
+    def observation_spec(self) -> tuple[Quantity, ...]:
+        return tuple(Quantity(name, unit, 0.5) for unit in ("m", "m/s") for name in (f"x in {unit}", f"y in {unit}"))
+
+    def reset(self, key: Any) -> Hovering:
+        return Hovering(jax.random.uniform(key, (2,), minval=-0.8, maxval=0.8), jnp.zeros(2))
+
+    def advance(self, uniforms: Any, state: Hovering, u: Any) -> tuple[Hovering, Any, Any]:
+        speed = 0.9 * state.speed + 0.03 * u
+        away = jnp.linalg.norm(state.at + speed)
+        return Hovering(state.at + speed, speed), -away, away > 2.0
+
+    def observe(self, state: Hovering) -> Any:
+        return jnp.concatenate(state)
+
+    def heuristic(self, observation: Any) -> Any:
+        return -0.9 * observation[:2] - 1.8 * observation[2:]
+
+
+def test_the_search_begins_near_the_heuristic_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(coupling, "GENERATIONS", 3)
+    environment, scale = WithoutNeurons(Hover(), None), 0.5
+    weights = scale * np.array([[-0.9, 0, -1.8, 0, 0], [0, -0.9, 0, -1.8, 0]])
+    starts = coupling._near_heuristic(environment, None, (0, 1, 2, 3), seed=1)
+    np.testing.assert_allclose(starts[0].reshape(2, 5), weights, atol=1e-5)
+    np.testing.assert_allclose(starts[2], 4 * starts[0])
+    # What it begins near is far better than what so few generations find by themselves.
+    by_itself = Coupling(jnp.asarray(4 * weights[None], jnp.float32), jnp.zeros((1, 1)), None, "graded", (0, 1, 2, 3))
+    known = mean_return(environment, None, by_itself)
+    assert mean_return(environment, None, best_coupling(environment, None)) >= known - 0.05 * abs(known)
+    monkeypatch.setattr(coupling, "_near_heuristic", lambda *_: np.zeros((0, 0)))
+    assert mean_return(environment, None, best_coupling(environment, None)) < known - 0.2 * abs(known)
+
+
 def test_a_coupling_does_not_see_the_goal() -> None:
     spec = Wheels().observation_spec
     seen = tuple(i for i, quantity in enumerate(spec) if not quantity.of_goal)

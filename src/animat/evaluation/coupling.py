@@ -17,11 +17,14 @@ from scipy.stats import t as student_t
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
+from animat.evaluation.heuristic import Heuristic, heuristic_policy
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
+from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
+from animat.robots.base import capability, lacking
 from animat.robots.host import HostRobot
 
 Kind = Literal["graded", "switch"]
@@ -32,6 +35,8 @@ GENERATIONS, EPISODES = 60, 32
 """Of a search; episodes of each coupling, the same starts and chances for all of them."""
 RESTARTS = 2
 """Of each kind."""
+STEEPER = (1.0, 2.0, 4.0, 8.0)
+"""Times the couplings that come nearest to a heuristic: its commands end at -1 and 1, and so a fit is too flat."""
 FRESH_EPISODES = 512
 """In which the best of the last generations is chosen: those that it was found in flatter it."""
 REFLEX_GAP = 0.05
@@ -80,8 +85,9 @@ def best_coupling(
 ) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 
-    Differential evolution, twice for each kind, over weights from -12 to 12. All couplings of a search meet the same
-    starts and chances. The best of the four last generations is chosen in fresh episodes.
+    Differential evolution, twice for each kind, over weights from -12 to 12: once from random ones alone, and once with
+    couplings among them that come nearest to the robot's heuristic, where it has one. All couplings of a search meet
+    the same starts and chances. The best of the four last generations is chosen in fresh episodes.
 
     Args:
         simulator: the neurons' answers; None without neurons.
@@ -120,17 +126,24 @@ def best_coupling(
 
     rounds = itertools.count(1)
     size = n_commands * (len(seen) + 1)
+    per_weight = max(8, -(-40 // size))
+    near_heuristic = _near_heuristic(environment, simulator, seen, seed)
     seeds = np.random.default_rng([seed, 31]).integers(2**31, size=(len(KINDS), RESTARTS, 2)).tolist()
     fresh = seeds[0][0][0] + 1
     found = []
     for kind, of_kind in zip(KINDS, seeds, strict=True):
         last = []
-        for draws, episodes in of_kind:
+        for restart, (draws, episodes) in enumerate(of_kind):
+            first: Any = "latinhypercube"
+            if restart and len(near_heuristic):
+                bounds, others = (-LARGEST_WEIGHT, LARGEST_WEIGHT), (per_weight * size - len(near_heuristic), size)
+                first = np.concatenate([near_heuristic, np.random.default_rng([draws, 1]).uniform(*bounds, others)])
             search = differential_evolution(
                 lambda w, kind=kind, episodes=episodes: -mean_returns(actor(kind, w.T), EPISODES, episodes),
                 [(-LARGEST_WEIGHT, LARGEST_WEIGHT)] * size,
                 maxiter=GENERATIONS,
-                popsize=max(8, -(-40 // size)),
+                popsize=per_weight,
+                init=first,
                 tol=0.0,
                 rng=draws,
                 polish=False,
@@ -142,6 +155,27 @@ def best_coupling(
         returns = mean_returns(actor(kind, candidates), FRESH_EPISODES, fresh)
         found.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
     return max(found, key=lambda each: each[0])[1]
+
+
+def _near_heuristic(
+    environment: Environment[Any], simulator: NeuronSimulator | None, seen: tuple[int, ...], seed: int
+) -> Float64[np.ndarray, "starts weights"]:
+    """Couplings that come nearest to the robot's heuristic, by least squares over its episodes, and steeper ones.
+
+    None where it has no heuristic.
+    """
+    robot = environment.robot
+    if "heuristic" in lacking(robot):
+        return np.zeros((0, 0))
+    policy = Heuristic() if environment.n_actions is None else heuristic_policy(environment, simulator)
+    ran = trace(environment, simulator, policy, 1, episodes=EPISODES, seed=seed)
+    under_way = np.arange(robot.episode_limit) < ran.lengths[..., None]
+    observed = ran.observations[..., :-1, : len(robot.observation_spec)][under_way]
+    wanted = np.asarray(jax.vmap(capability(robot, "heuristic"))(observed), np.float64).reshape(len(observed), -1)
+    scales = np.array([quantity.scale for quantity in robot.observation_spec])
+    design = np.column_stack([(observed / scales)[:, seen], np.ones(len(observed))])
+    weights = np.linalg.lstsq(design, wanted, rcond=None)[0].T.ravel()
+    return np.clip(np.outer(STEEPER, weights), -LARGEST_WEIGHT, LARGEST_WEIGHT)
 
 
 @dataclass(frozen=True)
