@@ -209,7 +209,7 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
     [
         (lambda: fit_histogram(responses_of([1.0], []), bins=3), UnusableData, "10 Hz"),
         (lambda: fit_histogram(responses_of([1.0]), bins=0), InvalidArgument, "bins"),
-        (lambda: fit_histogram(responses_of([1.0]), bins=10**8), InvalidArgument, "bins: expected 1 to 10000"),
+        (lambda: fit_histogram(responses_of([1.0]), bins=10**8), InvalidArgument, "bins: expected 1 to 10,000"),
         (lambda: fit_histogram(responses_of([1.0]), range_hz=-1.0), InvalidArgument, "range_hz"),
         (lambda: fit_histogram(responses_of([1.0]), range_hz=float("nan")), InvalidArgument, "range_hz"),
         (lambda: fit_empirical(responses_of([1.0, 2.0]), room=1), InvalidArgument, "room"),

@@ -136,7 +136,7 @@ def test_a_chain_with_memory_is_told_from_one_without() -> None:
     forgetting = validate(autoregressive(0.0, 2_000))
     assert not forgetting.gain("memory", "empirical").is_certain
     assert forgetting.of("memory").autocorrelation.mean[0] == pytest.approx(0.0, abs=0.03)
-    assert forgetting.verdict.startswith("Cannot be trusted: to know the condition is worth")
+    assert forgetting.verdict.startswith("Cannot be trusted: knowing the condition is worth")
 
 
 @pytest.mark.oracle
@@ -193,7 +193,7 @@ def test_what_the_verdict_says(known: Validation) -> None:
 def test_a_culture_that_hardly_answers_is_not_trusted(share: float) -> None:
     rng = np.random.default_rng(6)
     v = validate(series(1.0 * (rng.random(1_000) < share), np.arange(1_000) % 2, 2))
-    assert v.verdict.startswith("Cannot be trusted: to know the condition is worth ")
+    assert v.verdict.startswith("Cannot be trusted: knowing the condition is worth ")
     assert np.isnan(v.drift)
     assert "nan %" not in validation_text("still.npz", v)
     draw_validation("still.npz", v)
@@ -445,7 +445,7 @@ def test_the_organoid_by_hand(real_data: Path, window_ms: tuple[float, float], d
     recording = read_recording(real_data / "organoid_cartpole_maxone.npz")
     found = check_by_hand(extract_responses(recording, conditions_named("interval:5,10+-25%"), window_ms))
     assert (found.n_fitted, found.n_held) == ((472, 106), (502, 77))
-    assert found.verdict.startswith("Cannot be trusted: to know the condition is worth 0.0")
+    assert found.verdict.startswith("Cannot be trusted: knowing the condition is worth 0.0")
     assert found.drift == pytest.approx(drift, abs=0.01)
     gain = found.gain("memory", "empirical")
     if drift:

@@ -175,7 +175,7 @@ def test_the_table_tells_a_policy_that_knows_its_goal_from_one_that_does_not() -
 def test_one_goal_alone_and_no_neurons_are_said() -> None:
     falling = linear_networks(np.zeros((4, 5)))
     made = whose_work(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
-    assert made.turning is None and "the robot has one goal alone" in made.to_text()
+    assert made.turning is None and "the robot has only one goal" in made.to_text()
     assert [row.name for row in made.rows][-1] == "turned round"
     with pytest.raises(InvalidArgument, match="expected policies that act through neurons"):
         whose_work(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)

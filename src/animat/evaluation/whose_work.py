@@ -85,7 +85,7 @@ class WhoseWork:
 
     Attributes:
         rows: the policies as they are, then changed.
-        turning: what the switch of the goal does; None for a robot with one goal alone.
+        turning: what the switch of the goal does; None for a robot with only one goal.
     """
 
     __repr__ = briefly
@@ -113,7 +113,7 @@ class WhoseWork:
         ]
         information = self.rows[0].information
         if information is None:
-            lines.append("  no goal information: the robot has one goal alone (it has no method `with_goal_of`)")
+            lines.append("  no goal information: the robot has only one goal (it has no method `with_goal_of`)")
         else:
             lines.append(f"  {information.to_text()}")
         if self.turning is not None:

@@ -168,7 +168,7 @@ def check_binning(bins: int, range_hz: float | None) -> None:
         InvalidArgument: for fewer bins than one or more than `LARGEST_BINS`, or a range that is not positive.
     """
     if not 1 <= bins <= LARGEST_BINS:
-        raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS}, got {bins}; other kinds of simulators have none")
+        raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS:,}, got {bins}; only histogram simulators have bins")
     if range_hz is not None and not 0 < range_hz < np.inf:
         raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {range_hz:g}")
 

@@ -205,8 +205,8 @@ class Validation:
         for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
             if not gain.is_certain:
                 return (
-                    f"Cannot be trusted: to know the condition is worth {gain.value:.3f} ± {gain.error:.3f} {unit} "
-                    "a trial, not certainly more than nothing, so that there is next to nothing to steer with"
+                    f"Cannot be trusted: knowing the condition is worth {gain.value:.3f} ± {gain.error:.3f} {unit} "
+                    "a trial, which is not clearly above 0, so there is next to nothing to steer with"
                 )
         if distance > LARGE_DISTANCE:
             return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"

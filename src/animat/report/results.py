@@ -231,7 +231,7 @@ class ContextRow:
         best_known: where there is no optimal return, that of the best of the policies and the heuristic.
         gap, score: the context gap of the task and the context score of the policies, on the simulator; the least that
             they can be where there is no optimal return.
-        bits: goal information; None for a robot with one goal alone.
+        bits: goal information; None for a robot with only one goal.
     """
 
     culture: int
