@@ -1,10 +1,15 @@
-"""Ctrl-C in a callback of the garbage collector, where Python prints what is raised and goes on."""
+"""Ctrl-C and a kill in a callback of the garbage collector, where Python drops what is raised, and in an import."""
 
 from __future__ import annotations
 
 import gc
+import importlib
 import signal
+import subprocess
+import sys
 import time
+import weakref
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,15 +19,17 @@ from animat.ctrl_c import heard_everywhere
 
 pytestmark = pytest.mark.usefixtures("in_the_foreground")
 
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-def interrupt_while_collecting() -> None:
-    """One Ctrl-C that comes in a callback of the garbage collector."""
+
+def interrupt_while_collecting(number: signal.Signals = signal.SIGINT) -> None:
+    """One Ctrl-C, or another signal, that comes in a callback of the garbage collector."""
     sent = []
 
     def callback(phase: str, info: dict[str, Any]) -> None:
         if not sent:
             sent.append(phase)
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     gc.callbacks.append(callback)
     try:
@@ -39,6 +46,71 @@ def test_it_is_dropped_by_python_and_heard_here() -> None:
         interrupt_while_collecting()
         time.sleep(5.0)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("number", ASKING)
+def test_so_is_a_kill_and_where_a_weak_reference_is_told_of_an_end(number: signal.Signals) -> None:
+    class Body:
+        pass
+
+    hook = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        interrupt_while_collecting(number)
+        time.sleep(5.0)
+    body = Body()
+    reference = weakref.ref(body, lambda _: signal.raise_signal(number))
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        del body
+        time.sleep(5.0)
+    assert reference() is None
+    assert sys.unraisablehook is hook
+
+
+@pytest.mark.parametrize("number", ASKING)
+def test_an_import_is_not_cut_short(number: signal.Signals, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"interrupted_by_{number.name}"
+    (tmp_path / f"{name}.py").write_text(f"import signal\nsignal.raise_signal({number})\nwhole = True\n")
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        importlib.import_module(name)
+        time.sleep(5.0)
+    assert sys.modules.pop(name).whole
+
+
+def test_an_import_that_does_not_end_is(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("animat.ctrl_c._LONGEST_IMPORT_S", 0.2)
+    (tmp_path / "without_end.py").write_text(
+        "import signal, time\nsignal.raise_signal(signal.SIGINT)\nwhile True:\n    time.sleep(5.0)\n"
+    )
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        importlib.import_module("without_end")
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("module", "kept"),
+    [("tyro", ""), ("jax._src.interpreters.mlir", "; what was finished is kept; start again to go on")],
+)
+def test_a_command_that_still_imports_ends_in_a_line(
+    module: str, kept: str, number: signal.Signals, tmp_path: Path
+) -> None:
+    """The signal comes as this module is looked for: by the command line, and in the middle of JAX."""
+    code = f"""
+import signal, sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            signal.raise_signal({number})
+sys.meta_path.insert(0, Finder())
+from animat.__main__ import main
+sys.exit(main())
+"""
+    command = ["train", "cartpole", "--mapping", "none", "--policies", "1", "--iterations", "6000", "--out", "policies"]
+    ran = subprocess.run([sys.executable, "-c", code, *command], cwd=tmp_path, capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (130, f"animat: interrupted{kept}\n")
+    assert not list(tmp_path.iterdir())
 
 
 def test_elsewhere_it_is_raised_at_once() -> None:

@@ -21,11 +21,13 @@ from animat.coding.mapping import Linear, mapping_named
 from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.gym import IDS, register_environments
+from animat.neurons.memory import Memory, fit_memory
 from animat.neurons.simulator import silenced
 from animat.neurons.synthetic import LABELS, synthetic_simulator
 from animat.recordings.formats.nwb import write_nwb
+from animat.responses.extraction import extract_responses
 from animat.robots import Cartpole, robot_named
-from animat.wrappers import EpisodeLimit
+from animat.wrappers import EpisodeLimit, NeuralObservation
 from synthetic_recordings import synthetic_recording, write_synthetic_series
 
 assert animat.__doc__  # importing animat registers the environments
@@ -221,6 +223,14 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"recordings": 3}, "recordings: expected a path or several, got 3"),
         ({"recordings": ["r", None]}, "recordings: expected a path or several, got None"),
         ({"delivery": "late"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
+        ({"window_ms": -4}, "window_ms: expected two numbers of milliseconds, start and end, got -4"),
+        ({"window_ms": "28"}, "window_ms: expected two numbers of milliseconds, start and end, got '28'"),
+        (
+            {"recordings": "r", "window_ms": -4},
+            "window_ms: expected two numbers of milliseconds, start and end, got -4",
+        ),
+        ({"recordings": "r", "window_ms": (2, 4, 8)}, r"window_ms: expected two numbers .*, got \(2, 4, 8\)"),
+        ({"neural_observation": 1}, "neural_observation: expected True or False, got 1"),
     ],
 )
 def test_bad_options_are_refused_in_one_line(options: dict, message: str) -> None:
@@ -240,6 +250,67 @@ def test_actions_that_are_no_condition_are_refused(action: object) -> None:
     envs.reset(seed=0)
     with pytest.raises(InvalidArgument, match="actions: expected 2 conditions"):
         envs.step(np.array([action, 0]) if np.ndim(action) == 0 else action)
+
+
+@pytest.mark.parametrize(
+    ("actions", "got"),
+    [
+        (np.full(64, 5), "got 5 for environment 0"),
+        (np.array([0] * 63 + [-1]), "got -1 for environment 63"),
+        (np.zeros((64, 2), int), r"got an array of int64, shape \(64, 2\)"),
+        (np.zeros(64), r"got an array of float64, shape \(64,\)"),
+    ],
+)
+def test_of_many_bad_actions_the_first_is_named_in_one_line(actions: np.ndarray, got: str) -> None:
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=64)
+    envs.reset(seed=0)
+    with pytest.raises(InvalidArgument, match=f"^actions: expected 64 conditions, whole numbers from 0 to 4, {got}$"):
+        envs.step(actions)
+    env = gymnasium.make("Animat/Cartpole-v0").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(InvalidArgument, match=r"^action: .*$"):
+        env.step(np.zeros((64, 2), int))
+
+
+def test_a_vector_is_of_a_whole_number_and_starts_as_one() -> None:
+    with pytest.raises(InvalidArgument, match=r"num_envs: expected a whole number, got 1\.5"):
+        gymnasium.make_vec("Animat/Cartpole-v0", num_envs=1.5)
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=np.int64(2))
+    with pytest.raises(InvalidArgument, match="options: expected no 'reset_mask': all episodes are started at once"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+
+
+def test_what_the_neurons_remember_is_observed_too() -> None:
+    """As the wrapper has it, around the same Animat with the same random numbers; pictures show the robot alone."""
+    recorded = extract_responses(synthetic_recording(1, patterns=20, channels=32))
+    simulator = fit_memory(recorded, memory=Memory(0.5, 0.5, 0.5, 1.0))
+    options = {"simulator": simulator, "neural_observation": True, "render_mode": "rgb_array"}
+    env = gymnasium.make("Animat/Cartpole-v0", **options).unwrapped
+    envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=1, **options)
+    direct = NeuralObservation(Animat(Cartpole(), mapping_named("1-threshold"), 5))
+    assert [q.name for q in env.setup.environment.observation_spec[-2:]] == ["trace", "load"]
+    np.testing.assert_array_equal(env.observation_space.low[-2:], [0, 0])
+    np.testing.assert_array_equal(env.observation_space.high[-2:], [1, np.inf])
+    assert envs.single_observation_space == env.observation_space and envs.observation_space.shape == (1, 6)
+    with pytest.warns(UserWarning, match="maximum value is infinity"):  # of the load, which has no bound
+        check_env(gymnasium.make("Animat/Cartpole-v0", **options).unwrapped)
+
+    state, advance = direct.reset(jax.random.key(0)), jax.jit(direct.advance)
+    observation, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(envs.reset(seed=3)[0][0], observation)
+    np.testing.assert_allclose(observation, direct.observe(state))
+    rng = np.random.Generator(type(env.np_random.bit_generator)())
+    rng.bit_generator.state = env.np_random.bit_generator.state
+    remembered = []
+    for action in (4, 4, 0, 3, 1):
+        observation = env.step(action)[0]
+        np.testing.assert_array_equal(envs.step(np.array([action]))[0][0], observation)
+        state = advance(jnp.asarray(rng.random(direct.noise_size, np.float32)), state, jnp.int32(action), simulator)
+        np.testing.assert_allclose(observation, direct.observe(state), rtol=1e-5, atol=1e-6)
+        assert observation in env.observation_space
+        remembered.append(tuple(observation[-2:]))
+    assert len(set(remembered)) == 5
+    assert env.render().shape == envs.render()[0].shape
 
 
 def test_stepping_or_rendering_before_a_reset_is_refused() -> None:

@@ -191,6 +191,17 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"observation_spec": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
         ({"observation_spec": (Quantity("x", "m", np.nan),)}, "x: expected a scale from 1e-12 to 1e.12, got nan"),
         ({"__hash__": None}, "expected a frozen dataclass"),
+        (
+            {"observation_spec": (Quantity("x", "m", 1.0, low=-0.01, high=0.01),)},
+            "Changed.observe: x: expected from -0.01 to 0.01, the bounds of its Quantity, got",
+        ),
+        (
+            {
+                "noise_size": 0,
+                "advance": lambda self, uniforms, state, u: (At(state.x_m + uniforms[0]), u, u > 2),
+            },
+            r"advance: expected it to run under jax.jit with 0 uniforms \(noise_size\), got IndexError",
+        ),
     ],
 )
 def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) -> None:
@@ -211,6 +222,9 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
         (("x", "m", np.ones(2)), r"x: scale of a Quantity: expected a number, got array\("),
         (("x", "m", 1.0, "low"), "x: low of a Quantity: expected a number, got 'low'"),
         (("x", "m", 1.0, 0.0, ()), r"x: high of a Quantity: expected a number, got \(\)"),
+        (("x", "m", 1.0, 1.0, -1.0), "x: expected low < high of a Quantity, got 1 and -1"),
+        (("x", "m", 1.0, 1.0, np.float32(1)), "x: expected low < high of a Quantity, got 1 and 1"),
+        (("x", "m", 1.0, np.nan), "x: expected low < high of a Quantity, got nan and inf"),
         ((1.0, "m", 1.0), "name of a Quantity: expected a text, got 1.0"),
         (("x", 1.0, 1.0), "unit of a Quantity: expected a text, got 1.0"),
     ],
@@ -218,6 +232,16 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
 def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
     with pytest.raises(InvalidArgument, match=f"^{words}"):
         Quantity(*given)
+
+
+def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
+    """The first step leads out of the bounds: it may where it begins after the end, and not as the end itself."""
+    bounded = {"observation_spec": (Quantity("x", "m", 1.0, -1.0, 1.0),), "reset": lambda self, key: At(jnp.float32(1))}
+    after_the_end = lambda self, uniforms, state, u: (At(state.x_m + (u > -1)), u, u < 2)  # noqa: E731
+    check_robot(slider(**bounded, advance=after_the_end))
+    at_the_end = lambda self, uniforms, state, u: (At(state.x_m + 1.0), u, u < 2)  # noqa: E731
+    with pytest.raises(InvalidArgument, match="x: expected from -1 to 1, the bounds of its Quantity, got 2"):
+        check_robot(slider(**bounded, advance=at_the_end))
 
 
 def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:

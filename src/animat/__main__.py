@@ -2,13 +2,16 @@
 
 import sys
 
+from animat.ctrl_c import heard_everywhere
+
 
 def main() -> int:
-    """Run one command (`animat.cli.main`); Ctrl-C ends it in a line, also while it is being loaded."""
+    """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it in a line, also while it is being loaded."""
     try:
-        from animat.cli import main as run
+        with heard_everywhere():
+            from animat.cli import main as run
 
-        return run()
+            return run()
     except KeyboardInterrupt:
         print("animat: interrupted", file=sys.stderr)
         return 130

@@ -72,7 +72,7 @@ class BodyFailed(AnimatError):
 def shown(value: object) -> str:
     """A value as a message shows it: in one line, and cut where it is longer than anyone reads."""
     try:
-        text = repr(value)
+        text = re.sub(r"\s*\n\s*", " ", repr(value))
     except (ValueError, RecursionError):
         # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
         text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"

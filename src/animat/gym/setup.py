@@ -14,7 +14,7 @@ from gymnasium import spaces
 from animat.coding.checking import check_mapping
 from animat.coding.decoder import expect_fit
 from animat.coding.mapping import Mapping, mapping_named
-from animat.environment import Animat
+from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument, expect_kind, expect_several
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator
@@ -26,10 +26,10 @@ from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
 from animat.responses.readouts import USUAL_READOUTS, Readouts
 from animat.responses.series import extract_series
-from animat.responses.windows import DEFAULT_WINDOW_MS
+from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
-from animat.wrappers import Delivery, EpisodeLimit, ShuffledDelivery
+from animat.wrappers import Delivery, EpisodeLimit, NeuralObservation, ShuffledDelivery
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -73,6 +73,7 @@ def set_up(
     kind: Kind | None = None,
     readouts: str | Readouts | None = None,
     delivery: Delivery = "chosen",
+    neural_observation: bool = False,
     **parameters: float,
 ) -> Setup:
     """Read the options of `Animat/...` environments.
@@ -92,6 +93,7 @@ def set_up(
         readouts: of the recordings, as many as the robot takes commands: `halves`, `quadrants`, or groups; None: all
             channels as one, or of several commands those that `animat train` takes.
         delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
+        neural_observation: whether what the neurons remember is observed too (`animat.wrappers.NeuralObservation`).
         parameters: of the robot, `pole_mass_kg=0.55`.
 
     Raises:
@@ -111,6 +113,7 @@ def set_up(
         recordings = expect_several("recordings", recordings, str | os.PathLike, "a path or several")
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
+    check_window(window_ms)
     if recordings is None:
         reading: dict[str, Any] = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
         reading["readouts"] = (readouts, None)
@@ -135,11 +138,16 @@ def set_up(
         )
     else:
         simulator, labels = synthetic_simulator(), LABELS
+    expect_kind("neural_observation", neural_observation, bool, "True or False")
     if delivery not in ("chosen", "shuffled"):
         raise InvalidArgument(f"delivery: expected 'chosen' or 'shuffled', got {delivery!r}")
     expect_fit(body.name, body.n_commands, simulator.n_readouts)
     chosen = mapping if isinstance(mapping, Mapping) else mapping_named(mapping)
     if not is_ours(chosen):
         check_mapping(chosen)
-    animat = Animat(body, chosen, simulator.n_conditions)
-    return Setup(EpisodeLimit(ShuffledDelivery(animat) if delivery == "shuffled" else animat), simulator, labels)
+    environment: Environment[Any] = Animat(body, chosen, simulator.n_conditions)
+    if delivery == "shuffled":
+        environment = ShuffledDelivery(environment)
+    if neural_observation:
+        environment = NeuralObservation(environment)
+    return Setup(EpisodeLimit(environment), simulator, labels)

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.gym.compiled import CompiledAnimat
 from animat.gym.setup import set_up
 from animat.robots.base import Robot, capability
@@ -63,7 +63,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
             raise gymnasium.error.ResetNeeded("step: expected an episode that reset() started, got none")
         if not self.action_space.contains(action):
             last = len(self.setup.condition_labels) - 1
-            raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {action!r}")
+            raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {shown(action)}")
         self._states = self._compiled.step(self._states, np.array([action]), self.np_random)
         after, observations = self._compiled.read(self._states)
         # Numbers are plain ones; of several readouts they are arrays.
@@ -84,9 +84,9 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
         return draw_robot(self.setup.environment.robot, now, command=self._command, earlier=earlier)
 
     def _show(self, observation: Float32[np.ndarray, " observations"]) -> None:
-        """Keep what pictures need; the observation itself is the user's, so it is copied."""
+        """Keep what pictures need, the robot's numbers; the observation itself is the user's, so it is copied."""
         if self.render_mode is not None:
-            self._shown.append(observation.copy())
+            self._shown.append(observation[: len(self.setup.environment.robot.observation_spec)].copy())
 
 
 def check_render_mode(render_mode: str | None, robot: Robot[Any]) -> None:

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_kind
 from animat.gym.compiled import CompiledAnimat, Rows
 from animat.gym.setup import set_up
 from animat.gym.single import check_render_mode
@@ -38,6 +38,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
     }
 
     def __init__(self, robot: str = "", num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+        expect_kind("num_envs", num_envs, int | np.integer, "a whole number")
         if num_envs < 1:
             raise InvalidArgument(f"num_envs: expected at least 1, got {num_envs}")
         self.setup = set_up(robot, **options)
@@ -57,7 +58,13 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         self._commands = self._at_rest
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Rows, dict[str, Any]]:
-        """Start all episodes; one seed decides all of them, and `options` are not used."""
+        """Start all episodes; one seed decides all of them, and `options` are not used.
+
+        Raises:
+            InvalidArgument: for Gymnasium's `reset_mask`, which would start some of them only.
+        """
+        if options and "reset_mask" in options:
+            raise InvalidArgument("options: expected no 'reset_mask': all episodes are started at once")
         super().reset(seed=seed)
         self._states = self._compiled.start(self.num_envs, self.np_random)
         _, observations = self._compiled.read(self._states)
@@ -79,12 +86,11 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
             raise gymnasium.error.ResetNeeded("step: expected episodes that reset() started, got none")
         actions = np.asarray(actions)
         n_conditions = len(self.setup.condition_labels)
-        is_whole = np.issubdtype(actions.dtype, np.integer)
-        if not is_whole or actions.shape != (self.num_envs,) or np.any((actions < 0) | (actions >= n_conditions)):
-            raise InvalidArgument(
-                f"actions: expected {self.num_envs} conditions, whole numbers from 0 to {n_conditions - 1}, "
-                f"got {actions!r}"
-            )
+        expected = f"actions: expected {self.num_envs} conditions, whole numbers from 0 to {n_conditions - 1}"
+        if not np.issubdtype(actions.dtype, np.integer) or actions.shape != (self.num_envs,):
+            raise InvalidArgument(f"{expected}, got an array of {actions.dtype}, shape {actions.shape}")
+        if (is_none := (actions < 0) | (actions >= n_conditions)).any():
+            raise InvalidArgument(f"{expected}, got {actions[is_none][0]} for environment {is_none.argmax()}")
         states = self._compiled.step(self._states, actions, self.np_random)
         begun = self._ended
         if begun.any():
@@ -116,9 +122,10 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         commands: Float32[np.ndarray, "environments *commands"],
         begun: Bool[np.ndarray, " environments"],
     ) -> None:
-        """Keep what pictures need; the observations themselves are the user's, so they are copied."""
+        """Keep what pictures need, the robots' numbers; the observations are the user's, so they are copied."""
         if self.render_mode is None:
             return
         self._commands = commands
-        for i, observation in enumerate(observations.copy()):
+        of_robot = len(self.setup.environment.robot.observation_spec)
+        for i, observation in enumerate(observations[:, :of_robot].copy()):
             self._shown[i] = [observation] if begun[i] else [*self._shown[i], observation]

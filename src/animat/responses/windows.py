@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sized
+from numbers import Real
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_several, shown
 
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
@@ -65,7 +66,11 @@ def check_window(window_ms: tuple[float, float]) -> None:
     Raises:
         InvalidArgument: unless 0 <= start < end, both finite.
     """
-    start_ms, end_ms = window_ms
+    words = "two numbers of milliseconds, start and end"
+    several = expect_several("window_ms", window_ms, Real, words)
+    if len(several) != 2:
+        raise InvalidArgument(f"window_ms: expected {words}, got {shown(window_ms)}")
+    start_ms, end_ms = several
     if not (math.isfinite(start_ms) and math.isfinite(end_ms) and 0 <= start_ms < end_ms):
         raise InvalidArgument(
             f"window_ms: expected 0 <= start < end in milliseconds after the stimulus, got {start_ms:g} to {end_ms:g}"

@@ -6,6 +6,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable
+from numbers import Real
 from typing import Annotated, Any, ClassVar, Generic, TypeVar, final
 
 from jaxtyping import Bool, Float
@@ -52,7 +53,8 @@ class Quantity:
             (`animat.evaluation.coupling`).
 
     Raises:
-        InvalidArgument: for a name or a unit that is no text, and for a scale or a bound that is no number.
+        InvalidArgument: for a name or a unit that is no text, for a scale or a bound that is no number, and for bounds
+            that do not rise.
     """
 
     name: str
@@ -71,6 +73,8 @@ class Quantity:
             # Also what JAX traces, of a robot whose parameters are drawn.
             if not hasattr(number, "__float__") or getattr(number, "ndim", 0) != 0:
                 raise InvalidArgument(f"{self.name}: {name} of a Quantity: expected a number, got {shown(number)}")
+        if all(isinstance(bound, Real) for bound in (self.low, self.high)) and not self.low < self.high:
+            raise InvalidArgument(f"{self.name}: expected low < high of a Quantity, got {self.low:g} and {self.high:g}")
 
 
 class Robot(abc.ABC, Generic[State]):

@@ -57,11 +57,12 @@ def _check_compiled(robot: Robot[Any]) -> None:
 
     def episode(key: Any) -> Any:
         state = _tried(f"{name}.reset", robot.reset, key)
-        told, wanted = [told_of(state, 0.0)], []
+        told, over, wanted = [told_of(state, 0.0)], [], []
         # Commands at both ends and in the middle.
         for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
             uniforms = jnp.full(noise, 0.5, jnp.float32)
-            step = _tried(f"{name}.advance", robot.advance, uniforms, state, jnp.full(one_command, u))
+            words = f"it to run under jax.jit with {noise} uniforms (noise_size)"
+            step = _tried(f"{name}.advance", robot.advance, uniforms, state, jnp.full(one_command, u), words=words)
             if not isinstance(step, tuple) or len(step) != 3:
                 raise InvalidArgument(f"{name}.advance: expected (state, reward, whether it ended), got {shown(step)}")
             after, reward, ended = step
@@ -69,11 +70,12 @@ def _check_compiled(robot: Robot[Any]) -> None:
             _expect_shape(f"{name}.advance: reward", reward, (), "a number")
             _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
             told.append(told_of(after, reward))
+            over.append(ended)
             if heuristic is not None:
                 command = _tried(f"{name}.heuristic", heuristic, told[-1][1])
                 _expect_shape(f"{name}.heuristic", command, one_command, "a command")
                 wanted.append(jnp.asarray(command, jnp.float32))
-        return told, wanted
+        return told, over, wanted
 
     def run(key: Any) -> Any:
         # Traced twice, by functions that JAX takes for different ones: what was kept of the first time fails in the
@@ -82,7 +84,7 @@ def _check_compiled(robot: Robot[Any]) -> None:
         return jax.device_get(jax.jit(episode)(key))
 
     try:
-        told, commands = _tried(name, run, jax.random.key(0))
+        told, over, commands = _tried(name, run, jax.random.key(0))
     except InvalidArgument as error:
         # JAX has put a note of its own to it.
         raise InvalidArgument(str(error)) from error.__cause__
@@ -93,6 +95,20 @@ def _check_compiled(robot: Robot[Any]) -> None:
         for what, value in zip(("a state", "an observation", "a reward", "a potential"), values, strict=True):
             if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(value)):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
+    last = [*over, True].index(True)
+    _expect_within_bounds(robot, [seen for _, seen, *_ in told[: last + 2]])
+
+
+def _expect_within_bounds(robot: Robot[Any], observations: list[Any]) -> None:
+    """Of an episode's observations, the last one included; what float32 rounds is not held against a robot."""
+    for seen in observations:
+        for number, quantity in zip(seen, robot.observation_spec, strict=True):
+            within = np.clip(number, quantity.low, quantity.high)
+            if not np.isclose(number, within, rtol=1e-5, atol=0.0):
+                raise InvalidArgument(
+                    f"{type(robot).__name__}.observe: {quantity.name}: expected from {quantity.low:g} to "
+                    f"{quantity.high:g}, the bounds of its Quantity, got {number:g}"
+                )
 
 
 def _expect_grid(what: str, value_grid: Callable[[], Any]) -> None:
