@@ -51,7 +51,8 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
     assert recording.presentation is None
     assert recording.stimuli.presentation.tolist() == [0, 1]
     assert names(recording) >= {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
-    assert "1 of 3 spikes stand behind a later one" in said(recording)["unsorted-spikes"]
+    early = "1 of 3 spikes follows a later one in the file; it was sorted by time"
+    assert said(recording)["unsorted-spikes"] == early
 
 
 def said(recording: Recording) -> dict[str, str]:

@@ -356,3 +356,22 @@ def test_absurd_sizes_are_refused_before_memory_is_asked_for(tmp_path: Path, sha
         file.create_dataset("units/spike_times", shape, "f8", chunks=(1024,) + (1,) * (len(shape) - 1))
     with pytest.raises(InvalidFile, match=r"claims [\d,]+ values, more than a file of"):
         read_recording(path)
+
+
+def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> None:
+    def told(units: list[list[float]]) -> str | None:
+        import pynwb
+
+        start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+        nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+        for times_s in units:
+            nwb.add_unit(spike_times=times_s)
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.nwb"
+        with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
+            nwb_io.write(nwb)
+        recording = read_recording(path)
+        assert recording.spike_times_s.tolist() == sorted(t for times_s in units for t in times_s)
+        return next((f.message for f in recording.findings if f.name == "unsorted-spikes"), None)
+
+    assert told([[0.1, 0.5, 0.9], [0.2, 0.4]]) is None
+    assert str(told([[0.1, 0.9, 0.5], [0.4, 0.2]])).startswith("2 of 5 spikes follow a later one in the file")

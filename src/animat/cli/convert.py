@@ -44,6 +44,8 @@ class Convert:
     """In words"""
     start_min: float | None = None
     """Start on the culture's clock, in minutes"""
+    start_s: float | None = None
+    """Start on the clock of its own times, in seconds, of a file that does not say it"""
     stimuli: str | None = None
     """Which of several things in the file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     stimuli_path: Path | None = None
@@ -94,6 +96,7 @@ class Convert:
                 stimuli=self.stimuli,
                 part=self.part,
                 start_min=self.start_min,
+                start_s=self.start_s,
                 progress=progress,
             )
         n_spikes, n_stimuli = len(recording.spike_times_s), len(recording.stimuli)

@@ -100,6 +100,7 @@ def convert_recording(
     stimuli: str | None = None,
     part: str | None = None,
     start_min: float | None = None,
+    start_s: float | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Read a recording in any format and write it as NWB.
@@ -108,7 +109,7 @@ def convert_recording(
         out: the NWB file, complete or absent.
         detection: find the spikes in raw traces, in this way; None: take the spikes that the file has.
         reader: the format's name for SpikeInterface; the spikes are then found in its traces.
-        stimuli_path, stimuli, part, start_min: as in `read_recording`.
+        stimuli_path, stimuli, part, start_min, start_s: as in `read_recording`.
         progress: of finding spikes.
 
     Returns:
@@ -126,6 +127,8 @@ def convert_recording(
         raise InvalidArgument(f"--out: expected a name that ends in .nwb, as NWB is written, got {out}")
     if reader is not None and (stimuli is not None or part is not None):
         raise InvalidArgument(f"stimuli, part: expected none for traces read with a reader, got {stimuli or part!r}")
+    if (detection is not None or reader is not None) and start_s is not None:
+        raise InvalidArgument(f"start_s: expected none beside raw traces, which say when they start, got {start_s:g}")
     if reader is None and detection is not None and stimuli_path is not None:
         raise InvalidArgument(
             f"stimuli_path: expected only beside CSV spikes or traces read with a reader, got {stimuli_path}, but "
@@ -137,7 +140,7 @@ def convert_recording(
     elif detection is not None:
         recording = read_traces(path, detection, part=part, stimuli=stimuli, progress=progress)
     else:
-        recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
+        recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part, start_s=start_s)
     words = {} if origin is None else origin.words()
     # A subject without a sex is of an unknown one.
     unsaid = {"sex": "U"} if "subject_id" in words else {}
