@@ -199,11 +199,53 @@ def test_spikeinterface_is_asked_for_by_the_formats_name(tmp_path: Path) -> None
         import spikeinterface  # noqa: F401
     except ImportError:
         installed = False
-    message = "reader: expected one of" if installed else "pip install 'spikeinterface>="
+    message = "reader: expected one of" if installed else r"pip install -c constraints\.txt '\.\[raw\]'"
     with pytest.raises(InvalidArgument, match=message):
         convert_recording(path, tmp_path / "out.nwb", reader="nosuchformat")
     with pytest.raises(InvalidFile, match="no such file"):
         convert_recording(tmp_path / "none", tmp_path / "out.nwb", reader="intan")
+    if installed:
+        with pytest.raises(InvalidArgument, match="reader: expected one of ") as refused:
+            convert_recording(path, tmp_path / "out.nwb", reader="phy")
+        listed = str(refused.value).partition("one of ")[2].partition(";")[0].split(", ")
+        assert {"intan", "maxwell", "mda_recording", "spikeglx"} <= set(listed)
+        assert not {"phy", "kilosort", "binary", "zarr", "npz_sorting", "mda_sorting", "maxwell_event"} & set(listed)
+
+
+# What writes the folder leaves a file open.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+def test_a_folder_is_read_by_a_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
+    from spikeinterface.core import NumpyRecording
+    from spikeinterface.extractors.extractor_classes import MdaRecordingExtractor
+
+    voltage, truth = noisy(3, 1.0)
+    traces = NumpyRecording([voltage.astype(np.float32) * np.float32(0.1)], 20_000.0)
+    traces.set_dummy_probe_from_locations(np.column_stack([np.arange(3) * 17.5, np.zeros(3)]))
+    MdaRecordingExtractor.write_recording(traces, tmp_path / "mda")
+    arguments = ["convert", str(tmp_path / "mda"), "--out", str(tmp_path / "out.nwb"), "--reader", "mda_recording"]
+    assert main(arguments) == 0, capsys.readouterr().err
+    assert abs(len(read_recording(tmp_path / "out.nwb").spike_times_s) - sum(map(len, truth))) <= 3
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (
+            ["--threshold", "6", "--band-hz", "300", "3000", "--blank-ms", "1", "3"],
+            "--band-hz, --threshold, --blank-ms",
+        ),
+        (["--dead-time-ms", "2"], "--dead-time-ms"),
+    ],
+)
+def test_options_of_finding_spikes_are_not_ignored(
+    options: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.nwb"
+    assert main(["convert", str(rig_file("npz", tmp_path)), "--out", str(out), *options]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{named}: expected only where spikes are found in raw traces" in said
+    assert not out.exists()
 
 
 def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:

@@ -160,7 +160,9 @@ def test_channels_that_fire_as_no_neurons_do() -> None:
     hum = np.column_stack([np.arange(0, 10, 0.008), np.full(1250, 39)])
     found = {f.name: f for f in noticed(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
     assert (found["noisy-channels"].severity, found["noisy-channels"].value) == ("warning", 1)
-    assert "1 of 40 channels (39) fire as no neurons do and hold 76 % of all spikes" in found["noisy-channels"].message
+    assert (
+        "1 of 40 channels (39) fires as no neurons do and holds 76 % of all spikes" in found["noisy-channels"].message
+    )
     assert (found["silent-channels"].severity, found["silent-channels"].value) == ("note", 9)
     found = {f.name: f for f in noticed(recording(usual[:20], [1], 40, 10.0))}
     assert found["silent-channels"].severity == "warning"
@@ -183,3 +185,18 @@ def test_brainoware_cannot_be_used_in_the_papers_window(real_data: Path) -> None
     assert found["dead-window"].severity == "refuse"
     assert "an artefact counted as spikes" in found["artefact-spikes"].message
     assert found["artefact-spikes"].severity == "warning"
+
+
+def test_an_artefact_is_compared_with_as_much_time_as_it_takes() -> None:
+    # A spike in each half millisecond, and around 50 stimuli 39 more in one of them and 29 more in three others.
+    every_s = (np.arange(2 * 60_000) + 0.5) * 0.5e-3
+    stimulus_s = np.arange(5.0, 55.0)
+    more_s = [
+        t + 1e-3 * ms
+        for t in stimulus_s
+        for ms, n in ((-0.75, 29), (-0.25, 39), (0.25, 29), (0.75, 29))
+        for _ in range(n)
+    ]
+    spikes = [(t, 0) for t in [*every_s, *more_s]]
+    finding = findings(recording(spikes, stimulus_s, 4, 60.0))["artefact-spikes"]
+    assert finding.message.startswith("from -1 to 1 ms there are 130.0 spikes a stimulus, 32.5 times as many")

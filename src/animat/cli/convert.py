@@ -8,8 +8,11 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidArgument, InvalidFile
 from animat.writing import expect_writable
+
+OF_DETECTION = ("band_hz", "threshold", "dead_time_ms", "blank_ms")
+"""Options of finding spikes, which those of a file are not."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,17 @@ class Convert:
         from animat.recordings.detection.settings import Detection
         from animat.recordings.noticed import noticed
 
-        if self.recording.is_dir():
-            raise InvalidFile(f"{self.recording}: expected one recording, got a folder; convert its files one by one")
+        if self.recording.is_dir() and self.reader is None:
+            raise InvalidFile(
+                f"{self.recording}: expected one recording, got a folder; convert its files one by one, or name the "
+                "format with --reader where the folder is one recording"
+            )
+        finds_spikes = self.raw or self.reader is not None
+        if not finds_spikes and (given := [name for name in OF_DETECTION if getattr(self, name) != _default(name)]):
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise InvalidArgument(
+                f"{options}: expected only where spikes are found in raw traces; add --raw or --reader, or leave it out"
+            )
         expect_writable(self.out.parent)
         detection = Detection(
             band_hz=None if self.band_hz == (0, 0) else self.band_hz,
@@ -90,7 +102,7 @@ class Convert:
                 self.recording,
                 self.out,
                 origin,
-                detection=detection if self.raw or self.reader is not None else None,
+                detection=detection if finds_spikes else None,
                 reader=self.reader,
                 stimuli_path=self.stimuli_path,
                 stimuli=self.stimuli,
@@ -111,3 +123,7 @@ class Convert:
             "stimuli": n_stimuli,
             "findings": [finding.name for finding in findings],
         }
+
+
+def _default(name: str) -> Any:
+    return next(field.default for field in fields(Convert) if field.name == name)
