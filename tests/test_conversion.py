@@ -263,3 +263,39 @@ def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:
     assert len(written.channels) == 3
     assert written.stimuli.time_s.tolist() == [0.5]
     assert abs(len(written.spike_times_s) - sum(map(len, truth))) <= 3
+
+
+@pytest.mark.parametrize(("age", "fits"), [("P40D/P42D", True), ("P6W/P42D", True), ("P42D/P40D", False),
+                                           ("P1Y/P6M", False), ("PT36H/P1D", False), ("P1D/", True)])  # fmt: skip
+def test_a_range_of_ages_begins_with_the_younger(age: str, fits: bool) -> None:
+    if fits:
+        assert Origin(age=age).age == age
+    else:
+        with pytest.raises(InvalidArgument, match="age: expected a range from the younger to the older"):
+            Origin(age=age)
+
+
+@pytest.mark.parametrize("who", ["Jane Doe", "Doe, Jane; Max", ""])
+def test_an_experimenter_is_last_first(who: str) -> None:
+    assert Origin(experimenter="Doe, Jane; Müller, Max").experimenter == "Doe, Jane; Müller, Max"
+    with pytest.raises(InvalidArgument, match="experimenter: expected Last, First, as NWB has it"):
+        Origin(experimenter=who)
+
+
+@pytest.mark.parametrize(
+    ("date", "is_told"),
+    [
+        ("2024-05-31T14:00:00", True),
+        ("2024-05-31", True),
+        ("2024-05-31T14:00:00+09:00", False),
+        ("2024-05-31T14:00Z", False),
+    ],
+)
+def test_a_date_without_a_zone_is_said_to_be_taken_for_utc(date: str, is_told: bool, tmp_path: Path) -> None:
+    written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", Origin(recorded_at=date))
+    told = {finding.name: finding for finding in written.findings}
+    assert ("zone-unknown" in told) == is_told
+    with h5py.File(tmp_path / "out.nwb") as file:
+        assert ("+00:00" in file["session_start_time"][()].decode()) == (is_told or date.endswith("Z"))
+    again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb")
+    assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]

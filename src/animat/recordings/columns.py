@@ -146,6 +146,12 @@ class PlainColumns:
             return table, _looked_up(values.astype(np.str_), table.label)
         if _is_text(values):
             raise UnusableData("spike_channel: expected rows (whole numbers), as there is no channel_label; got text")
+        outside = values[(values < 0) | (values >= n_channels)]
+        if len(outside) and self.channel_label is not None:
+            raise UnusableData(
+                f"spike_channel: expected rows from 0 to {n_channels - 1}, as these are numbers and channel_label is "
+                f"text, got {outside[0]}: write labels as text in both, or as numbers in both"
+            )
         return table, values.astype(np.int64)
 
     def _frequencies(self, n: int) -> Float64[np.ndarray, " stimuli"]:

@@ -101,4 +101,4 @@ def _reader(name: str) -> Callable[..., Any]:
     readers = {n: read for n, read in readers.items() if read in of_traces and n not in REFUSED}
     if name not in readers:
         raise InvalidArgument(f"reader: expected one of {', '.join(sorted(readers))}; got {name!r}")
-    return readers[name]
+    return readers[name]  # type: ignore[no-any-return]
