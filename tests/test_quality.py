@@ -200,3 +200,36 @@ def test_an_artefact_is_compared_with_as_much_time_as_it_takes() -> None:
     spikes = [(t, 0) for t in [*every_s, *more_s]]
     finding = findings(recording(spikes, stimulus_s, 4, 60.0))["artefact-spikes"]
     assert finding.message.startswith("from -1 to 1 ms there are 130.0 spikes a stimulus, 32.5 times as many")
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "kind", "is_coarse"),
+    [(0.0, np.float64, False), (0.0, np.float32, False), (1e5, np.float32, True), (1.7e9, np.float64, False)],
+)
+def test_times_too_coarse_for_the_window_are_said(offset_s: float, kind: type, is_coarse: bool) -> None:
+    rng = np.random.default_rng(0)
+    stimulus_s = np.arange(1.0, 300.0)
+    times_s = (offset_s + np.sort(rng.uniform(0, 300, 20_000))).astype(kind).astype(float)
+    # The step of single precision at 100,000 s is 2^-7 s.
+    source = recording([(0.5, 0)], offset_s + stimulus_s, 4, offset_s + 301)
+    spikes = replace(source, spike_times_s=times_s, spike_channels=rng.integers(4, size=len(times_s)))
+    found = findings(spikes)
+    assert ("coarse-times" in found) == is_coarse
+    if is_coarse:
+        assert found["coarse-times"].value == pytest.approx(1e3 * 2**-7)
+        assert "in steps of 7.81 ms, too coarse for a window of 8 ms" in found["coarse-times"].message
+
+
+@pytest.mark.parametrize(("decimals", "is_coarse"), [(4, False), (3, False), (2, True)])
+def test_times_with_few_decimals_are_coarse(decimals: int, is_coarse: bool) -> None:
+    source = answering({5.0: 20.0, 80.0: 40.0})
+    rounded = replace(source, spike_times_s=np.round(source.spike_times_s, decimals))
+    assert len(rounded.spike_times_s) > 1000
+    assert ("coarse-times" in findings(rounded)) == is_coarse
+
+
+def test_a_single_unit_that_is_refractory_has_no_coarse_times() -> None:
+    rng = np.random.default_rng(0)
+    times_s = np.cumsum(0.004 + rng.exponential(0.2, 2000))
+    source = recording([(t, 0) for t in times_s], np.arange(1.0, 300.0), 4, 500.0)
+    assert "coarse-times" not in findings(source)
