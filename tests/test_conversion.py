@@ -199,11 +199,53 @@ def test_spikeinterface_is_asked_for_by_the_formats_name(tmp_path: Path) -> None
         import spikeinterface  # noqa: F401
     except ImportError:
         installed = False
-    message = "reader: expected one of" if installed else "pip install 'spikeinterface>="
+    message = "reader: expected one of" if installed else r"pip install -c constraints\.txt '\.\[raw\]'"
     with pytest.raises(InvalidArgument, match=message):
         convert_recording(path, tmp_path / "out.nwb", reader="nosuchformat")
     with pytest.raises(InvalidFile, match="no such file"):
         convert_recording(tmp_path / "none", tmp_path / "out.nwb", reader="intan")
+    if installed:
+        with pytest.raises(InvalidArgument, match="reader: expected one of ") as refused:
+            convert_recording(path, tmp_path / "out.nwb", reader="phy")
+        listed = str(refused.value).partition("one of ")[2].partition(";")[0].split(", ")
+        assert {"intan", "maxwell", "mda_recording", "spikeglx"} <= set(listed)
+        assert not {"phy", "kilosort", "binary", "zarr", "npz_sorting", "mda_sorting", "maxwell_event"} & set(listed)
+
+
+# What writes the folder leaves a file open.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+def test_a_folder_is_read_by_a_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("spikeinterface", reason="SpikeInterface is not installed (animat[raw])")
+    from spikeinterface.core import NumpyRecording
+    from spikeinterface.extractors.extractor_classes import MdaRecordingExtractor
+
+    voltage, truth = noisy(3, 1.0)
+    traces = NumpyRecording([voltage.astype(np.float32) * np.float32(0.1)], 20_000.0)
+    traces.set_dummy_probe_from_locations(np.column_stack([np.arange(3) * 17.5, np.zeros(3)]))
+    MdaRecordingExtractor.write_recording(traces, tmp_path / "mda")
+    arguments = ["convert", str(tmp_path / "mda"), "--out", str(tmp_path / "out.nwb"), "--reader", "mda_recording"]
+    assert main(arguments) == 0, capsys.readouterr().err
+    assert abs(len(read_recording(tmp_path / "out.nwb").spike_times_s) - sum(map(len, truth))) <= 3
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (
+            ["--threshold", "6", "--band-hz", "300", "3000", "--blank-ms", "1", "3"],
+            "--band-hz, --threshold, --blank-ms",
+        ),
+        (["--dead-time-ms", "2"], "--dead-time-ms"),
+    ],
+)
+def test_options_of_finding_spikes_are_not_ignored(
+    options: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.nwb"
+    assert main(["convert", str(rig_file("npz", tmp_path)), "--out", str(out), *options]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"{named}: expected only where spikes are found in raw traces" in said
+    assert not out.exists()
 
 
 def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:
@@ -221,3 +263,39 @@ def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:
     assert len(written.channels) == 3
     assert written.stimuli.time_s.tolist() == [0.5]
     assert abs(len(written.spike_times_s) - sum(map(len, truth))) <= 3
+
+
+@pytest.mark.parametrize(("age", "fits"), [("P40D/P42D", True), ("P6W/P42D", True), ("P42D/P40D", False),
+                                           ("P1Y/P6M", False), ("PT36H/P1D", False), ("P1D/", True)])  # fmt: skip
+def test_a_range_of_ages_begins_with_the_younger(age: str, fits: bool) -> None:
+    if fits:
+        assert Origin(age=age).age == age
+    else:
+        with pytest.raises(InvalidArgument, match="age: expected a range from the younger to the older"):
+            Origin(age=age)
+
+
+@pytest.mark.parametrize("who", ["Jane Doe", "Doe, Jane; Max", ""])
+def test_an_experimenter_is_last_first(who: str) -> None:
+    assert Origin(experimenter="Doe, Jane; Müller, Max").experimenter == "Doe, Jane; Müller, Max"
+    with pytest.raises(InvalidArgument, match="experimenter: expected Last, First, as NWB has it"):
+        Origin(experimenter=who)
+
+
+@pytest.mark.parametrize(
+    ("date", "is_told"),
+    [
+        ("2024-05-31T14:00:00", True),
+        ("2024-05-31", True),
+        ("2024-05-31T14:00:00+09:00", False),
+        ("2024-05-31T14:00Z", False),
+    ],
+)
+def test_a_date_without_a_zone_is_said_to_be_taken_for_utc(date: str, is_told: bool, tmp_path: Path) -> None:
+    written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", Origin(recorded_at=date))
+    told = {finding.name: finding for finding in written.findings}
+    assert ("zone-unknown" in told) == is_told
+    with h5py.File(tmp_path / "out.nwb") as file:
+        assert ("+00:00" in file["session_start_time"][()].decode()) == (is_told or date.endswith("Z"))
+    again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb")
+    assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]

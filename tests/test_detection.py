@@ -317,6 +317,61 @@ def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
     assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
 
 
+@pytest.mark.parametrize("until_ms", [15.0, 100.0, 700.0])
+@pytest.mark.parametrize("chunk_s", [0.2, 0.5])
+def test_who_is_saturated_for_long_is_blanked_to_its_end(until_ms: float, chunk_s: float) -> None:
+    voltage, truth = noisy(6, 16.0)
+    # The fourth comes while the third still saturates the channel, where that lasts 100 ms.
+    pulses = np.array([0.45, 3.62, 6.1, 6.16 if until_ms == 100 else 8.0, 11.0, 13.4])
+    first = np.rint(pulses * RATE_HZ).astype(np.int64)
+    last = first + round(until_ms * 20)
+    is_railed = np.zeros(len(voltage), dtype=bool)
+    for start, stop in zip(first, last, strict=True):
+        is_railed[start:stop] = True
+    voltage[is_railed, 2] = 32_000
+    source = RawTraces.of_array(voltage, channels(6), RATE_HZ, uv_per_step=0.1)
+    found = find_spikes(source, pulses, Detection(chunk_s=chunk_s))
+    sample = np.rint(found.time_s * RATE_HZ).astype(np.int64)
+    on_it = sample[found.channel == 2]
+    # Every spike found there is a true one, out of what is saturated and of the quarter of a millisecond after it.
+    near = np.abs(on_it[:, None] - truth[2][None, :]).min(axis=1) <= 10
+    assert np.count_nonzero(~near) <= 1
+    assert not np.any(is_railed[on_it])
+    free = truth[2][~np.array([is_railed[max(t - 150, 0) : t + 40].any() for t in truth[2]])]
+    blank = np.array([np.any((t >= first - 11) & (t <= first + 31)) for t in free])
+    missed = np.array([np.abs(on_it - t).min() > 10 for t in free[~blank]])
+    assert np.count_nonzero(missed) <= 1
+    others = [np.count_nonzero(found.channel == column) for column in range(6) if column != 2]
+    assert min(others) > 0.9 * min(len(t) for t in truth)
+    message = {f.name: f.message for f in found.findings}["saturated-channels"]
+    assert message.startswith("after a stimulus 1.0 of 6 channels are saturated on average")
+    assert f"the longest until {until_ms + 0.25:.1f} ms" in message
+    assert f"at most {until_ms + 0.25:.1f} ms" in message
+
+
+def test_samples_that_are_no_numbers_are_blank_and_the_rest_of_the_channel_is_heard() -> None:
+    voltage, truth = noisy(4, 4.0)
+    voltage_uv = voltage.astype(np.float32) * np.float32(0.1)
+    lost = np.zeros(voltage_uv.shape, dtype=bool)
+    lost[[10_000, 30_000], 1] = True
+    lost[50_000:52_000, 1] = True
+    lost[:, 3] = True
+    whole = find_spikes(RawTraces.of_array(voltage_uv, channels(4), RATE_HZ))
+    voltage_uv[lost] = np.nan
+    voltage_uv[30_000, 1] = np.inf
+    found = find_spikes(RawTraces.of_array(voltage_uv, channels(4), RATE_HZ), np.array([1.0]))
+    assert np.all(np.isfinite(found.noise_uv)) and found.noise_uv[1] == pytest.approx(whole.noise_uv[1], rel=0.05)
+    names = {f.name: f for f in found.findings}
+    assert names["samples-lost"].value == lost.sum() and "2 of 4 channels" in names["samples-lost"].message
+    assert names["dead-channels"].value == 1 and "nan" not in names["noise"].message
+    at = np.rint(found.time_s[found.channel == 1] * RATE_HZ)
+    assert not np.any(lost[at.astype(int), 1]) and 3 not in found.channel
+    expected = truth[1][~np.array([lost[t - 40 : t + 41, 1].any() for t in truth[1]])]
+    expected = expected[np.abs(expected - 20_000) > 60]
+    hit = sum(np.abs(at - t).min() <= 10 for t in expected)
+    assert hit >= 0.98 * len(expected) and len(at) <= len(truth[1]) + 2
+
+
 def test_dead_and_noisy_channels_are_said() -> None:
     voltage, _ = noisy(30, 1.0)
     voltage[:, 3] = 7

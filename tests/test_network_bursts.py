@@ -57,3 +57,11 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     assert "figures of the series" not in told
     assert '"network_bursts": {"bursts": 3' in told
     assert [file.name for file in (tmp_path / "figures").iterdir()] == ["a-raster.png"]
+
+
+def test_one_burst_is_told_in_the_singular_and_wide_bins_are_said() -> None:
+    text = inspection_text(inspect_recording(spontaneous([100.1])))
+    assert "  1 network burst (" in text and "(median) holds " in text and "in bins of" not in text
+    # Of 50 ms there would be more than ten million.
+    long = recording([(t, 0) for t in np.arange(0.0, 1e6, 100.0)], [], 4, 1e6)
+    assert "looked for in bins of 0.1 s" in inspection_text(inspect_recording(long))

@@ -160,7 +160,9 @@ def test_channels_that_fire_as_no_neurons_do() -> None:
     hum = np.column_stack([np.arange(0, 10, 0.008), np.full(1250, 39)])
     found = {f.name: f for f in noticed(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
     assert (found["noisy-channels"].severity, found["noisy-channels"].value) == ("warning", 1)
-    assert "1 of 40 channels (39) fire as no neurons do and hold 76 % of all spikes" in found["noisy-channels"].message
+    assert (
+        "1 of 40 channels (39) fires as no neurons do and holds 76 % of all spikes" in found["noisy-channels"].message
+    )
     assert (found["silent-channels"].severity, found["silent-channels"].value) == ("note", 9)
     found = {f.name: f for f in noticed(recording(usual[:20], [1], 40, 10.0))}
     assert found["silent-channels"].severity == "warning"
@@ -183,3 +185,51 @@ def test_brainoware_cannot_be_used_in_the_papers_window(real_data: Path) -> None
     assert found["dead-window"].severity == "refuse"
     assert "an artefact counted as spikes" in found["artefact-spikes"].message
     assert found["artefact-spikes"].severity == "warning"
+
+
+def test_an_artefact_is_compared_with_as_much_time_as_it_takes() -> None:
+    # A spike in each half millisecond, and around 50 stimuli 39 more in one of them and 29 more in three others.
+    every_s = (np.arange(2 * 60_000) + 0.5) * 0.5e-3
+    stimulus_s = np.arange(5.0, 55.0)
+    more_s = [
+        t + 1e-3 * ms
+        for t in stimulus_s
+        for ms, n in ((-0.75, 29), (-0.25, 39), (0.25, 29), (0.75, 29))
+        for _ in range(n)
+    ]
+    spikes = [(t, 0) for t in [*every_s, *more_s]]
+    finding = findings(recording(spikes, stimulus_s, 4, 60.0))["artefact-spikes"]
+    assert finding.message.startswith("from -1 to 1 ms there are 130.0 spikes a stimulus, 32.5 times as many")
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "kind", "is_coarse"),
+    [(0.0, np.float64, False), (0.0, np.float32, False), (1e5, np.float32, True), (1.7e9, np.float64, False)],
+)
+def test_times_too_coarse_for_the_window_are_said(offset_s: float, kind: type, is_coarse: bool) -> None:
+    rng = np.random.default_rng(0)
+    stimulus_s = np.arange(1.0, 300.0)
+    times_s = (offset_s + np.sort(rng.uniform(0, 300, 20_000))).astype(kind).astype(float)
+    # The step of single precision at 100,000 s is 2^-7 s.
+    source = recording([(0.5, 0)], offset_s + stimulus_s, 4, offset_s + 301)
+    spikes = replace(source, spike_times_s=times_s, spike_channels=rng.integers(4, size=len(times_s)))
+    found = findings(spikes)
+    assert ("coarse-times" in found) == is_coarse
+    if is_coarse:
+        assert found["coarse-times"].value == pytest.approx(1e3 * 2**-7)
+        assert "in steps of 7.81 ms, too coarse for a window of 8 ms" in found["coarse-times"].message
+
+
+@pytest.mark.parametrize(("decimals", "is_coarse"), [(4, False), (3, False), (2, True)])
+def test_times_with_few_decimals_are_coarse(decimals: int, is_coarse: bool) -> None:
+    source = answering({5.0: 20.0, 80.0: 40.0})
+    rounded = replace(source, spike_times_s=np.round(source.spike_times_s, decimals))
+    assert len(rounded.spike_times_s) > 1000
+    assert ("coarse-times" in findings(rounded)) == is_coarse
+
+
+def test_a_single_unit_that_is_refractory_has_no_coarse_times() -> None:
+    rng = np.random.default_rng(0)
+    times_s = np.cumsum(0.004 + rng.exponential(0.2, 2000))
+    source = recording([(t, 0) for t in times_s], np.arange(1.0, 300.0), 4, 500.0)
+    assert "coarse-times" not in findings(source)

@@ -19,7 +19,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.noticed import noticed
-from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.reading import read_recording, read_recordings, read_source
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
 
@@ -51,7 +51,8 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
     assert recording.presentation is None
     assert recording.stimuli.presentation.tolist() == [0, 1]
     assert names(recording) >= {"unsorted-spikes", "unsorted-stimuli", "silent-channels-unknown"}
-    assert "1 of 3 spikes stand behind a later one" in said(recording)["unsorted-spikes"]
+    early = "1 of 3 spikes follows a later one in the file; it was sorted by time"
+    assert said(recording)["unsorted-spikes"] == early
 
 
 def said(recording: Recording) -> dict[str, str]:
@@ -587,3 +588,27 @@ def test_a_file_of_responses_without_times_is_refused_by_its_keys(real_data: Pat
     said = r"expected times of spikes .*only counts \(culture0_spikes_per_electrode.*bring the times"
     with pytest.raises(AnimatError, match=said):
         read_recording(real_data / "rat_cortical_64ch_responses.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a_spikes.csv", "time_s,channel\n", "expected a line a spike, .* there are no spikes in it"),
+        ("a_spikes.csv", "time_s,channel,unit\n0.1,1,2\n", "expected one column of .* got channel and unit"),
+        ("a_spikes.csv", "time_s\n0.1,7\n", "expected 1 field, as in the header, got 2"),
+        ("a_responses.csv", "trial,pattern\n1,a\n", "expected a column count_CHANNEL or rate_hz_CHANNEL"),
+    ],
+)
+def test_messages_say_what_is_missing(name: str, text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InvalidFile, match=words):
+        read_source(tmp_path / name)
+
+
+def test_labels_in_text_and_a_negative_duration_are_said(tmp_path: Path) -> None:
+    labels = {"channel_label": np.array(["17", "21", "40"])}
+    numbers = {"spike_time_s": np.array([0.1, 0.2]), "spike_channel": np.array([17, 1])}
+    with pytest.raises(InvalidFile, match="rows from 0 to 2, as these are numbers and channel_label is text, got 17"):
+        read_recording(npz(tmp_path, **numbers, **STIMULI, **labels))
+    with pytest.raises(InvalidFile, match=r"the latter 0 or more, got -0\.25 and -1"):
+        read_recording(npz(tmp_path, **SPIKES, **STIMULI, duration_s=-1.0))

@@ -356,3 +356,66 @@ def test_absurd_sizes_are_refused_before_memory_is_asked_for(tmp_path: Path, sha
         file.create_dataset("units/spike_times", shape, "f8", chunks=(1024,) + (1,) * (len(shape) - 1))
     with pytest.raises(InvalidFile, match=r"claims [\d,]+ values, more than a file of"):
         read_recording(path)
+
+
+def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> None:
+    def told(units: list[list[float]]) -> str | None:
+        import pynwb
+
+        start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+        nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+        for times_s in units:
+            nwb.add_unit(spike_times=times_s)
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.nwb"
+        with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
+            nwb_io.write(nwb)
+        recording = read_recording(path)
+        assert recording.spike_times_s.tolist() == sorted(t for times_s in units for t in times_s)
+        return next((f.message for f in recording.findings if f.name == "unsorted-spikes"), None)
+
+    assert told([[0.1, 0.5, 0.9], [0.2, 0.4]]) is None
+    assert str(told([[0.1, 0.9, 0.5], [0.4, 0.2]])).startswith("2 of 5 spikes follow a later one in the file")
+
+
+def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False) -> Path:
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    nwb.add_unit(spike_times=[0.1, 0.5, 0.9])
+    table = pynwb.epoch.TimeIntervals(name="stimuli" if stimuli else "sweeps", description="x")
+    if electrodes is not None:
+        table.add_column("electrodes", "on the array")
+    for i in range(3):
+        row = {} if electrodes is None else {"electrodes": electrodes[i]}
+        table.add_interval(start_time=0.2 * i, stop_time=0.2 * i + 0.1, **row)
+    nwb.add_stimulus(table) if stimuli else nwb.add_time_intervals(table)
+    with pynwb.NWBHDF5IO(str(path), "w") as nwb_io:
+        nwb_io.write(nwb)
+    return path
+
+
+def test_tables_that_may_be_stimuli_are_named_where_none_speaks_of_them(tmp_path: Path) -> None:
+    path = write_trials(tmp_path / "a.nwb", None)
+    finding = next(f for f in noticed(read_recording(path)) if f.name == "no-stimuli")
+    assert finding.severity == "refuse" and "intervals/sweeps" in finding.message and "--stimuli" in finding.message
+    assert read_recording(path, stimuli="sweeps").stimuli.time_s.tolist() == pytest.approx([0.0, 0.2, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("words", "read"),
+    [
+        (["7", "7 9", ""], [[7, -1], [7, 9], [-1, -1]]),
+        (["7,9", "8", "9"], [[7, 9], [8, -1], [9, -1]]),
+        (["7", "north", "9"], [[-1], [-1], [-1]]),
+    ],
+)
+def test_electrodes_in_words_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
+    recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
+    assert recording.stimuli.electrodes.tolist() == read
+
+
+def test_the_advice_to_choose_names_the_commands_that_can(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb", stimuli=("pulses", "events"))
+    with pytest.raises(InvalidFile, match="choose with --stimuli NAME, which animat inspect and animat convert have"):
+        read_recording(path)

@@ -123,6 +123,25 @@ def test_a_quiet_culture_that_answers_is_in_seconds_however_long_it_is_recorded(
     assert said(of_spikes(answers, stimulus_s, 40, 12 * 3600.0)) is None
 
 
+@pytest.mark.parametrize("sampling_rate_hz", [float("nan"), 20_000.0])
+@pytest.mark.parametrize(
+    ("per_s", "rate_hz", "unit"),
+    [(1e3, 2.0, "milliseconds"), (1e3, 0.7, "milliseconds"), (20e3, 2.0, "samples"), (1e6, 2.0, "microseconds")],
+)
+def test_sorted_units_are_named_in_their_unit_first_and_doubt_is_said(
+    per_s: float, rate_hz: float, unit: str, sampling_rate_hz: float
+) -> None:
+    # 60 units that are refractory for 3 ms, and a stimulus a second.
+    rng = np.random.default_rng(0)
+    spikes = [(t, c) for c in range(60) for t in np.cumsum(0.003 + rng.exponential(1 / rate_hz - 0.003, 1000))]
+    source = of_spikes(spikes, np.arange(1.0, 300.0), 60, 4000 / rate_hz)
+    assert said(source) is None
+    message = str(said(dataclasses.replace(in_unit(source, per_s), sampling_rate_hz=sampling_rate_hz)))
+    assert f"times are in {unit}; divide" in message
+    # Milliseconds at 2 Hz are as well samples at 40 Hz.
+    assert ("perhaps" in message) == (", or in " in message) == (per_s == 1e3)
+
+
 def test_channels_that_fire_faster_than_neurons_can() -> None:
     rng = np.random.default_rng(0)
     spikes = [(t, c) for c in range(3) for t in rng.uniform(0, 2, 1000)]

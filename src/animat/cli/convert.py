@@ -8,8 +8,11 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidArgument, InvalidFile
 from animat.writing import expect_writable
+
+OF_DETECTION = ("band_hz", "threshold", "dead_time_ms", "blank_ms")
+"""Options of finding spikes, which those of a file are not."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,8 @@ class Convert:
     """In words"""
     start_min: float | None = None
     """Start on the culture's clock, in minutes"""
+    start_s: float | None = None
+    """Start on the clock of its own times, in seconds, of a file that does not say it"""
     stimuli: str | None = None
     """Which of several things in the file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     stimuli_path: Path | None = None
@@ -72,8 +77,17 @@ class Convert:
         from animat.recordings.detection.settings import Detection
         from animat.recordings.noticed import noticed
 
-        if self.recording.is_dir():
-            raise InvalidFile(f"{self.recording}: expected one recording, got a folder; convert its files one by one")
+        if self.recording.is_dir() and self.reader is None:
+            raise InvalidFile(
+                f"{self.recording}: expected one recording, got a folder; convert its files one by one, or name the "
+                "format with --reader where the folder is one recording"
+            )
+        finds_spikes = self.raw or self.reader is not None
+        if not finds_spikes and (given := [name for name in OF_DETECTION if getattr(self, name) != _default(name)]):
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise InvalidArgument(
+                f"{options}: expected only where spikes are found in raw traces; add --raw or --reader, or leave it out"
+            )
         expect_writable(self.out.parent)
         detection = Detection(
             band_hz=None if self.band_hz == (0, 0) else self.band_hz,
@@ -88,12 +102,13 @@ class Convert:
                 self.recording,
                 self.out,
                 origin,
-                detection=detection if self.raw or self.reader is not None else None,
+                detection=detection if finds_spikes else None,
                 reader=self.reader,
                 stimuli_path=self.stimuli_path,
                 stimuli=self.stimuli,
                 part=self.part,
                 start_min=self.start_min,
+                start_s=self.start_s,
                 progress=progress,
             )
         n_spikes, n_stimuli = len(recording.spike_times_s), len(recording.stimuli)
@@ -108,3 +123,7 @@ class Convert:
             "stimuli": n_stimuli,
             "findings": [finding.name for finding in findings],
         }
+
+
+def _default(name: str) -> Any:
+    return next(field.default for field in fields(Convert) if field.name == name)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
+from animat.recordings.empty_stretches import late_start
 from animat.recordings.findings import Finding, merged
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Order, Presentation
@@ -39,7 +40,8 @@ class PlainColumns:
         stimulus_pattern: whole numbers, -1 for unknown, or names, which are numbered in alphabetical order (an empty
             one is unknown), shape (stimuli,).
         stimulus_electrodes: electrodes pulsed together, padded with -1, shape (stimuli, electrodes) or (stimuli,).
-        stimulus_presentation: presentation of each pulse, shape (stimuli,); by default each pulse is one of its own.
+        stimulus_presentation: presentation of each pulse, shape (stimuli,); by default, and where it is -1, a pulse is
+            one of its own.
         sampling_rate_hz: of the raw signal, NaN for unknown.
         start_min: start on the culture's clock in minutes.
         start_s: start on the recording's clock; by default 0, or the first event if that is earlier.
@@ -86,12 +88,14 @@ class PlainColumns:
         channels, rows = self._channels(len(spike_time_s), noted)
         patterns, names = self._patterns(len(stimulus_time_s))
         start_s, duration_s = self._span(spike_time_s, stimulus_time_s)
+        if self.start_s is None:
+            noted += late_start(spike_time_s, stimulus_time_s)
         stimuli = Stimuli(
             time_s=stimulus_time_s,
             frequency_hz=self._frequencies(len(stimulus_time_s))[stimuli_in_time],
             pattern=patterns[stimuli_in_time],
             electrodes=self._electrodes(len(stimulus_time_s))[stimuli_in_time],
-            presentation=self._presentations(len(stimulus_time_s), stimuli_in_time),
+            presentation=self._presentations(len(stimulus_time_s), stimuli_in_time, noted),
         )
         return Recording(
             spike_times_s=spike_time_s,
@@ -142,6 +146,12 @@ class PlainColumns:
             return table, _looked_up(values.astype(np.str_), table.label)
         if _is_text(values):
             raise UnusableData("spike_channel: expected rows (whole numbers), as there is no channel_label; got text")
+        outside = values[(values < 0) | (values >= n_channels)]
+        if len(outside) and self.channel_label is not None:
+            raise UnusableData(
+                f"spike_channel: expected rows from 0 to {n_channels - 1}, as these are numbers and channel_label is "
+                f"text, got {outside[0]}: write labels as text in both, or as numbers in both"
+            )
         return table, values.astype(np.int64)
 
     def _frequencies(self, n: int) -> Float64[np.ndarray, " stimuli"]:
@@ -180,11 +190,19 @@ class PlainColumns:
             )
         return whole
 
-    def _presentations(self, n: int, in_time: Int64[np.ndarray, " stimuli"]) -> Int64[np.ndarray, " stimuli"]:
+    def _presentations(
+        self, n: int, in_time: Int64[np.ndarray, " stimuli"], noted: list[Finding]
+    ) -> Int64[np.ndarray, " stimuli"]:
         if self.stimulus_presentation is not None:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
             presentations: Int64[np.ndarray, " stimuli"] = _whole("stimulus_presentation", column)[in_time]
-            return presentations
+            unknown = presentations == UNKNOWN
+            # Numbers that fall are for `Stimuli` to refuse.
+            if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
+                return presentations
+            message = f"{unknown.sum():,} of {n:,} stimuli name no trial (-1): each of them is taken for a trial"
+            noted.append(Finding("trials-unknown", "note", message, float(unknown.sum())))
+            return np.cumsum(np.append(True, np.diff(presentations) != 0) | unknown) - 1
         if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
             raise UnusableData(
                 f"stimulus_presentation: expected, to know which {self.presentation_pulses} pulses belong to one "
@@ -208,11 +226,26 @@ class PlainColumns:
         start_s = float(min([0.0, *events_s])) if self.start_s is None else float(self.start_s)
         if self.duration_s is not None:
             return start_s, float(self.duration_s)
-        stop_s = float(max([start_s, *events_s]))
-        duration_s = stop_s - start_s
-        while start_s + duration_s < stop_s:
-            duration_s = float(np.nextafter(duration_s, np.inf))
-        return start_s, duration_s
+        return start_s, _duration_s(start_s, float(max([start_s, *events_s])))
+
+
+def started_at(recording: Recording, start_s: float) -> Recording:
+    """The recording with its start, which its file does not say, and the end that it had; it is no longer asked for.
+
+    Raises:
+        UnusableData: if events come before it.
+    """
+    duration_s = _duration_s(start_s, max(recording.stop_s, start_s))
+    findings = tuple(finding for finding in recording.findings if finding.name != "start-unknown")
+    return replace(recording, start_s=float(start_s), duration_s=duration_s, findings=findings)
+
+
+def _duration_s(start_s: float, stop_s: float) -> float:
+    """The duration such that start + duration does not round to before the end."""
+    duration_s = stop_s - start_s
+    while start_s + duration_s < stop_s:
+        duration_s = float(np.nextafter(duration_s, np.inf))
+    return duration_s
 
 
 def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, float]:
@@ -233,12 +266,21 @@ def _in_time(
         raise UnusableData(f"{name}: expected one column of times in seconds, got shape {times_s.shape}")
     expect_times(name, times_s)
     order = np.argsort(times_s, kind="stable")
-    # Later than one that stands anywhere before it, not only just before it.
-    early = np.count_nonzero(times_s < np.maximum.accumulate(times_s)) if len(times_s) else 0
-    if early:
-        message = f"{early:,} of {len(times_s):,} {events} stand behind a later one in the file: sorted by time"
-        noted.append(Finding(f"unsorted-{events}", "note", message, float(early)))
+    if early := out_of_order(times_s):
+        noted.append(unsorted(events, early, len(times_s)))
     return times_s[order], order
+
+
+def out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
+    """How many times are earlier than one that stands anywhere before them, not only just before."""
+    return int(np.count_nonzero(times_s < np.maximum.accumulate(times_s))) if len(times_s) else 0
+
+
+def unsorted(events: str, early: int, n: int) -> Finding:
+    """The note on events that were out of order in their file."""
+    verbs = ("follows", "it was") if early == 1 else ("follow", "they were")
+    message = f"{early:,} of {n:,} {events} {verbs[0]} a later one in the file; {verbs[1]} sorted by time"
+    return Finding(f"unsorted-{events}", "note", message, float(early))
 
 
 def _channel_table(labels: Column, electrode: Column | None, xy_um: Column | None) -> Channels:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import Progress
 from animat.recordings.detection.settings import Detection
-from animat.recordings.findings import merged
+from animat.recordings.findings import Finding, merged
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
@@ -29,6 +29,8 @@ DURATION = re.compile(
 )
 """ISO 8601: P, years, months, weeks and days, and after a T hours, minutes and seconds; one of them at least."""
 
+DAYS = {"Y": 365.25, "M": 365.25 / 12, "W": 7.0, "D": 1.0}
+PERSON = re.compile(r"\s*[^,;]+,\s*[^,;]+")
 SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
 """Genus and species, and perhaps the subspecies, or an address of NCBI's taxonomy."""
 
@@ -50,8 +52,8 @@ class Origin:
         experiment_description: in words.
 
     Raises:
-        InvalidArgument: for a `species` that is not in Latin, an `age` that is no duration, or a `recorded_at` that is
-            no date.
+        InvalidArgument: for a `species` that is not in Latin, an `age` that is no duration, an `experimenter` without a
+            comma, or a `recorded_at` that is no date.
     """
 
     subject_id: str | None = None
@@ -77,6 +79,11 @@ class Origin:
             if not all(map(DURATION.fullmatch, (first, last) if last else (first,))):
                 expected = "an ISO 8601 duration such as P42D (days), P6W or P3M"
                 raise InvalidArgument(f"age: expected {expected}, got {self.age!r}")
+            if last and _days(last) < _days(first):
+                raise InvalidArgument(f"age: expected a range from the younger to the older, got {self.age!r}")
+        if self.experimenter is not None and not all(map(PERSON.fullmatch, self.experimenter.split(";"))):
+            expected = "Last, First, as NWB has it, several separated by semicolons"
+            raise InvalidArgument(f"experimenter: expected {expected}, got {self.experimenter!r}")
         if self.recorded_at is not None:
             try:
                 datetime.fromisoformat(self.recorded_at)
@@ -100,6 +107,7 @@ def convert_recording(
     stimuli: str | None = None,
     part: str | None = None,
     start_min: float | None = None,
+    start_s: float | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Read a recording in any format and write it as NWB.
@@ -108,7 +116,7 @@ def convert_recording(
         out: the NWB file, complete or absent.
         detection: find the spikes in raw traces, in this way; None: take the spikes that the file has.
         reader: the format's name for SpikeInterface; the spikes are then found in its traces.
-        stimuli_path, stimuli, part, start_min: as in `read_recording`.
+        stimuli_path, stimuli, part, start_min, start_s: as in `read_recording`.
         progress: of finding spikes.
 
     Returns:
@@ -126,6 +134,8 @@ def convert_recording(
         raise InvalidArgument(f"--out: expected a name that ends in .nwb, as NWB is written, got {out}")
     if reader is not None and (stimuli is not None or part is not None):
         raise InvalidArgument(f"stimuli, part: expected none for traces read with a reader, got {stimuli or part!r}")
+    if (detection is not None or reader is not None) and start_s is not None:
+        raise InvalidArgument(f"start_s: expected none beside raw traces, which say when they start, got {start_s:g}")
     if reader is None and detection is not None and stimuli_path is not None:
         raise InvalidArgument(
             f"stimuli_path: expected only beside CSV spikes or traces read with a reader, got {stimuli_path}, but "
@@ -137,14 +147,37 @@ def convert_recording(
     elif detection is not None:
         recording = read_traces(path, detection, part=part, stimuli=stimuli, progress=progress)
     else:
-        recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
+        recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part, start_s=start_s)
     words = {} if origin is None else origin.words()
     # A subject without a sex is of an unknown one.
     unsaid = {"sex": "U"} if "subject_id" in words else {}
     start_min = recording.start_min if start_min is None else start_min
     recording = replace(recording, provenance={**unsaid, **recording.provenance, **words}, start_min=float(start_min))
+    recording = replace(recording, findings=(*recording.findings, *_without_zone(recording)))
     write_nwb(recording, out)
     return recording
+
+
+def _days(age: str) -> float:
+    """How long an ISO 8601 duration of `DURATION` is, in days; months and years are those of the mean calendar."""
+    date, _, time = age[1:].partition("T")
+    days = sum(float(number) * DAYS[unit] for number, unit in re.findall(r"([\d.]+)([YMWD])", date))
+    seconds = {"H": 3600.0, "M": 60.0, "S": 1.0}
+    return days + sum(float(n) * seconds[unit] for n, unit in re.findall(r"([\d.]+)([HMS])", time)) / 86_400
+
+
+def _without_zone(recording: Recording) -> Iterator[Finding]:
+    """A note on a date that names no time zone."""
+    recorded_at = recording.provenance.get("recorded_at", "")
+    try:
+        is_without = datetime.fromisoformat(recorded_at).tzinfo is None
+    except ValueError:
+        return
+    if is_without and all(finding.name != "zone-unknown" for finding in recording.findings):
+        message = (
+            f"recorded_at {recorded_at} names no time zone and is taken for UTC; add it, such as +09:00, after the time"
+        )
+        yield Finding("zone-unknown", "note", message)
 
 
 def read_traces(

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from animat.recordings.empty_stretches import silences
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -23,9 +24,11 @@ def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     Of a table of responses, which has no spikes to look at, the former and its frequencies (`other-frequencies`).
 
     Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
-    (`channel_findings`), times that cannot be in seconds (`animat.recordings.time_quality`), more
-    stimuli than spikes (`more-stimuli-than-spikes`), stimuli of one time (`simultaneous-stimuli`), stimuli without
-    electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
+    (`channel_findings`), times that cannot be in seconds (`animat.recordings.time_quality`), silences of all channels
+    (`silence`), spikes that are there twice (`duplicate-spikes`), more stimuli than spikes
+    (`more-stimuli-than-spikes`), stimuli of one time (`simultaneous-stimuli`), trials of several frequencies
+    (`trials-of-several-frequencies`), stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown
+    presentation (`presentation-unknown`).
     """
     if isinstance(recording, ResponseTable):
         return (*recording.findings, *frequency_findings(recording.stimuli, has_times=recording.has_times))
@@ -46,6 +49,8 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     else:
         yield from channel_findings(recording)
     yield from time_findings(recording)
+    yield from silences(recording)
+    yield from _duplicates(recording)
     yield from _stimulus_rows(recording)
     if unknown := int(np.count_nonzero(np.all(stimuli.electrodes == UNKNOWN, axis=1) & ~stimuli.is_rest)):
         message = f"the electrodes of {unknown:,} of {len(stimuli):,} stimuli are not known"
@@ -73,6 +78,32 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         )
         yield Finding("simultaneous-stimuli", "refuse", message, float(same))
 
+    frequency_hz, trial = recording.stimuli.frequency_hz, recording.stimuli.presentation
+    # Unknown ones differ from each other too, and are none.
+    differs = (np.diff(frequency_hz) != 0) & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
+    if several := len(np.unique(trial[1:][differs & (np.diff(trial) == 0)])):
+        message = (
+            f"{several:,} of {np.count_nonzero(last):,} trials hold pulses of several frequencies, and the response "
+            "counts for that of the last: correct the frequencies or stimulus_presentation"
+        )
+        yield Finding("trials-of-several-frequencies", "warning", message, float(several))
+
+
+TWICE = 0.03
+
+
+def _duplicates(recording: Recording) -> Iterable[Finding]:
+    """Spikes of one channel at one time, which no channel can have."""
+    same = (np.diff(recording.spike_times_s) == 0) & (np.diff(recording.spike_channels) == 0)
+    share = float(np.count_nonzero(same)) / max(len(recording.spike_times_s), 1)
+    if share > TWICE:
+        message = (
+            f"{np.count_nonzero(same):,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at the "
+            "very time of another on their channel: are they in the file twice, or times coarse? Each is counted; "
+            "bring them once"
+        )
+        yield Finding("duplicate-spikes", "warning", message, share)
+
 
 MOSTLY_SILENT = 0.5
 FAST_HZ = 100.0
@@ -96,7 +127,10 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     count = np.bincount(recording.spike_channels, minlength=n)
     if silent := int(np.count_nonzero(count == 0)):
         mostly = silent > MOSTLY_SILENT * n
-        message = f"{silent:,} of {n:,} channels are silent; they count in rates per channel"
+        message = f"{silent:,} of {n:,} channels " + (
+            "is silent; it counts" if silent == 1 else "are silent; they count"
+        )
+        message += " in rates per channel"
         message += ": route electrodes where the culture fires" if mostly else ""
         yield Finding("silent-channels", "warning" if mostly else "note", message, float(silent))
     fast = count > FAST_HZ * recording.duration_s if recording.duration_s > 0 else np.zeros(n, dtype=bool)
@@ -106,7 +140,14 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
         share = float(count[noisy].sum() / n_spikes)
         names = ", ".join(channels.label[noisy[:NAMED]]) + (", ..." if len(noisy) > NAMED else "")
         message = (
-            f"{len(noisy):,} of {n:,} channels ({names}) fire as no neurons do and hold {100 * share:.0f} % of all "
-            "spikes: they carry noise; raise their threshold or leave them out of the routing"
+            f"{len(noisy):,} of {n:,} channels ({names}) "
+            + ("fires as no neurons do and holds" if len(noisy) == 1 else "fire as no neurons do and hold")
+            + f" {100 * share:.0f} % of all spikes: "
+            + (
+                "it carries noise; raise its threshold or leave it out"
+                if len(noisy) == 1
+                else "they carry noise; raise their threshold or leave them out"
+            )
+            + " of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

@@ -14,6 +14,7 @@ import numpy as np
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.plain_file import expect_plain_file, is_folder, is_nothing
 from animat.recordings.apart import read_hdf5_apart
+from animat.recordings.columns import started_at
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
 from animat.recordings.formats.npz import read_npz
@@ -52,6 +53,7 @@ def read_recording(
     stimuli: str | None = None,
     part: str | None = None,
     start_min: float | None = None,
+    start_s: float | None = None,
 ) -> Recording:
     """Read one recording: NWB, MaxWell, CL1 (HDF5), NPZ (zip) or CSV (text, gzipped or not), known by its content.
 
@@ -61,6 +63,7 @@ def read_recording(
             events' type.
         part: which recording of a MaxWell file that holds several, such as `well000/rec0000`.
         start_min: when the recording started on the culture's clock, in minutes; by default what the file says.
+        start_s: when it started on the clock of its own times, in seconds, for a file that does not say so.
 
     Returns:
         The recording, sorted and checked; what was noticed on the way is in its provenance (see
@@ -69,17 +72,24 @@ def read_recording(
     Raises:
         InvalidFile: naming the file, what was expected and what came.
         InvalidArgument: for a `stimuli_path` beside a file that holds its own stimuli, a choice that the format does
-            not offer, or a `start_min` not finite.
+            not offer, or a `start_min` or `start_s` not finite.
     """
     path = Path(path)
     if start_min is not None and not np.isfinite(start_min):
         raise InvalidArgument(f"start_min: expected finite minutes, got {start_min:g}")
+    if start_s is not None and not np.isfinite(start_s):
+        raise InvalidArgument(f"start_s: expected finite seconds, got {start_s:g}")
     source = _read(path, stimuli_path, stimuli, part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(
             f"{path}: expected spikes, got a table of responses, which animat inspect, train and evaluate read; "
             "this needs the times of spikes"
         )
+    if start_s is not None:
+        try:
+            source = started_at(source, start_s)
+        except UnusableData as error:
+            raise InvalidFile(f"{path}: {error}") from error
     return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
 
 

@@ -131,8 +131,9 @@ class Recording:
         self._order_simultaneous_spikes()
         # Spikes and stimuli up to a century before and after 0 are two apart.
         if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
+            length = ", the latter 0 or more" if self.duration_s < 0 else ""
             raise UnusableData(
-                f"start_s, duration_s: expected finite seconds, within a century, got {self.start_s:g} and "
+                f"start_s, duration_s: expected finite seconds, within a century{length}, got {self.start_s:g} and "
                 f"{self.duration_s:g}"
             )
         if not abs(self.start_min) <= CENTURY_S / 60:

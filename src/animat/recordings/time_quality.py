@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64
 
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
@@ -24,8 +23,11 @@ FEW_HZ, MANY_HZ = 0.02, 200.0
 """Median rate of the channels that fired, below and above which no recording is."""
 SHORT_S, SHORT_SHARE = 0.5, 0.05
 """In any recording at least this share of a channel's intervals is shorter: neurons fire in bursts."""
-SHORTEST_IN_SAMPLES, SHORTEST_IN_MICROSECONDS = 2.0, 100.0
-"""The shortest hundredth of a channel's intervals, from which on they are counted in these."""
+LIKELY_HZ, LIKELY_SHORTEST_S = (FEW_HZ, 50.0), (0.00015, 0.05)
+"""Median rate of the channels that fired, and the shortest hundredth of a channel's intervals, in the right unit."""
+USUAL_HZ, USUAL_SHORTEST_S = 1.0, 0.002
+USUAL_SAMPLING_HZ = 20_000.0
+"""Where a file does not say it; nearly all arrays are sampled at half to twice as much."""
 SOON_S = 0.1
 ENOUGH_SPIKES, ENOUGH_STIMULI = 1000, 20
 
@@ -160,7 +162,8 @@ def _fired(recording: Recording) -> str | None:
     if len(interval_s) and median_hz < FEW_HZ and np.mean(interval_s < SHORT_S) < SHORT_SHARE:
         return (
             f"spike times cannot be in seconds: {hours}, with {median_hz:.2g} Hz on the median channel and hardly ever "
-            f"two spikes of a channel within {SHORT_S:g} s; times are in {_unit_of_spikes(interval_s)}"
+            f"two spikes of a channel within {SHORT_S:g} s; "
+            + _unit_of_spikes(median_hz, float(np.quantile(interval_s, 0.01)), recording.sampling_rate_hz)
         )
     stimulus_s = recording.stimuli.time_s
     soon_after = np.searchsorted(times_s, stimulus_s + SOON_S) - np.searchsorted(times_s, stimulus_s)
@@ -172,16 +175,24 @@ def _fired(recording: Recording) -> str | None:
     return None
 
 
-def _unit_of_spikes(interval: Float64[np.ndarray, " intervals"]) -> str:
-    """The unit that intervals on a channel are in; the shortest last a fifth of a millisecond to a few."""
-    shortest = float(np.quantile(interval, 0.01))
-    if shortest < SHORTEST_IN_SAMPLES:
-        return "milliseconds; divide them by 1,000"
-    return (
-        "samples; divide them by the sampling rate"
-        if shortest < SHORTEST_IN_MICROSECONDS
-        else "microseconds; divide them by 1,000,000"
-    )
+def _unit_of_spikes(median_hz: float, shortest_s: float, sampling_rate_hz: float) -> str:
+    """The units in which rate and shortest intervals are those of neurons, the likeliest first, and what to do."""
+    is_known = bool(np.isfinite(sampling_rate_hz))
+    rate_hz = sampling_rate_hz if is_known else USUAL_SAMPLING_HZ
+    units = {
+        1e3: "milliseconds; divide them by 1,000",
+        1e6: "microseconds; divide them by 1,000,000",
+        rate_hz: "samples; divide them by the sampling rate" + (f" of {_plain(rate_hz)} Hz" if is_known else ""),
+    }
+    fits = {}
+    for factor, unit in units.items():
+        hz, at_least_s = factor * median_hz, shortest_s / factor
+        if all(low <= x <= high for x, (low, high) in ((hz, LIKELY_HZ), (at_least_s, LIKELY_SHORTEST_S))):
+            fits[unit] = abs(np.log(hz / USUAL_HZ)) + abs(np.log(at_least_s / USUAL_SHORTEST_S))
+    if not fits:
+        return "are they in milliseconds, microseconds or samples?"
+    likeliest = sorted(fits, key=lambda unit: fits[unit])
+    return ("perhaps " if len(fits) > 1 else "") + "times are in " + ", or in ".join(likeliest)
 
 
 def _apart(recording: Recording) -> str | None:

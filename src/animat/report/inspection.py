@@ -17,7 +17,7 @@ from animat.report.response_histograms import draw_response_histograms
 from animat.report.spontaneous import draw_spontaneous
 from animat.report.style import save_figure
 from animat.responses.inspection import Inspection
-from animat.responses.network_bursts import NetworkBursts
+from animat.responses.network_bursts import BIN_S, NetworkBursts
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 
 _MOST_CONDITIONS = 16
@@ -29,15 +29,15 @@ def inspection_text(inspection: Inspection) -> str:
     responses = inspection.responses
     start_ms, end_ms = responses.window_ms
     # As far as it is known.
-    spikes = "rates" if inspection.n_spikes is None else f"{inspection.n_spikes:,} spikes"
+    spikes = "rates" if inspection.n_spikes is None else _many(inspection.n_spikes, "spike")
     of_s = inspection.duration_s
     span = f" in {of_s:,.1f} s ({of_s / 60:.1f} min)" if math.isfinite(of_s) else ""
     start = f"from {inspection.start_min:g} min on the culture's clock"
     lines = [
         f"{inspection.name}: {inspection.verdict}",
-        f"  {spikes} on {inspection.n_channels:,} channels{span}, {start}",
-        f"  {inspection.n_stimuli:,} stimuli"
-        + (f" in {inspection.n_trials:,} trials" if inspection.n_trials != inspection.n_stimuli else "")
+        f"  {spikes} on {_many(inspection.n_channels, 'channel')}{span}, {start}",
+        f"  {inspection.n_stimuli:,} {'stimulus' if inspection.n_stimuli == 1 else 'stimuli'}"
+        + (f" in {_many(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
         + (f", {inspection.presentation}" if inspection.presentation else ""),
     ]
     if inspection.network_bursts is not None:
@@ -60,17 +60,23 @@ def inspection_text(inspection: Inspection) -> str:
     return "\n".join(lines)
 
 
+def _many(n: int, what: str) -> str:
+    return f"{n:,} {what}{'' if n == 1 else 's'}"
+
+
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:
     """The activity of a culture that nobody stimulated."""
     lines = [f"  {inspection.spontaneous_rate_hz:.3g} Hz per channel"] if inspection.duration_s else []
     if len(bursts):
         a_minute = 60 * len(bursts) / inspection.duration_s
         lines.append(
-            f"  {len(bursts):,} network bursts ({a_minute:.3g} a minute) of {bursts.median_s:.2f} s (median) hold "
-            f"{100 * bursts.share:.0f} % of all spikes"
+            f"  {_many(len(bursts), 'network burst')} ({a_minute:.3g} a minute) of {bursts.median_s:.2f} s (median) "
+            f"{'holds' if len(bursts) == 1 else 'hold'} {100 * bursts.share:.0f} % of all spikes"
         )
     elif inspection.n_spikes:
         lines.append("  no network bursts")
+    if (bin_s := float(bursts.edges_s[1] - bursts.edges_s[0])) > 1.01 * BIN_S:
+        lines[-1] += f"; looked for in bins of {bin_s:.3g} s, as the recording is so long"
     return lines
 
 

@@ -5,7 +5,8 @@ Around a stimulus, three things are done to each channel, in this order:
 1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse the trace is a straight line, and nothing is looked for.
 2. *Saturation*: a channel whose amplifier saturates, as those near a stimulated electrode do, is blanked on until it
    comes out of it: at the rail if that is known, else while the trace does not move for 0.4 ms on end and is far from
-   where it was. A spike's negative peak in coarse steps stands still for a shorter time.
+   where it was. A spike's negative peak in coarse steps stands still for a shorter time. Whoever is still saturated
+   20 ms after the pulse (`recovery_ms`) is followed to the end of that, or to the next pulse.
 3. *Recovery*: what decays afterwards is fitted by a exp(-t / tau) + b, tau from some 0.2 to 16 ms, and the
    exponential is taken away; what is far off the fit (spikes) hardly counts in it. Nothing is blanked.
 
@@ -33,6 +34,8 @@ FLAT_MS, FLAT_SHARE = 0.4, 0.005
 """How long a saturated amplifier stands still at least, and how far it moves at most, of its distance from rest."""
 SETTLE_MS = 0.25
 """After an amplifier came out of saturation, as its first samples lie on no exponential."""
+PAUSE_MS = 1.0
+"""For which one that has been saturated for long may move in between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,51 +78,67 @@ def without_artefacts(
     before, after = (round(ms * per_ms) for ms in settings.blank_ms)
     follow = round(settings.recovery_ms * per_ms)
     is_blank = np.zeros(voltage_uv.shape, dtype=bool)
-    following = np.append(stimulus[1:], samples + follow)
+    following = np.append(stimulus[1:], samples + before)
+    rest_uv, is_held = np.zeros(len(voltage_uv), np.float32), np.zeros(len(voltage_uv), dtype=bool)
     for i, (at, next_at) in enumerate(zip(stimulus.tolist(), following.tolist(), strict=True)):
         start, end = max(at - before, 0), min(at + after, samples)
-        stop = min(at + follow, next_at - before, samples)
+        limit = min(next_at - before, samples)
+        stop = min(at + follow, limit)
         if end <= 0 or start >= samples:
             continue
         if stop <= end:
             # The next pulse comes before this one is over: nothing but blanking can be done.
-            _bridge(voltage_uv, is_blank, start, np.full(len(voltage_uv), end))
+            _bridge(voltage_uv, is_blank, start, np.full(len(voltage_uv), end), is_held)
             continue
-        rest_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
+        before_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
+        # What is saturated since the pulse before is not at rest.
+        rest_uv = np.where(is_held, rest_uv, before_uv)
         # From the pulse on: what stands still at the blank's end did so before.
         pulse = max(at, 0)
-        trace = voltage_uv[:, pulse:stop] - rest_uv[:, None]
         flat = max(round(FLAT_MS * per_ms), 3)
-        until = np.maximum(pulse + _saturated_until(trace, noise_uv, settings.saturation_uv, flat), end)
+        saturated_until = _saturated_until(voltage_uv[:, pulse:stop] - rest_uv[:, None], noise_uv, settings, flat)
+        until = np.maximum(pulse + saturated_until, end)
+        longer = np.flatnonzero(pulse + saturated_until == stop) if stop < limit else np.empty(0, np.int64)
+        if len(longer):
+            trace = voltage_uv[longer, stop - flat : limit] - rest_uv[longer, None]
+            more = _saturated_until(trace, noise_uv[longer], settings, flat, round(PAUSE_MS * per_ms))
+            until[longer] = np.maximum(stop - flat + more, stop)
+        is_held = until == limit
         late = until > end
-        until[late] = np.minimum(until[late] + round(SETTLE_MS * per_ms), stop)
+        until[late] = np.minimum(until[late] + round(SETTLE_MS * per_ms), limit)
         saturated[i] = np.count_nonzero(late)
         longest_ms[i] = (int(until.max()) - at) / per_ms if saturated[i] else 0.0
-        _take_away_recovery(voltage_uv, until, stop, rest_uv, noise_uv, per_ms)
-        _bridge(voltage_uv, is_blank, start, until)
+        stops = np.full(len(until), stop)
+        stops[longer] = np.minimum(until[longer] + follow, limit)
+        _take_away_recovery(voltage_uv, until, stops, rest_uv, noise_uv, per_ms)
+        _bridge(voltage_uv, is_blank, start, until, is_held)
     return Cleaned(voltage_uv, is_blank, saturated, longest_ms)
 
 
 def _saturated_until(
     trace_uv: Float32[np.ndarray, "channels samples"],
     noise_uv: Float32[np.ndarray, " channels"],
-    saturation_uv: float | None,
+    settings: Detection,
     flat: int,
+    pause: int | None = None,
 ) -> Int64[np.ndarray, " channels"]:
     """How many samples of each channel's trace go by until its amplifier has come out of saturation.
 
     Without a known rail, it is saturated in stretches of `flat` samples that are far from rest and in which it moves by
     next to nothing.
+
+    Args:
+        pause: samples after which it does not count that it is saturated again; None: however many.
     """
     until = np.zeros(len(trace_uv), np.int64)
-    size_uv = np.abs(trace_uv)
+    size_uv, rail_uv = np.abs(trace_uv), settings.saturation_uv
     far_uv = FAR * np.maximum(noise_uv, 1e-6)
-    limit_uv = far_uv if saturation_uv is None else np.full_like(far_uv, saturation_uv)
+    limit_uv = far_uv if rail_uv is None else np.full_like(far_uv, rail_uv)
     rows = np.flatnonzero(size_uv.max(axis=1) >= limit_uv)
     if not len(rows):
         return until
     is_saturated = size_uv[rows] >= limit_uv[rows, None]
-    if saturation_uv is None:
+    if rail_uv is None:
         if trace_uv.shape[1] < flat:
             return until
         stretches = np.lib.stride_tricks.sliding_window_view(trace_uv[rows], flat, axis=1)
@@ -127,8 +146,11 @@ def _saturated_until(
         is_flat = (moves_uv <= FLAT_SHARE * size_uv[rows, flat - 1 :]) & is_saturated[:, flat - 1 :]
         is_saturated = np.zeros_like(is_saturated)
         is_saturated[:, flat - 1 :] = is_flat
-    last = is_saturated.shape[1] - np.argmax(is_saturated[:, ::-1], axis=1)
-    until[rows] = np.where(is_saturated.any(axis=1), last, 0)
+    for row, flags in zip(rows.tolist(), is_saturated, strict=True):
+        at = np.flatnonzero(flags)
+        if pause is not None and np.any(is_over := np.diff(at, prepend=0) > pause + flat):
+            at = at[: int(np.argmax(is_over))]
+        until[row] = at[-1] + 1 if len(at) else 0
     return until
 
 
@@ -137,8 +159,12 @@ def _bridge(
     is_blank: Bool[np.ndarray, "channels samples"],
     start: int,
     until: Int64[np.ndarray, " channels"],
+    is_held: Bool[np.ndarray, " channels"],
 ) -> None:
-    """A straight line over the blanked stretch of each channel, between means of half a millisecond or so beside it."""
+    """A straight line over the blanked stretch of each channel, between means of half a millisecond or so beside it.
+
+    Of one that is saturated beyond it (`is_held`), at the mean before.
+    """
     for stop in np.unique(until).tolist():
         if stop <= start:
             continue
@@ -151,6 +177,7 @@ def _bridge(
         if from_uv is None or to_uv is None:
             from_uv = to_uv = np.zeros(len(chosen), np.float32)
         share = ((np.arange(stop - start) + 1) / (stop - start + 1)).astype(np.float32)
+        to_uv = np.where(is_held[chosen], from_uv, to_uv)
         voltage_uv[chosen, start:stop] = from_uv[:, None] * (1 - share) + to_uv[:, None] * share
         is_blank[chosen, start:stop] = True
 
@@ -158,17 +185,17 @@ def _bridge(
 def _take_away_recovery(
     voltage_uv: Float32[np.ndarray, "channels samples"],
     until: Int64[np.ndarray, " channels"],
-    stop: int,
+    stops: Int64[np.ndarray, " channels"],
     rest_uv: Float32[np.ndarray, " channels"],
     noise_uv: Float32[np.ndarray, " channels"],
     per_ms: float,
 ) -> None:
     """Fit a exp(-t / tau) + b to what follows on each unsettled channel, and take the exponential away."""
-    for start in np.unique(until).tolist():
+    for start, stop in np.unique(np.column_stack([until, stops]), axis=0).tolist():
         length = stop - start
         if length < round(2 * per_ms):
             continue
-        rows = np.flatnonzero(until == start)
+        rows = np.flatnonzero((until == start) & (stops == stop))
         early = voltage_uv[rows, start : start + max(round(0.5 * per_ms), 1)].mean(axis=1) - rest_uv[rows]
         rows = rows[np.abs(early) > UNSETTLED * noise_uv[rows]]
         if not len(rows):

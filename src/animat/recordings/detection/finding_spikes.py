@@ -25,6 +25,8 @@ NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
 DEAD, NOISY = 0.1, 5.0
 """Of the median channel's noise: a channel below is dead, one above is noisy."""
 
+MUCH_LOST = 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class FoundSpikes:
@@ -72,13 +74,13 @@ def find_spikes(
     stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
     workers = workers or len(os.sched_getaffinity(0))
     noise_uv = _noise_uv(traces, stimulus, settings, workers)
-    sample, channel, saturation = _detect(traces, stimulus, noise_uv, settings, workers, progress)
+    sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, settings, workers, progress)
     order = np.lexsort((channel, sample))
     return FoundSpikes(
         time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
-        findings=tuple(_findings(noise_uv, len(stimulus), saturation, settings)),
+        findings=(*_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturation, settings)),
     )
 
 
@@ -114,7 +116,7 @@ def _noise_uv(
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
             first = median_noise_uv(_filtered(piece.rows(columns), settings, rate_hz)[:, margin:-margin])
-            if len(piece.stimulus):
+            if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
                 first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
@@ -141,8 +143,11 @@ def _detect(
     settings: Detection,
     workers: int,
     progress: Progress,
-) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray]:
-    """Samples and channels of the spikes; and of each stimulus how many channels saturate, and how long in ms."""
+) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray, Int64[np.ndarray, " channels"]]:
+    """Samples and channels of the spikes; of each stimulus how many channels saturate, and how long in ms.
+
+    And the samples of each channel that are lost, as they are no finite numbers.
+    """
     rate_hz = traces.sampling_rate_hz
     margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
@@ -155,36 +160,51 @@ def _detect(
             filtered[cleaned.is_blank] = 0.0
         end = margin + piece.stop - piece.start
         row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
-        saturation = np.column_stack([cleaned.saturated, cleaned.longest_ms])[piece.owned]
+        # Of a pulse before the piece, or near its end, another one counts the channels; how long is seen in either.
+        saturation = np.column_stack([cleaned.saturated * piece.owned, cleaned.longest_ms])
         return sample - margin + piece.start, row + columns.start, saturation
 
-    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         found = [of_block(piece, columns) for columns in blocks(len(noise_uv))]
-        saturation = np.zeros((np.count_nonzero(piece.owned), 2))
+        saturation = np.zeros((len(piece.stimulus), 2))
         for _, _, more in found:
             saturation[:, 0] += more[:, 0]
             saturation[:, 1] = np.maximum(saturation[:, 1], more[:, 1])
-        return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found]), saturation
+        where = piece.first_stimulus, piece.lost
+        return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found]), saturation, *where
 
-    samples, channels, saturations = [], [], []
+    samples, channels = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    saturations, lost = np.zeros((len(stimulus), 2)), np.zeros(len(noise_uv), np.int64)
     starts = deque(range(0, traces.samples, length))
     n, done = len(starts), 0
     with ThreadPoolExecutor(workers) as pool:
         # No more pieces are under way than there are threads: what waits takes memory.
-        running: deque[Future[tuple[np.ndarray, np.ndarray, np.ndarray]]] = deque()
+        running: deque[Future[tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]]] = deque()
         while starts or running:
             while starts and len(running) < workers:
                 running.append(pool.submit(of_piece, starts.popleft()))
-            sample, channel, saturation = running.popleft().result()
+            sample, channel, saturation, first, lost_in_it = running.popleft().result()
             samples.append(sample)
             channels.append(channel)
-            saturations.append(saturation)
+            its = saturations[first : first + len(saturation)]
+            its[:, 0] += saturation[:, 0]
+            its[:, 1] = np.maximum(its[:, 1], saturation[:, 1])
+            lost += lost_in_it
             done += 1
             progress.update(done, n, f"{sum(map(len, samples)):,} spikes")
-    empty = np.empty(0, np.int64)
-    found = np.concatenate([empty, *samples]), np.concatenate([empty, *channels])
-    return *found, np.concatenate([np.zeros((0, 2)), *saturations])
+    return np.concatenate(samples), np.concatenate(channels), saturations, lost
+
+
+def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Finding]:
+    if n := int(lost.sum()):
+        n_channels = np.count_nonzero(lost)
+        share = n / (samples * n_channels)
+        message = (
+            f"{n:,} samples on {n_channels:,} of {len(lost):,} channels ({100 * share:.2g} % of theirs) are no finite "
+            "numbers: nothing is looked for there"
+        )
+        yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
 
 def _findings(
@@ -194,16 +214,18 @@ def _findings(
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
     if dead := int(np.count_nonzero(is_dead(noise_uv))):
+        are, them, count = ("is", "it", "it counts") if dead == 1 else ("are", "them", "they count")
         message = (
-            f"{dead:,} of {n:,} channels are dead (less than {DEAD:g} of the median noise): no spike can be found on "
-            "them, and they count in rates per channel; leave them out of the routing next time"
+            f"{dead:,} of {n:,} channels {are} dead (less than {DEAD:g} of the median noise): no spike can be found on "
+            f"{them}, and {count} in rates per channel; leave {them} out of the routing next time"
         )
         yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
     noisy = int(np.count_nonzero(noise_uv > NOISY * middle)) if middle > 0 else 0
     if noisy:
+        have = "has" if noisy == 1 else "have"
         message = (
-            f"{noisy:,} of {n:,} channels have more than {NOISY:g} times the median noise: only large spikes are found "
-            "on them; look for loose contacts or air bubbles"
+            f"{noisy:,} of {n:,} channels {have} more than {NOISY:g} times the median noise: "
+            "only large spikes are found there; look for loose contacts or air bubbles"
         )
         yield Finding("noisy-channels", "note" if noisy < 0.1 * n else "warning", message, float(noisy))
     if n_stimuli:
@@ -218,7 +240,8 @@ def _findings(
         share = mean / max(n, 1)
         message = (
             f"after a stimulus {mean:.1f} of {n:,} channels are saturated on average, the longest until "
-            f"{longest:.1f} ms; they are blanked until then"
+            f"{longest:.1f} ms (median of {np.count_nonzero(saturation[:, 0]):,} stimuli; at most "
+            f"{saturation[:, 1].max():.1f} ms); they are blanked until then"
         )
         is_much = share >= 0.05 and longest > 2
         message += ": rates in an earlier window are too low, use one that begins later" if is_much else ""

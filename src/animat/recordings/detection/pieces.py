@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from animat.recordings.detection.artefacts import Cleaned, without_artefacts
 from animat.recordings.detection.settings import Detection
 from animat.recordings.raw import RawTraces
+
+FOLLOWED_S, REST_S = 1.0, 0.005
+"""How far before a piece the last pulse may be, to know whether an amplifier is saturated since; and where the trace
+was before it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,52 +23,100 @@ class Piece:
     Attributes:
         start, stop: samples of the recording.
         margin: more on both sides; beyond the recording's ends, its last samples are repeated.
-        voltage_uv: shape (samples + 2 margin, channels).
+        lead: samples before the first margin, from before the last pulse on; they are there to be cleaned only.
+        voltage_uv: finite, shape (lead + samples + 2 margin, channels).
+        is_lost: where it was not, and is a straight line, of the same shape; None where it always was.
         stimulus: samples of the pulses in it, counted from the first row of `voltage_uv`.
+        first_stimulus: which of all pulses the first of these is.
     """
 
     start: int
     stop: int
     margin: int
+    lead: int
     voltage_uv: Float32[np.ndarray, "samples channels"]
+    is_lost: Bool[np.ndarray, "samples channels"] | None
     stimulus: Int64[np.ndarray, " stimuli"]
+    first_stimulus: int
 
     @property
     def owned(self) -> np.ndarray:
         """Which of its stimuli lie between `start` and `stop`, and not in a margin."""
-        at = self.stimulus - self.margin
+        at = self.stimulus - self.lead - self.margin
         return np.asarray((at >= 0) & (at < self.stop - self.start))
 
     def cleaned(
         self, columns: slice, noise_uv: Float32[np.ndarray, " channels"], rate_hz: float, settings: Detection
     ) -> Cleaned:
-        """Some of its channels without artefacts, one a row; `noise_uv` is of these."""
-        rows = self.rows(columns)
-        if len(self.stimulus):
-            # What removes artefacts changes what it is given.
-            rows = rows.copy()
-        return without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings)
+        """Some of its channels without artefacts, one a row, and without the lead; `noise_uv` is of these.
+
+        Lost samples are blank in it.
+        """
+        rows = np.array(self.voltage_uv[:, columns].T, order="C")
+        cleaned = without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings)
+        is_blank = cleaned.is_blank
+        if self.is_lost is not None:
+            lost = self.is_lost[:, columns].T
+            is_blank = lost if is_blank is None else is_blank | lost
+        return replace(
+            cleaned,
+            voltage_uv=np.ascontiguousarray(cleaned.voltage_uv[:, self.lead :]),
+            is_blank=None if is_blank is None else is_blank[:, self.lead :],
+        )
 
     def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
-        """Some of its channels as they were recorded, one a row; not to be changed."""
-        return np.ascontiguousarray(self.voltage_uv[:, columns].T)
+        """Some of its channels as they were recorded, one a row and without the lead; not to be changed."""
+        return np.ascontiguousarray(self.voltage_uv[self.lead :, columns].T)
+
+    @property
+    def lost(self) -> Int64[np.ndarray, " channels"]:
+        """How many samples of each channel between `start` and `stop` are no finite numbers."""
+        first = self.lead + self.margin
+        inside = slice(first, first + self.stop - self.start)
+        n_channels = self.voltage_uv.shape[1]
+        return (
+            np.zeros(n_channels, np.int64) if self.is_lost is None else np.count_nonzero(self.is_lost[inside], axis=0)
+        )
 
 
 def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start: int, stop: int, margin: int) -> Piece:
-    """Read a piece.
+    """Read a piece, with a lead where a pulse came in the second before.
 
     Args:
         stimulus: sample of every pulse of the recording, rising.
         start, stop: samples of the recording.
         margin: samples more on both sides.
     """
-    first, last = max(start - margin, 0), min(stop + margin, traces.samples)
+    begin = start - margin
+    followed, rest = (round(seconds * traces.sampling_rate_hz) for seconds in (FOLLOWED_S, REST_S))
+    first_stimulus, last_stimulus = np.searchsorted(stimulus, [begin + rest, stop + margin]).tolist()
+    if first_stimulus and stimulus[first_stimulus - 1] > begin - followed:
+        first_stimulus -= 1
+        begin = min(max(int(stimulus[first_stimulus]) - rest, 0), begin)
+    first, last = max(begin, 0), min(stop + margin, traces.samples)
     voltage_uv = traces.read_uv(first, last)
-    missing = (first - (start - margin), stop + margin - last)
+    is_lost = None
+    if not np.isfinite(voltage_uv).all():
+        is_lost = ~np.isfinite(voltage_uv)
+        voltage_uv = _finite(voltage_uv, is_lost)
+    missing = (first - begin, stop + margin - last)
     if any(missing):
         voltage_uv = np.pad(voltage_uv, (missing, (0, 0)), mode="edge")
-    inside = stimulus[np.searchsorted(stimulus, start - margin) : np.searchsorted(stimulus, stop + margin)]
-    return Piece(start, stop, margin, voltage_uv, inside - (start - margin))
+        is_lost = None if is_lost is None else np.pad(is_lost, (missing, (0, 0)))
+    inside = stimulus[first_stimulus:last_stimulus] - begin
+    return Piece(start, stop, margin, start - margin - begin, voltage_uv, is_lost, inside, first_stimulus)
+
+
+def _finite(
+    voltage_uv: Float32[np.ndarray, "samples channels"], is_lost: Bool[np.ndarray, "samples channels"]
+) -> Float32[np.ndarray, "samples channels"]:
+    """The voltage with a straight line over what is not finite; 0 on a channel that never is."""
+    voltage_uv = voltage_uv.copy(order="K")
+    at = np.arange(len(voltage_uv))
+    for column in np.flatnonzero(is_lost.any(axis=0)).tolist():
+        lost = is_lost[:, column]
+        voltage_uv[lost, column] = 0.0 if lost.all() else np.interp(at[lost], at[~lost], voltage_uv[~lost, column])
+    return voltage_uv
 
 
 def stimulus_samples(

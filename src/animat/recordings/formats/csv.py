@@ -64,6 +64,8 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
     stimuli = stimuli_beside(path) if stimuli_path is None else Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
     columns, findings = _columns(read_text_table(path), SPIKE_COLUMNS)
+    if not len(columns["spike_time_s"]):
+        raise InvalidFile(f"{path}: expected a line a spike, got a header without any: there are no spikes in it")
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
@@ -119,6 +121,12 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
                 f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {found_names}"
                 f"{_advice(table, name) or nearest(table, (*names, *others))}"
             )
+    heads = [head for head in table.header if folded(head) in known.get("spike_channel", ())]
+    if len(heads) > 1:
+        raise InvalidFile(
+            f"{table.path}, line 1: expected one column of {' or '.join(known['spike_channel'])}, got "
+            f"{' and '.join(heads)}: take one out (each unit is a channel)"
+        )
     columns = {name: plain_column(table, i, name) for name, i in place.items()}
     left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
     if left_out:

@@ -265,4 +265,5 @@ def choose(
         raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
     if len(there) == 1:
         return there[0]
-    raise InvalidFile(f"{what}: expected one, found {len(there)}: {listed}; choose with {option} NAME")
+    raise InvalidFile(f"{what}: expected one, found {len(there)}: {listed}; choose with {option} NAME, which "
+                      "animat inspect and animat convert have: convert it for other commands")  # fmt: skip

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from animat.errors import InvalidFile, UnusableData
-from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.columns import Column, PlainColumns, out_of_order, unsorted
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import SUBJECT
@@ -97,9 +97,13 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     labels = np.arange(n).astype(np.str_) if names is None else file.read(names).reshape(-1).astype(np.str_)
     if len(labels) != n or len(np.unique(labels)) != n:
         labels = np.arange(n).astype(np.str_)
+    # Units stand one after another; only what is out of order within one is.
+    if early := sum(map(out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
+        findings.append(unsorted("spikes", early, len(time_s)))
+    order = np.argsort(time_s, kind="stable")
     columns: dict[str, Any] = {
-        "spike_time_s": time_s,
-        "spike_channel": np.repeat(labels, counts),
+        "spike_time_s": time_s[order],
+        "spike_channel": np.repeat(labels, counts)[order],
         "channel_label": labels,
     }
     row = _electrode_of_unit(file, n)

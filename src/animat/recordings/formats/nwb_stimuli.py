@@ -15,12 +15,13 @@ only under names that speak of stimuli, pulses or triggers. A name that the user
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import h5py
 import numpy as np
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File, choose
@@ -35,6 +36,7 @@ COLUMNS = {
     "stimulus_presentation": ("presentation",),
 }
 ELECTRODES = ("electrode_ids", "electrode_id", "electrodes", "electrode")
+MOST_ELECTRODES = 50_000_000
 APART_S = 0.001
 _BLOCK = 2**20
 
@@ -50,7 +52,7 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     Raises:
         InvalidFile: if several places could be meant and none is named, or the named one is not there.
     """
-    at = _place(file, asked)
+    at = _place(file, asked, findings)
     if at is None:
         return {"stimulus_time_s": np.empty(0)}
     columns = _of_intervals(file, at) if file.has(f"{at}/start_time") else {"stimulus_time_s": _of_series(file, at)}
@@ -59,7 +61,7 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     return columns
 
 
-def _place(file: Hdf5File, asked: str | None) -> str | None:
+def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | None:
     first = [f"{FIRST}/{name}" for name in file.names(FIRST)]
     elsewhere = [f"{room}/{name}" for room in ELSEWHERE for name in file.names(room)]
     elsewhere += [f"processing/{m}/{name}" for m in file.names("processing") for name in file.names(f"processing/{m}")]
@@ -71,6 +73,12 @@ def _place(file: Hdf5File, asked: str | None) -> str | None:
             choose(f"{file.path}: stimuli", "--stimuli", every or ["none (nothing in the file can be stimuli)"], asked)
         return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
     candidates = first or [at for at in elsewhere if SPEAKS_OF_STIMULI.search(at.rpartition("/")[2])]
+    if not candidates and elsewhere:
+        message = (
+            f"no stimulus: nothing in the file speaks of stimuli; if one of {some_of(elsewhere)} holds them, choose it "
+            "with --stimuli NAME (animat inspect, animat convert), else bring the stimulus times too"
+        )
+        findings.append(Finding("no-stimuli", "refuse", message))
     return choose(f"{file.path}: stimuli", "--stimuli", candidates, None) if candidates else None
 
 
@@ -92,22 +100,41 @@ def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
                     columns[column] = values
                     break
     for name in ELECTRODES:
-        node = file.node(f"{at}/{name}")
-        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iu":
-            continue
-        values = file.read(f"{at}/{name}").astype(np.int64)
-        if file.has(f"{at}/{name}_index"):
-            ends = file.read(f"{at}/{name}_index").astype(np.int64).reshape(-1).tolist()
-            if len(ends) == len(time_s) and all(a <= b for a, b in zip([0, *ends], ends, strict=False)):
-                flat = values.reshape(-1).tolist()
-                columns["stimulus_electrodes"] = padded([flat[a:b] for a, b in zip([0, *ends], ends, strict=False)])
-        elif values.shape[:1] == time_s.shape and values.ndim <= 2:
-            columns["stimulus_electrodes"] = values
-        break
+        is_there = isinstance(file.node(f"{at}/{name}"), h5py.Dataset)
+        if is_there and (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
+            columns["stimulus_electrodes"] = electrodes
+            break
     if "stimulus_frequency_hz" in columns:
         frequency = columns["stimulus_frequency_hz"].astype(np.float64)
         columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
     return columns
+
+
+def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
+    """The electrodes of each of n rows, as whole numbers or in words ("7 9"); None where they are none of these."""
+    dataset = file.dataset(at)
+    if dataset.dtype.kind in "SO" and dataset.shape == (n,):
+        return _in_words([str(words) for words in file.read(at).tolist()])
+    if dataset.dtype.kind not in "iu":
+        return None
+    values = file.read(at).astype(np.int64)
+    if file.has(f"{at}_index"):
+        ends = file.read(f"{at}_index").astype(np.int64).reshape(-1).tolist()
+        if len(ends) != n or any(a > b for a, b in zip([0, *ends], ends, strict=False)):
+            return None
+        flat = values.reshape(-1).tolist()
+        return padded([flat[a:b] for a, b in zip([0, *ends], ends, strict=False)])
+    return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
+
+
+def _in_words(cells: Sequence[str]) -> Column | None:
+    """Numbers of electrodes separated by blanks or commas, padded; None where a cell holds anything else."""
+    try:
+        lists = [[int(word) for word in cell.replace(",", " ").split()] for cell in cells]
+    except (ValueError, OverflowError):
+        return None
+    too_many = max(map(len, lists), default=0) * len(lists) > MOST_ELECTRODES
+    return None if too_many or any(abs(e) >= 2**53 for some in lists for e in some) else padded(lists)
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:

@@ -55,6 +55,9 @@ def is_response_csv(path: Path) -> bool:
     if names & SPIKE_COLUMNS.keys() or path.name.lower().endswith(("_spikes.csv", "_spikes.csv.gz")):
         return False
     long = "channel" in names and bool(names & set(KINDS))
+    if path.name.lower().endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
+        # Whatever it lacks, it is meant for one.
+        return True
     return long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
 
 

@@ -155,8 +155,9 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
         while len(row) > len(header) and not row[-1].strip():
             row.pop()
         if len(row) != len(header):
+            fields = f"{len(header)} field{'' if len(header) == 1 else 's'}"
             raise InvalidFile(
-                f"{path}, line {line}: expected {len(header)} fields, as in the header, got {len(row)}: "
+                f"{path}, line {line}: expected {fields}, as in the header, got {len(row)}: "
                 + (_advice(row, separator) if len(row) > len(header) else "is a field missing, or the file cut off?")
             )
     return TextTable(path, header, rows, lines)

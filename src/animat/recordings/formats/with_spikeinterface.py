@@ -23,9 +23,11 @@ from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 
-MISSING = "expected the package SpikeInterface, which is not installed: pip install 'spikeinterface>=0.104'"
-REFUSED = ("binary_folder", "zarr", "python", "npz_folder", "npz_sorting")
-"""Readers of SpikeInterface's own saved objects."""
+MISSING = (
+    "expected the package SpikeInterface, which is not installed: .venv/bin/pip install -c constraints.txt '.[raw]'"
+)
+REFUSED = ("binary",)
+"""A reader of traces that wants to be told more than their file."""
 
 
 def open_with_spikeinterface(
@@ -93,8 +95,10 @@ def _reader(name: str) -> Callable[..., Any]:
         extractors = importlib.import_module("spikeinterface.extractors")
     except ImportError as error:
         raise InvalidArgument(f"reader: {MISSING}") from error
-    found = getattr(extractors, f"read_{name}", None) if name.isidentifier() and name not in REFUSED else None
-    if not callable(found):
-        names = sorted(n[5:] for n in dir(extractors) if n.startswith("read_") and n[5:] not in REFUSED)
-        raise InvalidArgument(f"reader: expected one of {', '.join(names[:60])}; got {name!r}")
-    return found  # type: ignore[no-any-return]
+    # Not those of sortings and events, nor of SpikeInterface's own saved objects.
+    of_traces = list(extractors.recording_extractor_full_dict.values())
+    readers = {n[5:]: getattr(extractors, n) for n in dir(extractors) if n.startswith("read_")}
+    readers = {n: read for n, read in readers.items() if read in of_traces and n not in REFUSED}
+    if name not in readers:
+        raise InvalidArgument(f"reader: expected one of {', '.join(sorted(readers))}; got {name!r}")
+    return readers[name]  # type: ignore[no-any-return]

@@ -25,6 +25,7 @@ from animat.responses.psth import (
 )
 from animat.responses.quality.drift import drift_findings
 from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.resolution import resolution_findings
 from animat.responses.quality.timing import artefact_findings
 from animat.responses.readouts import CUT_NAMES
 from animat.responses.responses import Responses
@@ -78,6 +79,7 @@ def findings_on(
         outside = any(finding.name in ("dead-window", "response-elsewhere") for finding in found)
         is_elsewhere = outside and response is not None
         found += artefact_findings(source, responses.window_ms, is_elsewhere=is_elsewhere)
+        found += resolution_findings(source, responses.window_ms)
     return (
         *_left_out(source.stimuli, assignment, str(responses.by), inside),
         *found,

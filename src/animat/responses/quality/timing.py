@@ -138,7 +138,7 @@ def _artefact_finding(
     )
     message = (
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
-        f"{count.max() / usual:.0f} times as many as is usual in as much time: an artefact counted "
+        f"{spikes / (usual * len(count)):.3g} times as many as is usual in as much time: an artefact counted "
         f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
         f"({100 * spikes / max(n_spikes, 1):.1f} % of all); {remedy}"
     )
