@@ -39,7 +39,7 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
 from animat.environment import Animat
-from animat.errors import BudgetSpent, InvalidArgument, UnusableData
+from animat.errors import BudgetSpent, InvalidArgument, UnsafeStimulus, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.statistics import Interval
 from animat.neurons.adjusted_rank import AdjustedRanks
@@ -51,7 +51,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL
 from animat.robots import Cartpole, Navigation, Robot
 from animat.stimulation.protocol import Presentation, Protocol
-from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from fake_culture import CHANNELS, FakeCulture
@@ -564,6 +564,10 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
         with pytest.raises(InvalidArgument, match="episodes"):
             run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=0)
+        strong = Pulse((Phase(200, amplitude_mv=-2000), Phase(200, amplitude_mv=2000)))
+        with pytest.raises(UnsafeStimulus, match="amplitude: expected -400 to 400 mV, got -2000"):
+            run_session(culture, loop_of(pulse=strong), [RANDOM], tmp_path)
+        assert not list(tmp_path.iterdir())
         run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
         before = (tmp_path / "session.log").read_bytes()
         with pytest.raises(InvalidArgument, match="a session is there already"):

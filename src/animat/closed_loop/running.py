@@ -31,6 +31,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.observed import more_left_out
+from animat.cultures.safety import Guard
 from animat.errors import AnimatError, InvalidArgument, Mismatch, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
@@ -89,6 +90,7 @@ def run_session(
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read, or a folder of other work.
         InvalidFile: if a file is in the folder's place, or the log cannot be begun.
+        UnsafeStimulus: for a pulse that the culture may not be given.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
     check_session(culture, loop, agents, planned, seed)
@@ -362,6 +364,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
             "got none"
         )
     loop.readouts.members(culture.channels)
+    Guard(culture.limits, ()).check_pulse(loop.pulse)
     if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(
             f"conditions: expected electrodes that the {culture.name} culture can stimulate "

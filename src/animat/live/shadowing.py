@@ -124,6 +124,8 @@ def live(
     """
     timetable = timetable or Timetable()
     check_plan(training, protocol, Path(folder), timetable, episodes, settings)
+    if report is not None:
+        report(f"each pulse: {protocol.pulse}")
     run = _Run(training, culture, protocol, Path(folder), timetable, kind, account or Account(), progress)
     try:
         policies = run.shadow()
