@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -60,12 +61,13 @@ def write_whole(path: Path, content: str | bytes) -> Path:
     return path
 
 
-def expect_writable(folder: str | os.PathLike[str], option: str = "--out") -> None:
+def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_bytes: float = 0) -> None:
     """Refuse a folder that could not be written to, or not be made, before any work; nothing is left of the trial.
 
     Args:
         folder: it may be missing.
         option: of the command line, by which another can be chosen.
+        room_bytes: that must be free.
 
     Raises:
         InvalidFile: naming the folder, and what stands in its way.
@@ -76,10 +78,15 @@ def expect_writable(folder: str | os.PathLike[str], option: str = "--out") -> No
             there = there.parent
         # Asking for permissions would not tell a full disk or a file system that is read only.
         with tempfile.TemporaryFile(dir=there):
-            pass
+            free = shutil.disk_usage(there).free
     except OSError as error:
         what = f"{there} is no folder" if there.is_file() else (error.strerror or str(error))
         raise InvalidFile(f"{folder}: cannot be written: {what}; choose another {option}") from error
+    if free < room_bytes:
+        raise InvalidFile(
+            f"{folder}: expected {room_bytes / 1e6:.2f} MB free for what is to be written, got {free / 1e6:.2f} MB: "
+            f"make room, or choose another {option}"
+        )
 
 
 @contextmanager
