@@ -531,6 +531,11 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"percentiles": [1, 2]}, "11 rising"),
         ({"percentiles": PERCENTILES[::-1]}, "11 rising"),
         ({"pulses": 0}, "pulses: expected at least 1"),
+        # A quarter of an hour at the slowest of 5 to 80 Hz.
+        (
+            {"pulses": 5001},
+            r"pulses: expected trials of 1000 s at most, got 5001 .* at 5 Hz are 1,000 s: ask for fewer",
+        ),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),
         ({"conditions": (Condition("electrode 5", 0.0),)}, "state the frequency of its pulses"),
@@ -548,6 +553,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) -> None:
+    assert loop_of(pulses=5000).pulses == 5000
     with pytest.raises((InvalidArgument, UnusableData), match=words):
         loop_of(**wrong)
 

@@ -182,8 +182,8 @@ def test_a_rehearsal_of_currents_is_given_voltages(
 @pytest.mark.parametrize(
     ("pulses", "file", "words"),
     [
-        ((WEAK, BALANCED_PULSE), None, f"got {WEAK} (at 0.00 min) and {BALANCED_PULSE} (at 1.00 min): give those"),
-        ((WEAK, None), BALANCED_PULSE, f"got {WEAK} (at 0.00 min) and {BALANCED_PULSE} ("),
+        ((WEAK, BALANCED_PULSE), None, f"got {WEAK} (at 0 min) and {BALANCED_PULSE} (at 1 min): give those"),
+        ((WEAK, None), BALANCED_PULSE, f"got {WEAK} (at 0 min) and {BALANCED_PULSE} ("),
     ],
 )
 def test_recordings_of_several_pulses_are_refused_before_a_culture_is_made(

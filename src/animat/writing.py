@@ -13,6 +13,7 @@ from pathlib import Path
 
 from animat.errors import InvalidFile, Mismatch
 
+UNCHANGED = "; what stood there before is unchanged"
 LOCK = ".lock"
 """A file that is locked where a folder cannot be."""
 
@@ -46,9 +47,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         keep_name(path.parent)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise InvalidFile(
-            f"{path}: cannot be written: {error.strerror or error}; what stood there before is unchanged"
-        ) from error
+        raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}{UNCHANGED}") from error
     except BaseException:
         beside.unlink(missing_ok=True)
         raise

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from animat.cli.responses import fit_as, policies_for
 from animat.cli.stimulating import Stimulating, expect_no_fault
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, Mismatch, in_min
 from animat.plain_file import expect_no_file
 from animat.writing import exclusive_lock
 
@@ -179,7 +179,7 @@ class Run(Stimulating):
 
         usual = replace(CLOSED_LOOP, pulse=pulse_for(self.culture))
         given = None if self.protocol is None else read_protocol(self.protocol, usual)
-        told = {f"at {each.start_min:.2f} min": each.protocol for each in recordings}
+        told = {f"at {in_min(each.start_min)}": each.protocol for each in recordings}
         told |= {str(self.protocol): given}
         pulses = {protocol.pulse: where for where, protocol in told.items() if protocol is not None}
         if len(pulses) > 1:
@@ -196,7 +196,7 @@ class Run(Stimulating):
             return replace(protocol, pulse=usual.pulse), ()
         taken = next(iter(pulses), usual.pulse)
         message = (
-            f"the recording at {calibrating.start_min:.2f} min, which calibrates the loop, does not tell its pulse: "
+            f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not tell its pulse: "
             f"the loop delivers {taken}, {'as the others had' if pulses else f'the usual one on a {self.culture}'}; "
             "another is given by --protocol"
         )
