@@ -195,6 +195,27 @@ def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) ->
         neurons.fail = None
 
 
+@pytest.mark.parametrize("is_simulator", [True, False])
+def test_a_simulator_that_did_not_keep_up_is_told_with_what_helps(
+    is_simulator: bool, neurons: Neurons, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(*_: object) -> None:
+        raise TimeoutError("Timeout waiting for timestamp 5000")
+
+    helps = "the simulator did not keep up: run without CL_SDK_ACCELERATED_TIME, or with nothing else running"
+    monkeypatch.setattr(sys.modules["cl"], "is_simulator", lambda: is_simulator)
+    with CL1Culture() as culture:
+        neurons.fail = TimeoutError("Timeout waiting for timestamp 5000")
+        with pytest.raises(DeviceFailed, match="waiting for timestamp 5000: what had not begun") as failed:
+            culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.1)
+        assert (helps in str(failed.value)) == is_simulator
+        neurons.fail = None
+        monkeypatch.setattr(neurons, "read", late)
+        with pytest.raises(DeviceFailed, match=r"expected to rest 0\.5 s, got TimeoutError: Timeout waiting") as failed:
+            culture.rest(0.5)
+        assert (helps in str(failed.value)) == is_simulator
+
+
 def test_what_could_not_be_interrupted_is_told(neurons: Neurons, monkeypatch: pytest.MonkeyPatch) -> None:
     with CL1Culture() as culture:
         with monkeypatch.context() as patch:
