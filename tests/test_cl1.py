@@ -16,7 +16,9 @@ import pytest
 from animat.cultures.base import Culture
 from animat.cultures.contract import CultureContract
 from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, SITES, CL1Culture
+from animat.cultures.replay import ReplayCulture
 from animat.cultures.same_culture import other_culture
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import said
 from animat.stimulation.protocol import Protocol
@@ -62,14 +64,41 @@ def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     with CL1Culture() as culture:
         culture.rest(60.0)
         recording = culture.record(Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1), seed=1)
-        assert other_culture(recording, recording.start_min, culture) is None
+        assert other_culture(recording, culture) is None
     install(monkeypatch)
     with CL1Culture() as culture:
         culture.rest(62.0)
-        found = other_culture(recording, recording.start_min, culture)
+        found = other_culture(recording, culture)
     assert recording.duration_s > 5
     assert found is not None and found.name == "other-culture"
     assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.message
+
+
+def test_another_chip_rig_or_kind_of_culture_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with CL1Culture() as culture:
+        recording = culture.record(Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1), seed=1)
+    names = {"system_id": "stand-in", "chip_id": "none", "cell_batch_id": "7"}
+
+    def told(**words: str) -> str | None:
+        monkeypatch.setattr(sys.modules["cl"], "get_system_attributes", lambda: names)
+        with CL1Culture() as culture:
+            found = other_culture(replace(recording, provenance={**recording.provenance, **words}), culture)
+        return None if found is None else found.message
+
+    assert told() is told(cell_batch_id="7") is None
+    assert told(chip_id="A3") == (
+        "the recordings are of chip_id A3, and this is chip_id none: another culture has other percentiles"
+    )
+    assert "system_id rig 2, and this is system_id stand-in" in str(told(system_id="rig 2"))
+    assert "cell_batch_id 6, and this is cell_batch_id 7" in str(told(cell_batch_id="6"))
+    assert "of a MaxOne, and this is a CL1 (" in str(told(source="MaxOne by animat.cultures.maxone"))
+    virtual = VirtualCulture(1).settings
+    assert "of a virtual culture, and this is a CL1 (" in str(told(source=virtual["source"]))
+    # A converted file says nothing of where it comes from; and a replay answers from whatever was recorded.
+    assert told(source="rig.h5") is None
+    foreign = replace(recording, provenance={**recording.provenance, "chip_id": "A3"})
+    with ReplayCulture([foreign]) as replayed:
+        assert other_culture(recording, replayed) is None
 
 
 def pulse(*numbers: float) -> Pulse:
@@ -164,6 +193,27 @@ def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) ->
         assert "\n" not in str(failed.value)
         assert neurons.interrupted > before
         neurons.fail = None
+
+
+@pytest.mark.parametrize("is_simulator", [True, False])
+def test_a_simulator_that_did_not_keep_up_is_told_with_what_helps(
+    is_simulator: bool, neurons: Neurons, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(*_: object) -> None:
+        raise TimeoutError("Timeout waiting for timestamp 5000")
+
+    helps = "the simulator did not keep up: run without CL_SDK_ACCELERATED_TIME, or with nothing else running"
+    monkeypatch.setattr(sys.modules["cl"], "is_simulator", lambda: is_simulator)
+    with CL1Culture() as culture:
+        neurons.fail = TimeoutError("Timeout waiting for timestamp 5000")
+        with pytest.raises(DeviceFailed, match="waiting for timestamp 5000: what had not begun") as failed:
+            culture.deliver([Stimulus(0.0, (1,), CL1_PULSE)], 0.1)
+        assert (helps in str(failed.value)) == is_simulator
+        neurons.fail = None
+        monkeypatch.setattr(neurons, "read", late)
+        with pytest.raises(DeviceFailed, match=r"expected to rest 0\.5 s, got TimeoutError: Timeout waiting") as failed:
+            culture.rest(0.5)
+        assert (helps in str(failed.value)) == is_simulator
 
 
 def test_what_could_not_be_interrupted_is_told(neurons: Neurons, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,7 +39,7 @@ from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
 from animat.environment import Animat
-from animat.errors import BudgetSpent, InvalidArgument, UnusableData
+from animat.errors import BudgetSpent, InvalidArgument, UnsafeStimulus, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.statistics import Interval
 from animat.neurons.adjusted_rank import AdjustedRanks
@@ -51,7 +51,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL
 from animat.robots import Cartpole, Navigation, Robot
 from animat.stimulation.protocol import Presentation, Protocol
-from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.stimulus import Stimulus
 from cultures import small_culture
 from fake_culture import CHANNELS, FakeCulture
@@ -531,6 +531,11 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
         ({"percentiles": [1, 2]}, "11 rising"),
         ({"percentiles": PERCENTILES[::-1]}, "11 rising"),
         ({"pulses": 0}, "pulses: expected at least 1"),
+        # A quarter of an hour at the slowest of 5 to 80 Hz.
+        (
+            {"pulses": 5001},
+            r"pulses: expected trials of 1000 s at most, got 5001 .* at 5 Hz are 1,000 s: ask for fewer",
+        ),
         ({"window_ms": (10.0, 2.0)}, "start < end"),
         ({"conditions": ()}, "at least one"),
         ({"conditions": (Condition("electrode 5", 0.0),)}, "state the frequency of its pulses"),
@@ -548,6 +553,7 @@ def test_a_loop_presents_as_the_policy_was_recorded_and_names_where_it_does_not(
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any], words: str) -> None:
+    assert loop_of(pulses=5000).pulses == 5000
     with pytest.raises((InvalidArgument, UnusableData), match=words):
         loop_of(**wrong)
 
@@ -564,6 +570,10 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)
         with pytest.raises(InvalidArgument, match="episodes"):
             run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=0)
+        strong = Pulse((Phase(200, amplitude_mv=-2000), Phase(200, amplitude_mv=2000)))
+        with pytest.raises(UnsafeStimulus, match="amplitude: expected -400 to 400 mV, got -2000"):
+            run_session(culture, loop_of(pulse=strong), [RANDOM], tmp_path)
+        assert not list(tmp_path.iterdir())
         run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
         before = (tmp_path / "session.log").read_bytes()
         with pytest.raises(InvalidArgument, match="a session is there already"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -596,6 +597,11 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert_safe(session, culture, 20)
     assert session.log.lost_bytes == 0
     assert "could not be written" in session.ending.message
+    assert re.fullmatch(
+        r"the log cannot be written: No space left on device; "
+        r"(how it ended could .* is|the last tick could .* is|the last \d+ ticks could not be written and are) lost",
+        session.ending.message,
+    )
     with pytest.raises(InvalidFile, match="No space left"):
         LogWriter(tmp_path / "other.log", {})
 
@@ -609,6 +615,10 @@ def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> Non
     assert session.ending.by == "plan"
     assert "session.nwb: cannot be written" in session.ending.message
     assert "animat recover" in session.ending.message
+    assert session.ending.message == (
+        f"all 5 episodes were run; {tmp_path}/session.nwb: cannot be written: Is a directory "
+        f"(animat recover {tmp_path} writes the files, once that is mended)"
+    )
     (tmp_path / "session.nwb" / "in the way").unlink()
     (tmp_path / "session.nwb").rmdir()
     assert list(recover_session(tmp_path).ticks) == list(session.ticks)

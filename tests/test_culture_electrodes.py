@@ -319,6 +319,10 @@ def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:
 def test_settings_that_cannot_be_are_refused() -> None:
     with pytest.raises(InvalidArgument, match="seed: expected 0 or more, got -1"):
         VirtualCulture(-1)
+    for seed, got in ((1.5, "1.5"), ("a", "str"), (None, "None"), (True, "True")):
+        with pytest.raises(InvalidArgument, match=f"seed: expected a whole number, got {got}"):
+            VirtualCulture(seed)  # type: ignore[arg-type]
+    assert VirtualCulture(np.int64(3)).settings == VirtualCulture(3).settings  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="scan_s: expected above 0"):
         VirtualCulture(1, scan_s=0.0)
     with pytest.raises(InvalidArgument, match="expected one that was opened"):

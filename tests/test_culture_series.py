@@ -250,7 +250,7 @@ def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
     with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
         small_culture().restore_state(tmp_path / STATE_FILE)
     with small_culture() as culture:
-        found = other_culture(read_recording(file), 0.0, culture)
+        found = other_culture(read_recording(file), culture)
     assert found is not None
     assert "of virtual culture 1 with another tissue_revision, and this is virtual culture 1" in found.message
     file.unlink()

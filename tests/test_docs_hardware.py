@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import stand_in_maxlab
+from animat.cli import main
 from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
@@ -39,6 +40,21 @@ def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(recording.stimuli) == 500
     assert recording.presentation is not None
     assert recording.presentation.pulses == 5
+
+
+def test_the_first_commands_on_a_device_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    steps = PAGE.split("## Before the first pulse")[1].split("## Limits")[0]
+    commands = re.findall(r"`animat (record [^`]*cl1[^`]*)`", steps)
+    for command, file in zip(commands, re.findall(r"`(\{.*?\})`", steps), strict=False):
+        words = command.split()
+        Path(words[words.index("--protocol") + 1]).write_text(file)
+        assert main(words) == 0
+    none, few = (read_recording(tmp_path / "first" / each / "recording_0000_min.nwb") for each in ("none", "few"))
+    assert none.stimuli.is_rest.all()
+    assert len(few.stimuli) == 80
+    assert set(few.stimuli.frequency_hz.tolist()) == {5, 10, 20, 40}
 
 
 def test_the_example_of_a_selection_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

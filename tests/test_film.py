@@ -90,6 +90,16 @@ def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path, pause_s
     assert scene.start_s == pytest.approx(moved_s + 0.01 - 5) and scene.start_s > 5
     assert scene.moments[0].iteration == -1 and scene.moments[-1].iteration == 5
     assert scene_of_session(tmp_path, (0.0, 58.0 + pause_s)).start_s == 0.0
+    # Also where nothing moves yet, and of a session that was killed in its settling.
+    records = read_session(tmp_path).log.records
+    first = next(number for number, record in enumerate(records) if record.words.get("tick"))
+    log = (tmp_path / LOG_FILE).read_bytes()
+    (tmp_path / LOG_FILE).write_bytes(log[: records._places[first + 1]])
+    for span_s in ((0.5, 1.5), (1.0, pause_s)):
+        scene = scene_of_session(tmp_path, span_s)
+        assert (scene.start_s, scene.stop_s) == span_s
+        assert scene.moments[0].iteration == -1
+        assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0.5, 1) == 0
 
 
 def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:

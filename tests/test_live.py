@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +26,7 @@ from animat.errors import (
     BudgetSpent,
     DeviceFailed,
     InvalidArgument,
+    InvalidFile,
     Mismatch,
     UnsafeStimulus,
     UnusableData,
@@ -210,6 +212,32 @@ def test_where_the_budget_ends_recording_stops_and_training_goes_on(tmp_path: Pa
         live(ONE, culture, PROTOCOL, tmp_path / "none", account=Account(Budget(pulses=10)))
 
 
+@pytest.mark.parametrize(
+    ("budget", "words"),
+    [
+        (Budget(pulses=PULSES - 1), rf"0 of {PULSES - 1} pulses are spent, and {PULSES} more were wanted by the first"),
+        # Eight patterns of two of the eight electrodes, each as often.
+        (Budget(pulses_per_electrode=PULSES // 4 - 1), "per_electrode: electrode 10. had 0 of 99 .* by the first"),
+    ],
+)
+def test_a_budget_without_room_for_the_first_recording_leaves_nothing(
+    budget: Budget, words: str, tmp_path: Path
+) -> None:
+    with FakeCulture() as culture, pytest.raises(BudgetSpent, match=words):
+        live(ONE, culture, PROTOCOL, tmp_path / "live", account=Account(budget))
+    assert culture.pulses == 0
+    assert not (tmp_path / "live").exists()
+
+
+def test_without_room_on_the_disk_nothing_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("animat.writing.shutil.disk_usage", lambda _: usage._replace(free=1000))
+    with FakeCulture() as culture, pytest.raises(InvalidFile, match=r"MB free for .*, got 0\.00 MB"):
+        live(ONE, culture, PROTOCOL, tmp_path / "live")
+    assert culture.pulses == 0
+    assert not (tmp_path / "live" / ".exchange").exists()
+
+
 def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path) -> None:
     account = Account(Budget())
     blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
@@ -314,6 +342,7 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
         assert culture.is_stopped
         assert culture.after_halt == 0
     assert list(load_policies(tmp_path / "live" / "policies")) == ["p0"]
+    assert not (tmp_path / "live" / ".exchange").exists()
     assert len(read_recordings([tmp_path / "live" / "recordings"])) >= 2
     told = lines(tmp_path / "live")
     assert [line["what"] for line in told[-2:]] == ["interrupted", "end"]
@@ -475,6 +504,11 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--patience-s", "nan"], "--patience-s: expected"),
         (["--pause-s", "-1"], "--pause-s: expected"),
         (["--budget-pulses", "-1"], "--budget-pulses: expected"),
+        (
+            ["--budget-pulses", "2499"],
+            "--budget-pulses: 0 of 2499 pulses are spent, and 2500 more were wanted by the first recording: ask for "
+            "fewer trials, or give a larger budget",
+        ),
         (["--budget-per-electrode", "-1"], "--budget-per-electrode: expected"),
         (["--culture", "replay"], "--recordings: expected some for a replay"),
         (["--recordings", "x.nwb"], "--recordings: expected some for a replay and none for others, got 1 for virtual"),
@@ -495,6 +529,7 @@ def test_what_cannot_be_is_refused_before_a_culture_is_opened(
     (tmp_path / "full" / "something").touch()
     assert main(["live", "cartpole", *(word.replace("{full}", "full") for word in more)]) == 1
     assert words in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
 def test_an_exchange_gives_the_newest_and_each_only_once(tmp_path: Path) -> None:

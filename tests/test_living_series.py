@@ -28,7 +28,7 @@ from animat.cultures.kinds import culture_of
 from animat.cultures.observed import Observed
 from animat.cultures.replay import ReplayCulture
 from animat.cultures.series import record_series
-from animat.errors import DeviceFailed, InvalidArgument, Mismatch
+from animat.errors import DeviceFailed, InvalidArgument, InvalidFile, Mismatch
 from animat.recordings.reading import read_recording, read_recordings
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
@@ -95,6 +95,49 @@ def test_a_second_run_in_a_folder_at_work_is_refused_before_any_stimulus(tmp_pat
         with pytest.raises(Mismatch, match="another run is at work in this folder"):
             record_series(lambda: culture, SHORT, tmp_path, sessions=1, interval_min=2.0)
         assert culture.delivered == 0
+
+
+class Unopened(FakeCulture):
+    def _open(self) -> None:
+        raise AssertionError("opened")
+
+
+@pytest.mark.parametrize("there", ["another file", "a finished series"])
+def test_a_folder_that_cannot_be_written_to_is_found_before_a_culture_is_opened(
+    there: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = partial(record_series, protocol=SHORT, folder=tmp_path, interval_min=1.0)
+    if there == "a finished series":
+        again(FakeCulture, sessions=2)
+    else:
+        (tmp_path / "notes.txt").touch()
+    before = sorted(tmp_path.iterdir())
+
+    def read_only(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("animat.writing.tempfile.TemporaryFile", read_only)
+    with pytest.raises(InvalidFile, match=f"{tmp_path.name}: cannot be written: Permission denied; choose another"):
+        again(Unopened, sessions=3)
+    assert sorted(tmp_path.iterdir()) == before
+    if there == "a finished series":
+        # With nothing to be written it may be read only: the clock alone says that these are not of this culture.
+        with pytest.raises(Mismatch, match="before the culture's clock"):
+            again(FakeCulture, sessions=2)
+
+
+def test_without_room_for_a_recording_nothing_is_stimulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Of 2 MB a minute: two blocks of half a second of set-up, a pause and five pulses, tails included.
+    takes_min = 2 * (0.5 + 0.2 + SHORT.tail_s) / 60 + (5 / 20 + 5 / 80) / 60
+    room = iter([3e6 * takes_min, 3e6 * takes_min, 1.9e6 * takes_min])
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("animat.writing.shutil.disk_usage", lambda _: usage._replace(free=next(room)))
+    (tmp_path / "notes.txt").touch()
+    with FakeCulture() as culture:
+        with pytest.raises(InvalidFile, match=r"expected 0\.\d+ MB free .* MB: make room, or choose another"):
+            record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
+        assert culture.pulses == 10
+    assert [file.name for file in sorted(tmp_path.glob("*.nwb"))] == ["recording_0000_min.nwb"]
 
 
 def test_what_another_run_left_at_the_last_moment_is_checked_too(

@@ -276,7 +276,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
 
 def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_it(without_controls: Ran) -> None:
     gap, policies, told = without_controls
-    assert told == [*(f"warning: {each}" for each in warnings_once(gap.findings)), str(gap.outlook)]
+    warned = [f"warning: {each}" for each in warnings_once(gap.findings)]
+    assert told == [*warned, "each pulse: -200 mV 500 us, then +200 mV 400 us", str(gap.outlook)]
     assert gap.loop.adaptive_from is not None
     thresholds, commands = AdaptiveThresholds(gap.loop.adaptive_from), []
     mapping = next(iter(policies.values())).mapping
@@ -820,6 +821,7 @@ class TestCommand:
             (["--seed", "-1"], "--seed: expected 0 or more"),
             (["--culture-seed", "-1"], "--culture-seed: expected 0 or more, got -1"),
             (["--pulses", "0"], "--pulses: expected at least 1"),
+            (["--pulses", "1000000"], "--pulses: expected trials of 1000 s at most, got 1000000 pulses a trial"),
             (["--pause-s", "-1"], "--pause-s: expected a finite number from 0"),
             (["--warm-up", "-1"], "--warm-up: expected a whole number from 0 to 100, got -1"),
             (["--warm-up", "101"], "--warm-up: expected a whole number from 0 to 100, got 101"),

@@ -16,11 +16,13 @@ from animat.cli.record import Record
 from animat.cultures.base import Culture
 from animat.cultures.kinds import pulse_for
 from animat.cultures.series import Series, check_interval
+from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.schedule import make_schedule
+from fake_culture import FakeCulture
 from synthetic_recordings import synthetic_recording
 
 PATTERNS = np.arange(500).reshape(100, 5)
@@ -203,3 +205,11 @@ def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Pa
     assert int(pulses.replace(",", "")) == len(schedule)
     assert float(stimulated) == pytest.approx(stimulated_s, abs=0.05)
     assert float(whole) == pytest.approx(schedule.duration_s, abs=0.06)
+
+
+def test_what_is_no_protocol_is_refused_before_anything_is_delivered() -> None:
+    with FakeCulture() as culture:
+        for other, got in (({"trials": 5}, r"\{'trials': 5\}"), (None, "None"), (Protocol, "<class")):
+            with pytest.raises(InvalidArgument, match=rf"protocol: expected a Protocol, as .* makes one, got {got}"):
+                culture.record(other)  # type: ignore[arg-type]
+        assert culture.delivered == 0

@@ -14,6 +14,7 @@ import pytest
 from animat.cli import main
 from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
+from animat.cultures.devices.cl1 import CL1_PULSE
 from animat.cultures.series import STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
 from animat.neurons.memory import MemorySimulator
@@ -26,6 +27,7 @@ from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.selection import SelectionRule
 from animat.training.policy import Policy
 from cultures import small_culture
@@ -122,6 +124,98 @@ def test_recordings_of_no_virtual_culture_are_told(
     write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
     assert run(tmp_path / "session", policy_of(0), tmp_path / "synthetic.nwb") == 0
     assert "the recordings are of no virtual culture, and this is virtual culture 1" in capsys.readouterr().err
+
+
+def recorded_by(series: Path, folder: Path, *pulses: Pulse | None) -> Path:
+    """The recordings as if they had been made with these pulses; None: as converted ones, which tell none."""
+    for file, pulse in zip(sorted(series.glob("*.nwb")), pulses, strict=True):
+        protocol = None if pulse is None else replace(PROTOCOL, pulse=pulse)
+        write_nwb(replace(read_recording(file), protocol=protocol), folder / file.name)
+    return folder
+
+
+OTHERS, WEAK = " as the others had", Pulse((Phase(200, amplitude_mv=-100), Phase(200, amplitude_mv=100)))
+USUAL = " the usual one on a virtual"
+
+
+@pytest.mark.parametrize(
+    ("pulses", "file", "delivered", "warned"),
+    [
+        ((WEAK, WEAK), None, WEAK, ""),
+        ((BALANCED_PULSE, None), None, BALANCED_PULSE, OTHERS),
+        pytest.param((None, None), None, PUBLISHED_PULSE, USUAL, marks=pytest.mark.oracle),
+        ((None, None), WEAK, WEAK, ""),
+    ],
+)
+def test_a_loop_delivers_the_pulse_of_its_recordings_and_names_it_first(
+    pulses: tuple[Pulse | None, ...],
+    file: Pulse | None,
+    delivered: Pulse,
+    warned: str,
+    series: Path,
+    tmp_path: Path,
+    small_ones: None,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recordings = recorded_by(series, tmp_path / "recordings", *pulses)
+    mine = tmp_path / "mine.json"
+    mine.write_text(json.dumps({"pulse": (file or WEAK).to_list()}))
+    given = [] if file is None else ["--protocol", str(mine)]
+    assert run(tmp_path / "session", policy_of(0), recordings, "--at-min", "1", *given) == 0
+    told = read_session(tmp_path / "session").log.header["loop"]["pulse"]
+    assert Pulse.from_list(told) == delivered
+    printed = capsys.readouterr()
+    assert f"each pulse: {delivered}" in printed.err.split("the session is planned for")[0].splitlines()
+    found = {f["name"]: f["message"] for f in json.loads(printed.out.splitlines()[-1])["findings"]}
+    assert ("unknown-pulse" in found) == bool(warned)
+    assert f"the loop delivers {delivered},{warned}" in found.get("unknown-pulse", f"the loop delivers {delivered},")
+
+
+def test_a_rehearsal_of_currents_is_given_voltages(
+    series: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recordings = recorded_by(series, tmp_path / "recordings", CL1_PULSE, CL1_PULSE)
+    assert run(tmp_path / "session", policy_of(0), recordings, "--culture", "replay") == 0
+    assert f"each pulse: {PUBLISHED_PULSE}" in capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("pulses", "file", "words"),
+    [
+        ((WEAK, BALANCED_PULSE), None, f"got {WEAK} (at 0 min) and {BALANCED_PULSE} (at 1 min): give those"),
+        ((WEAK, None), BALANCED_PULSE, f"got {WEAK} (at 0 min) and {BALANCED_PULSE} ("),
+    ],
+)
+def test_recordings_of_several_pulses_are_refused_before_a_culture_is_made(
+    pulses: tuple[Pulse | None, ...],
+    file: Pulse | None,
+    words: str,
+    series: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delattr("animat.cultures.kinds.culture_of")
+    (tmp_path / "mine.json").write_text(json.dumps({"pulse": (file or WEAK).to_list()}))
+    given = [] if file is None else ["--protocol", str(tmp_path / "mine.json")]
+    recordings = recorded_by(series, tmp_path / "recordings", *pulses)
+    assert run(tmp_path / "session", policy_of(0), recordings, *given) == 1
+    assert words in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "session").exists()
+
+
+def test_a_pulse_that_the_culture_may_not_be_given_is_refused_before_it_is_opened(
+    series: Path, tmp_path: Path, small_ones: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def opened(*_: Any) -> None:
+        raise AssertionError("opened")
+
+    monkeypatch.setattr(VirtualCulture, "_open", opened)
+    strong = Pulse((Phase(200, amplitude_mv=-2000), Phase(200, amplitude_mv=2000)))
+    recordings = recorded_by(series, tmp_path / "recordings", strong, strong)
+    assert run(tmp_path / "session", policy_of(0), recordings) == 1
+    assert "amplitude: expected -400 to 400 mV, got -2000" in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "session").exists()
 
 
 @pytest.mark.parametrize(

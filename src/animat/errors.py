@@ -69,6 +69,11 @@ class BodyFailed(AnimatError):
     """A body of somebody else (`gymnasium:...`) raised, hung, or gave no finite numbers; what was finished stays."""
 
 
+def in_min(minutes: float) -> str:
+    """A time on the culture's clock as messages and tables have it: with two decimals at most."""
+    return f"{round(minutes, 2):g} min"
+
+
 def shown(value: object) -> str:
     """A value as a message shows it: in one line, and cut where it is longer than anyone reads."""
     try:

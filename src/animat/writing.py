@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from animat.errors import InvalidFile, Mismatch
 
+UNCHANGED = "; what stood there before is unchanged"
 LOCK = ".lock"
 """A file that is locked where a folder cannot be."""
 
@@ -45,9 +47,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         keep_name(path.parent)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise InvalidFile(
-            f"{path}: cannot be written: {error.strerror or error}; what stood there before is unchanged"
-        ) from error
+        raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}{UNCHANGED}") from error
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
@@ -60,12 +60,13 @@ def write_whole(path: Path, content: str | bytes) -> Path:
     return path
 
 
-def expect_writable(folder: str | os.PathLike[str], option: str = "--out") -> None:
+def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_bytes: float = 0) -> None:
     """Refuse a folder that could not be written to, or not be made, before any work; nothing is left of the trial.
 
     Args:
         folder: it may be missing.
         option: of the command line, by which another can be chosen.
+        room_bytes: that must be free.
 
     Raises:
         InvalidFile: naming the folder, and what stands in its way.
@@ -76,10 +77,15 @@ def expect_writable(folder: str | os.PathLike[str], option: str = "--out") -> No
             there = there.parent
         # Asking for permissions would not tell a full disk or a file system that is read only.
         with tempfile.TemporaryFile(dir=there):
-            pass
+            free = shutil.disk_usage(there).free
     except OSError as error:
         what = f"{there} is no folder" if there.is_file() else (error.strerror or str(error))
         raise InvalidFile(f"{folder}: cannot be written: {what}; choose another {option}") from error
+    if free < room_bytes:
+        raise InvalidFile(
+            f"{folder}: expected {room_bytes / 1e6:.2f} MB free for what is to be written, got {free / 1e6:.2f} MB: "
+            f"make room, or choose another {option}"
+        )
 
 
 @contextmanager

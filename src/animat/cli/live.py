@@ -108,7 +108,7 @@ class Live(Stimulating):
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
         settings = self._of_the_loop()
-        check_plan(training, protocol, self.out, timetable, self.episodes, settings)
+        check_plan(training, protocol, self.out, timetable, self.episodes, settings, account)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, Mismatch, in_min
 from animat.marks import expect_no_other
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class Record:
             progress=progress,
         )
         for minute in series.missed_min:
-            print(f"missed: the recording at {minute:g} min was not made, as the next was due", file=sys.stderr)
+            print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
         return series.files
 
     @property

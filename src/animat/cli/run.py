@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from animat.cli.responses import fit_as, policies_for
 from animat.cli.stimulating import Stimulating, expect_no_fault
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, Mismatch, in_min
 from animat.plain_file import expect_no_file
 from animat.writing import exclusive_lock
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from animat.recordings.findings import Finding
     from animat.recordings.recording import Recording
     from animat.responses.conditions import Conditions
+    from animat.stimulation.protocol import Protocol
     from animat.stimulation.pulse import Pulse
     from animat.training.policy import Policy
 
@@ -44,6 +45,8 @@ class Run(Stimulating):
     """Recordings the policies were trained on: their percentiles and prediction"""
     at_min: float | None = None
     """Minute whose newest recording is taken; default: the last that the policies were trained on"""
+    protocol: Path | None = None
+    """The file of record --protocol by which the recordings were made, where they do not tell their pulse themselves"""
     state: Path | None = None
     """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
     episodes: int = 5
@@ -119,17 +122,23 @@ class Run(Stimulating):
         recordings = read_recordings(self.recordings)
         calibration = self._calibration(recordings, first)
         check_conditions(first, calibration)
+        calibrating = next(each for each in recordings if each.start_min == calibration.start_min)
+        protocol, unknown = self._protocol(recordings, calibrating)
         loop, _ = Loop.of_policy(
-            first, np.zeros(percentiles_shape(first.readouts)), conditions=calibration.conditions, **settings
+            first,
+            np.zeros(percentiles_shape(first.readouts)),
+            conditions=calibration.conditions,
+            pulse=protocol.pulse,
+            **settings,
         )
         with (
             ExitStack() as told,
             # Last, as it makes the folder.
             _held_for_session(self.out),
             Bar("culture") as progress,
-            self._culture(recordings, progress) as culture,
+            self._culture(recordings, calibrating, loop.pulse, progress) as culture,
         ):
-            pulse, patterns, noticed = self._presenting(culture, recordings, calibration, loop)
+            noticed = unknown + _other_than(calibrating, culture, loop)
             gap = run_policies(
                 policies,
                 culture,
@@ -145,8 +154,9 @@ class Run(Stimulating):
                 progress=progress,
                 report=partial(print, file=sys.stderr),
                 noticed=noticed,
-                pulse=pulse,
-                patterns=patterns,
+                pulse=loop.pulse,
+                # Of recordings that do not tell how many they used, all.
+                patterns=None if unknown else min(protocol.patterns, len(culture.patterns)),
                 **settings,
             )
             # It is told even where the culture cannot be closed then.
@@ -159,34 +169,56 @@ class Run(Stimulating):
             print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
         expect_no_fault(gap.session, self.out)
 
-    def _culture(self, recordings: Sequence[Recording], progress: Progress) -> Culture:
-        from animat.cultures.kinds import culture_of, recorded_culture
+    def _protocol(
+        self, recordings: Sequence[Recording], calibrating: Recording
+    ) -> tuple[Protocol, tuple[Finding, ...]]:
+        """What tells pulse and patterns: the recording that calibrates, else --protocol, else what is usual; which."""
+        from animat.cultures.kinds import pulse_for
+        from animat.recordings.findings import Finding
+        from animat.stimulation.protocol import CLOSED_LOOP, read_protocol
 
-        known = recorded_culture(self.culture, recordings, self.recordings)
+        usual = replace(CLOSED_LOOP, pulse=pulse_for(self.culture))
+        given = None if self.protocol is None else read_protocol(self.protocol, usual)
+        told = {f"at {in_min(each.start_min)}": each.protocol for each in recordings}
+        told |= {str(self.protocol): given}
+        pulses = {protocol.pulse: where for where, protocol in told.items() if protocol is not None}
+        if len(pulses) > 1:
+            (one, there), (other, elsewhere), *_ = pulses.items()
+            raise Mismatch(
+                f"--recordings: expected one pulse in all, got {one} ({there}) and {other} ({elsewhere}): give those "
+                "that were recorded with the pulse that the loop is to deliver"
+            )
+        protocol = calibrating.protocol or given
+        if protocol is not None and (self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind):
+            return protocol, ()
+        if protocol is not None:
+            # A replay answers alike whatever the pulse, and its limits are those of voltages.
+            return replace(protocol, pulse=usual.pulse), ()
+        taken = next(iter(pulses), usual.pulse)
+        message = (
+            f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not tell its pulse: "
+            f"the loop delivers {taken}, {'as the others had' if pulses else f'the usual one on a {self.culture}'}; "
+            "another is given by --protocol"
+        )
+        return replace(usual, pulse=taken), (Finding("unknown-pulse", "warning", message),)
+
+    def _culture(
+        self, recordings: Sequence[Recording], calibrating: Recording, pulse: Pulse, progress: Progress
+    ) -> Culture:
+        from animat.cultures.kinds import culture_of, recorded_culture
+        from animat.cultures.safety import Guard
+
+        known = recorded_culture(self.culture, [calibrating], self.recordings)
         state = self.state or (known.get("state") if self.culture_seed is None else None)
         seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
         culture = culture_of(
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
+        # Again when it is open: some devices tell their step of amplitude only then.
+        Guard(culture.limits, ()).check_pulse(pulse)
         if state is not None:
             print(f"the culture goes on from {state}", file=sys.stderr)
         return culture
-
-    def _presenting(
-        self, culture: Culture, recordings: Sequence[Recording], calibration: Calibration, loop: Loop
-    ) -> tuple[Pulse, int | None, tuple[Finding, ...]]:
-        """The pulse and how many patterns, as in the recordings where they tell; and where the culture differs."""
-        from animat.cultures.kinds import pulse_for
-        from animat.cultures.same_culture import other_culture, other_patterns
-
-        found = [other_culture(recordings[0], calibration.start_min, culture)]
-        if loop.encoder.takes_patterns:
-            found.append(other_patterns(recordings[0], culture))
-        noticed = tuple(finding for finding in found if finding is not None)
-        protocol = recordings[0].protocol
-        if protocol is None:
-            return pulse_for(self.culture), None, noticed
-        return protocol.pulse, min(protocol.patterns, len(culture.patterns)), noticed
 
     def _calibration(self, recordings: Sequence[Recording], first: Policy) -> Calibration:
         from animat.reality_gap import Calibration
@@ -205,6 +237,16 @@ class Run(Stimulating):
         made = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         adaptive = self.thresholds == "adaptive"
         return Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **made)
+
+
+def _other_than(recording: Recording, culture: Culture, loop: Loop) -> tuple[Finding, ...]:
+    """Where the culture differs from the one of the recording that calibrates the loop."""
+    from animat.cultures.same_culture import other_culture, other_patterns
+
+    found = [other_culture(recording, culture)]
+    if loop.encoder.takes_patterns:
+        found.append(other_patterns(recording, culture))
+    return tuple(finding for finding in found if finding is not None)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import Fitting, say_findings
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, UnusableData, in_min
 from animat.records import as_json
 from animat.writing import expect_writable
 
@@ -195,7 +195,7 @@ class Train(Fitting):
         evaluation = evaluate(trained, timeline, at_min=until, controls=("random",))
         say_findings(evaluation.findings)
         policies, control = (row.to_dict() for row in evaluation.rows)
-        on = "" if evaluation.recorded_at_min is None else f" on the simulator at {evaluation.recorded_at_min:g} min"
+        on = "" if evaluation.recorded_at_min is None else f" on the simulator at {in_min(evaluation.recorded_at_min)}"
         error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
         counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{control['mean_return']:.1f}"
@@ -267,7 +267,7 @@ def _control(timeline: SimulatorTimeline) -> str:
         of_each = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, of, strict=True)) for of in shares)
         told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
     said = next((f.message for f in timeline.findings if f.name == "difference"), None)
-    at = f"in the simulator at {timeline.start_min[0]:g} min"
+    at = f"in the simulator at {in_min(timeline.start_min[0])}"
     first = f"P(x >= P50), the share of responses that reach the median, {at}: {told}"
     return "\n".join([first, *([f"in the recording {said}"] if said else []), *_memories(timeline)])
 
@@ -291,4 +291,4 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             )
             if load_s:
                 told += f". How much was stimulated in the last {load_s:g} s counts too"
-            yield f"memory at {start_min:g} min: {'none was found' if memory == NO_MEMORY else told}"
+            yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else told}"

@@ -31,9 +31,11 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.cultures.observed import more_left_out
+from animat.cultures.safety import Guard
 from animat.errors import AnimatError, InvalidArgument, Mismatch, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
+from animat.writing import UNCHANGED
 
 MOST_EPISODES = 100_000
 """Of each agent in a session."""
@@ -89,6 +91,7 @@ def run_session(
         Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
             read, or a folder of other work.
         InvalidFile: if a file is in the folder's place, or the log cannot be begun.
+        UnsafeStimulus: for a pulse that the culture may not be given.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
     check_session(culture, loop, agents, planned, seed)
@@ -113,7 +116,8 @@ def run_session(
         except Exception as error:
             # What was measured comes back, whatever its files are like.
             told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
-            message = f"{ending.message}; and {told} (animat recover {folder} makes them again)"
+            told = str(told).removesuffix(UNCHANGED)
+            message = f"{ending.message}; {told} (animat recover {folder} writes the files, once that is mended)"
             session = replace(session, ending=replace(ending, message=message))
     return session
 
@@ -242,8 +246,10 @@ class _Supervisor:
             self._log.append(Record(words))
             self._log.sync()
         except OSError as error:
-            left = len(self._driver.records)
-            message = f"{ending.message}; {left} ticks could not be written: {error.strerror or error}"
+            left, why = len(self._driver.records), error.strerror or str(error)
+            lost = {0: "how it ended", 1: "the last tick"}.get(left, f"the last {left} ticks")
+            message = f"{ending.message}; {lost} could not be written and {'are' if left > 1 else 'is'} lost"
+            message += "" if why in ending.message else f" ({why})"
             return Ending("disk" if ending.by in ("plan", "budget") else ending.by, message)
         return ending
 
@@ -362,6 +368,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
             "got none"
         )
     loop.readouts.members(culture.channels)
+    Guard(culture.limits, ()).check_pulse(loop.pulse)
     if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(
             f"conditions: expected electrodes that the {culture.name} culture can stimulate "

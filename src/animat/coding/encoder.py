@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, UnusableData, shown
 from animat.responses.condition import RESTING, Condition
 from animat.stimulation.stimulus import NOTHING
 from animat.tables import UNKNOWN
 
 SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
-"""Frequencies that a presentation may have: a quarter of an hour is waited for a pulse at most."""
+"""Frequencies that a presentation may have: a quarter of an hour is waited for a pulse at most, and for a train."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Encoder:
         pulses: of one presentation.
 
     Raises:
-        InvalidArgument: for no conditions.
+        InvalidArgument: for no conditions, or trains that are longer than is waited for.
         UnusableData: for a condition that cannot be delivered, as it is not known at which frequency or on which
             electrodes it was.
     """
@@ -55,6 +55,12 @@ class Encoder:
                     f"condition {condition.label}: expected recordings that state the electrodes of its pulses, "
                     "through which a closed loop presents it, got none; train on conditions by frequency or interval"
                 )
+        slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
+        if self.pulses > slowest_hz / SLOWEST_HZ:
+            raise InvalidArgument(
+                f"pulses: expected trials of {1 / SLOWEST_HZ:g} s at most, got {shown(self.pulses)} pulses a trial, "
+                f"which at {slowest_hz:g} Hz are {self.pulses / slowest_hz:,.0f} s: ask for fewer"
+            )
 
     @property
     def electrodes(self) -> tuple[int, ...]:

@@ -17,7 +17,7 @@ from animat.cultures.observed import Observed, Spikes, assembled, more_left_out,
 from animat.cultures.opening import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
-from animat.errors import AnimatError, InvalidArgument, some_of
+from animat.errors import AnimatError, InvalidArgument, shown, some_of
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.places import electrodes_of
@@ -179,8 +179,13 @@ class Culture(Openable):
         """The stimuli that `record` would deliver.
 
         Raises:
-            InvalidArgument: for places with electrodes that do not stimulate it, or more patterns than it has.
+            InvalidArgument: for what is no protocol, places with electrodes that do not stimulate it, or more patterns
+                than it has.
         """
+        if not isinstance(protocol, Protocol):
+            raise InvalidArgument(
+                f"protocol: expected a Protocol, as Protocol(trials=5) makes one, got {shown(protocol)}"
+            )
         table, electrodes = self.channels, np.array(self.stimulation_electrodes, np.int64)
         row_of = {electrode: row for row, electrode in enumerate(table.electrode.tolist())}
         rows = [row_of.get(electrode, UNKNOWN) for electrode in electrodes.tolist()]

@@ -64,13 +64,8 @@ class Account:
         Raises:
             BudgetSpent: naming what would be exceeded; nothing is written down.
         """
-        budget = self.budget
-        wanted = _pulses(stimuli)
-        if budget.pulses is not None and self.pulses + wanted > budget.pulses:
-            raise BudgetSpent(
-                f"budget.pulses: {self.pulses} of {budget.pulses} pulses are spent, and {wanted} more were wanted"
-            )
-        most = budget.pulses_per_electrode
+        self.check_number(_pulses(stimuli))
+        most = self.budget.pulses_per_electrode
         if most is None:
             return
         for electrode, more in _counted(stimuli).items():
@@ -79,6 +74,12 @@ class Account:
                     f"budget.pulses_per_electrode: electrode {electrode} had {self._on[electrode]} of {most} pulses, "
                     f"and {more} more were wanted"
                 )
+
+    def check_number(self, wanted: int) -> None:
+        """Raise `BudgetSpent` unless the budget holds so many pulses more, on whatever electrodes."""
+        most = self.budget.pulses
+        if most is not None and self.pulses + wanted > most:
+            raise BudgetSpent(f"budget.pulses: {self.pulses} of {most} pulses are spent, and {wanted} more were wanted")
 
     def spend(self, stimuli: Sequence[Stimulus]) -> None:
         """Write stimuli down as delivered."""

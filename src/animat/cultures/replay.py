@@ -11,7 +11,7 @@ from jaxtyping import Int64
 from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
@@ -60,13 +60,13 @@ class ReplayCulture(ComputedCulture):
         for recording in self._recordings:
             if recording.channels.label.tolist() != first.channels.label.tolist():
                 raise Mismatch(
-                    f"recordings: expected the same channels in all, but the one at {recording.start_min:g} min has "
-                    f"others than the one at {first.start_min:g} min"
+                    f"recordings: expected the same channels in all, but the one at {in_min(recording.start_min)} has "
+                    f"others than the one at {in_min(first.start_min)}"
                 )
             stimuli = recording.stimuli
             if not np.any(np.isfinite(stimuli.frequency_hz)) or not np.any(stimuli.electrodes != UNKNOWN):
                 raise UnusableData(
-                    f"the recording at {recording.start_min:g} min: expected stimuli of known frequency and "
+                    f"the recording at {in_min(recording.start_min)}: expected stimuli of known frequency and "
                     "electrodes, got none: a replay answers by frequency, and is stimulated on electrodes"
                 )
         self._seed = seed

@@ -24,12 +24,14 @@ from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
-from animat.writing import clear_away, exclusive_lock
+from animat.writing import clear_away, exclusive_lock, expect_writable
 
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
 LONGEST_MIN = 365 * 24 * 60.0
 """From the first recording to the last: a virtual culture's clock goes no further."""
+BYTES_PER_MIN = 2e6
+"""What 1,024 channels fill of the disk in a minute; a disk without that much room is as good as full for fewer too."""
 _MAY_DIFFER = ("stimulation_units",)
 """What a device tells of itself that can be otherwise when it is opened anew, and makes no other culture of it."""
 
@@ -83,7 +85,8 @@ def record_series(
             other electrodes than the culture has.
         Mismatch: if recordings are there that another culture, protocol or version made, or that lie ahead of the
             culture's clock, or another run is at work in the folder.
-        InvalidFile: if a file cannot be written, or the state or a recording that is there is damaged.
+        InvalidFile: if the folder cannot be written to or the disk lacks room for a recording, before it is made; if a
+            file cannot be written, or the state or a recording that is there is damaged.
         UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
     """
     if seed is not None and seed < 0:
@@ -104,6 +107,9 @@ def record_series(
             _expect_lived(files, virtual, protocol, interval_s, seed)
             virtual, recorded = _resumed(make_culture, virtual, files)
             culture = virtual
+        room_bytes = BYTES_PER_MIN * minutes_of(protocol, n_patterns)
+        if not all(file.exists() for file in files):
+            expect_writable(folder, room_bytes=room_bytes)
         if not culture.is_open and recorded < sessions:
             opened.enter_context(culture)
         if culture.is_open:
@@ -125,6 +131,8 @@ def record_series(
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
                 continue
+            # Again before each: what cannot be written is not recorded.
+            expect_writable(folder, room_bytes=room_bytes)
             culture.rest(max(0.0, due_s - culture.now_s))
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)

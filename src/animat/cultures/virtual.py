@@ -19,6 +19,7 @@ from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import MAXONE
+from animat.stimulation.plain import whole_number
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.scan import ScannedActivity
 from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
@@ -72,7 +73,7 @@ class VirtualCulture(ComputedCulture):
         progress: Progress | None = None,
     ) -> None:
         super().__init__(limits)
-        if seed < 0:
+        if (seed := whole_number("seed", seed)) < 0:
             raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
         if not 0 < scan_s <= 3600:
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")

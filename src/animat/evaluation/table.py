@@ -10,7 +10,7 @@ import numpy as np
 
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
@@ -133,9 +133,10 @@ class Evaluation:
     def to_text(self) -> str:
         """A table for a terminal: mean return and its standard error, over policies or over a control's episodes."""
         first_row, first = self.rows[0], self.rows[0].episodes.returns
-        on = "without neurons" if self.mapping is None else f"{self.mapping}, recording at {self.recorded_at_min:g} min"
+        at_min = self.recorded_at_min
+        on = "without neurons" if at_min is None else f"{self.mapping}, recording at {in_min(at_min)}"
         if self.fixed_from_min is not None:
-            on += f", percentiles fixed from {self.fixed_from_min:g} min"
+            on += f", percentiles fixed from {in_min(self.fixed_from_min)}"
         count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         goal = MEANS if self.objectives else ()
         are_counted, cost = first_row.electrode_pulses is not None, first_row.pulse_cost

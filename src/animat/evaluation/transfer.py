@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from animat.errors import Mismatch, some_of
+from animat.errors import Mismatch, in_min, some_of
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, other_stimulus
@@ -104,8 +104,8 @@ def other_recording(trained_until_min: float, evaluated_at_min: float) -> Iterat
     """Where policies are evaluated on another recording than the one that would calibrate their closed loop."""
     if trained_until_min != evaluated_at_min:
         message = (
-            f"this is the culture at {evaluated_at_min:g} min; the policies were last trained on the recording at "
-            f"{trained_until_min:g} min, which is the one that calibrates their closed loop"
+            f"this is the culture at {in_min(evaluated_at_min)}; the policies were last trained on the recording at "
+            f"{in_min(trained_until_min)}, which is the one that calibrates their closed loop"
         )
         yield Finding("other-recording", "warning", message, evaluated_at_min - trained_until_min)
 
@@ -147,8 +147,8 @@ def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         message = (
-            f"the policies' percentiles were fixed from the recording at {first_min:g} min, which is not the first "
-            f"of these: here they are fixed from {timeline.start_min[0]:g} min"
+            f"the policies' percentiles were fixed from the recording at {in_min(first_min)}, which is not the first "
+            f"of these: here they are fixed from {in_min(timeline.start_min[0])}"
         )
         found.append(Finding("other-percentiles", "warning", message))
     return tuple(found)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ import numpy as np
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_episodes
 from animat.coding.mapping import N_PERCENTILES
+from animat.cultures.budget import Account
 from animat.cultures.series import minutes_of
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import BudgetSpent, InvalidArgument, Mismatch
 from animat.plain_file import expect_no_file
 from animat.records import Positive, record
 from animat.responses.condition import Condition
+from animat.stimulation.places import NONE
 from animat.stimulation.protocol import Protocol
 from animat.training.folder import expect_trainable
 from animat.training.specification import Training
@@ -24,6 +27,8 @@ from animat.writing import LOCK
 
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
+EXCHANGE = ".exchange"
+"""A folder of simulators and of how training goes, for the processes that train."""
 _NOT_OF_THE_LOOP = ("greedy",)
 
 
@@ -50,6 +55,15 @@ class Timetable:
         return math.ceil(self.duration_min / self.interval_min - 1e-9)
 
 
+@contextmanager
+def for_the_first_recording() -> Iterator[None]:
+    """Say of a budget that does not hold it what can be done."""
+    try:
+        yield
+    except BudgetSpent as spent:
+        raise BudgetSpent(f"{spent} by the first recording: ask for fewer trials, or give a larger budget") from spent
+
+
 def check_plan(
     training: Training,
     protocol: Protocol,
@@ -57,6 +71,7 @@ def check_plan(
     timetable: Timetable,
     episodes: int,
     settings: Mapping[str, Any],
+    account: Account | None = None,
 ) -> None:
     """Raise for what would only come out when the culture is open, or after an hour of training.
 
@@ -65,6 +80,7 @@ def check_plan(
     Raises:
         InvalidArgument: for a training without neurons or with a neural observation, recordings that take longer than
             an interval, no episodes, or a setting of the closed loop that cannot be.
+        BudgetSpent: for a budget with fewer pulses than the first recording.
         InvalidFile: if a file is in the folder's place.
         Mismatch: if something is in the folder already: a live run is not gone on with, as its culture has lived on.
     """
@@ -90,6 +106,9 @@ def check_plan(
             f"interval_min: expected at least the {takes_min:.2f} min that a recording takes, "
             f"got {timetable.interval_min:g}"
         )
+    with for_the_first_recording():
+        places = max(1, protocol.n_places) - (NONE in protocol.places)
+        (account or Account()).check_number(len(protocol.frequencies_hz) * places * protocol.trials * protocol.pulses)
     check_episodes("episodes", episodes)
     of_the_loop = {name: value for name, value in settings.items() if name not in _NOT_OF_THE_LOOP}
     conditions = tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in protocol.frequencies_hz)

@@ -18,11 +18,20 @@ import jax
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
-from animat.cultures.series import STATE_FILE, order_seed
+from animat.cultures.series import BYTES_PER_MIN, STATE_FILE, minutes_of, order_seed
 from animat.cultures.under_way import UnderWay
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
-from animat.live.plan import LOG_FILE, POLICIES, RECORDINGS, SESSION, Timetable, check_plan
+from animat.live.plan import (
+    EXCHANGE,
+    LOG_FILE,
+    POLICIES,
+    RECORDINGS,
+    SESSION,
+    Timetable,
+    check_plan,
+    for_the_first_recording,
+)
 from animat.live.trainers import Exchange, Trainers
 from animat.neurons.kinds import Kind
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
@@ -35,7 +44,7 @@ from animat.stimulation.protocol import Protocol
 from animat.training.folder import describe, groups_of
 from animat.training.policy import Policy
 from animat.training.specification import Training
-from animat.writing import exclusive_lock
+from animat.writing import exclusive_lock, expect_writable
 
 _POLL_S = 0.1
 
@@ -123,8 +132,14 @@ def live(
             and policies are kept as they are.
     """
     timetable = timetable or Timetable()
-    check_plan(training, protocol, Path(folder), timetable, episodes, settings)
-    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account or Account(), progress)
+    account = account or Account()
+    check_plan(training, protocol, Path(folder), timetable, episodes, settings, account)
+    schedule = culture.schedule(protocol, order_seed(training.seed, 0))
+    with for_the_first_recording():
+        account.check([stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)])
+    if report is not None:
+        report(f"each pulse: {protocol.pulse}")
+    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account, progress)
     try:
         policies = run.shadow()
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
@@ -189,7 +204,16 @@ class _Run:
 
     def shadow(self) -> dict[str, Policy]:
         """Record and train to the end; returns the policies."""
-        exchange = Exchange(self.folder / ".exchange")
+        exchange = Exchange(self.folder / EXCHANGE)
+        try:
+            self._train(exchange)
+        finally:
+            # It serves those that train.
+            shutil.rmtree(exchange.folder, ignore_errors=True)
+        policies = self.folder / POLICIES
+        return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self._training.policies)}
+
+    def _train(self, exchange: Exchange) -> None:
         timeline = self._record(0, self._progress)
         if timeline is None:
             raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
@@ -213,9 +237,6 @@ class _Run:
         self.culture_min = (self._culture.now_s - self._zero_s) / 60
         self.wall_s = time.monotonic() - self._wall_zero_s
         self.write("trained", iterations=self.iterations, swaps=len(self.swaps), wall_s=round(self.wall_s, 1))
-        shutil.rmtree(exchange.folder, ignore_errors=True)
-        policies = self.folder / POLICIES
-        return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self._training.policies)}
 
     def end_early(self, error: BaseException) -> None:
         """Stimulate no more, and write down why, once."""
@@ -267,6 +288,8 @@ class _Run:
         folder = self.folder / RECORDINGS
         # Held as by `animat record`: whoever looks knows that it goes on.
         with exclusive_lock(folder), UnderWay(folder) as follow:
+            # What cannot be written is not recorded.
+            expect_writable(folder, room_bytes=BYTES_PER_MIN * minutes_of(self._protocol))
             seed = order_seed(self._training.seed, number)
             recording = record_within(self.account, self._culture, self._protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))

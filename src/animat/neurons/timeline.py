@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import InvalidArgument, Mismatch, expect_several
+from animat.errors import InvalidArgument, Mismatch, expect_several, in_min
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.simulator import NeuronSimulator, placed, stacked
@@ -150,20 +150,20 @@ def fit_timeline(
             if getattr(other, name) != getattr(first, name):
                 raise Mismatch(
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
-                    f"{first.start_min:g} min and {_words(getattr(other, name))} at {other.start_min:g} min"
+                    f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
                 )
         if others := other_stimulus(first.conditions, other.conditions):
-            raise Mismatch(f"conditions: {others} at {other.start_min:g} min")
+            raise Mismatch(f"conditions: {others} at {in_min(other.start_min)}")
     start_min = np.array([responses.start_min for responses in ordered], dtype=np.float64)
     if np.any(np.diff(start_min) == 0):
         twice = start_min[:-1][np.diff(start_min) == 0][0]
-        raise Mismatch(f"start_min: expected one recording a minute mark, got two at {twice:g} min")
+        raise Mismatch(f"start_min: expected one recording a minute mark, got two at {in_min(twice)}")
 
     room = room_for(ordered)
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
     findings = tuple(
-        replace(finding, message=f"at {responses.start_min:g} min: {finding.message}", at_min=responses.start_min)
+        replace(finding, message=f"at {in_min(responses.start_min)}: {finding.message}", at_min=responses.start_min)
         for responses, kept in zip(ordered, fidelities, strict=True)
         for finding in (*responses.findings, *kept.findings(of_memory=kind == "memory"))
     )

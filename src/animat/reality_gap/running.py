@@ -165,6 +165,7 @@ def run_policies(
         # Before the first pulse: whoever stands at the rig may think better of it.
         for message in warnings_once(findings):
             report(f"warning: {message}")
+        report(f"each pulse: {loop.pulse}")
         report(str(ahead))
     try:
         session = run_session(

@@ -9,6 +9,7 @@ from animat.closed_loop.gathering import in_words
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, told_unanswered
 from animat.cultures.budget import Account
+from animat.errors import in_min
 from animat.evaluation.verdict import Verdict
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, told_satisfaction
@@ -138,7 +139,7 @@ class RealityGap:
         head += ["pulses/action", "electrode pulses", *(("predicted net", "net") if cost else ()), "p value", "meaning"]
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
-            f"{self.calibrated_at_min:g} min",
+            f"{in_min(self.calibrated_at_min)}",
             *lined_up(head, cells),
         ]
         if self.rows[0].met:

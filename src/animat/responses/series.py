@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_several
+from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_several, in_min
 from animat.recordings.noticed import noticed
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -75,11 +75,11 @@ def extract_series(
             responses = extract_responses(recording, by, window_ms, burst_threshold, readouts)
         except (UnusableData, Mismatch) as error:
             # The argument that it begins with stays at the front.
-            raise type(error)(f"{error} (the recording at {recording.start_min:g} min)") from error
+            raise type(error)(f"{error} (the recording at {in_min(recording.start_min)})") from error
         for finding in (*noticed(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
                 raise UnusableData(
-                    f"the recording at {recording.start_min:g} min: {finding.message} (to allow it: "
+                    f"the recording at {in_min(recording.start_min)}: {finding.message} (to allow it: "
                     f"--allow {finding.name}, or in a study simulators.allow)"
                 )
         series.append(responses)

@@ -242,7 +242,9 @@ class CL1Culture(Culture):
                 error.add_note(told)
             if isinstance(error, AnimatError) or not isinstance(error, Exception):
                 raise
-            raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got {in_words(error)}: {told}") from error
+            raise DeviceFailed(
+                f"CL1: expected a loop over {duration_s:g} s, got {in_words(error)}: {told}{self._remedy(error)}"
+            ) from error
         row = _ROW_OF[channel]
         self.spikes_not_on_electrodes += int(np.count_nonzero(row == UNKNOWN))
         frame, row = frame[row != UNKNOWN], row[row != UNKNOWN]
@@ -261,8 +263,19 @@ class CL1Culture(Culture):
         # In pieces of a second, well under the five that the SDK holds.
         while now < until:
             piece = min(FRAMES_PER_S, until - now)
-            neurons.read(piece, now)
+            try:
+                neurons.read(piece, now)
+            except TimeoutError as error:
+                raise DeviceFailed(
+                    f"CL1: expected to rest {duration_s:g} s, got {in_words(error)}{self._remedy(error)}"
+                ) from error
             now += piece
+
+    def _remedy(self, error: Exception) -> str:
+        """What helps where the SDK's simulator was too slow; nothing for other errors, and on a device."""
+        if self._cl is None or "Timeout waiting for timestamp" not in str(error) or not self._cl.is_simulator():
+            return ""
+        return "; the simulator did not keep up: run without CL_SDK_ACCELERATED_TIME, or with nothing else running"
 
     def _halt(self) -> None:
         # First of all: whoever is about to hand over a pulse looks at it with the lock held.

@@ -50,7 +50,9 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
         reading.window_s = float(words["loop"]["window_ms"][1]) * 1e-3
         robot_data, seed = words["loop"] | {"robot": words["loop"]["robot"]}, int(words["seed"])
         for record in session.log.records:
-            if is_found and record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s:
+            is_past = is_found and record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s
+            # In a pause before the first trial nothing moves yet: that trial tells where the robot stands.
+            if is_past and reading.moments:
                 break
             reading.add(record.words)
             if not is_found and reading.moments:
@@ -58,7 +60,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
                 is_found = reading.moments[-1].iteration >= 0
                 from_s = max(0.0, reading.moments[-1].time_s - LOOK_BACK_S)
                 to_s = from_s + USUAL_S
-            if reading.stop_s > from_s - LOOK_BACK_S and len(record.spike_times_s):
+            if not is_past and reading.stop_s > from_s - LOOK_BACK_S and len(record.spike_times_s):
                 reading.spikes.append((record.spike_times_s, record.spike_channels))
     if not reading.moments:
         raise UnusableData(f"{file}: expected at least one episode, got none: {session.ending.message}")
