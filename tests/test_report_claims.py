@@ -38,6 +38,7 @@ from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
+from test_simulator import responses_of
 
 ROW = ComparedReturns(
     comparison="c", robot="cartpole", first="a", second="b", at_min=140.0, episodes=100, n=10, mean_first=5.0,
@@ -170,13 +171,42 @@ def test_what_binning_takes_is_said_where_it_takes_something() -> None:
 
 def test_decisions_of_the_papers_study_are_those_of_its_own() -> None:
     told = dict(decisions(paper_study()))
-    assert {"Nine levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
+    assert {"Ten levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
             "Most probable actions", "Walls", "Before training"} <= set(told)  # fmt: skip
     assert "0.055 kg, the simulator's" in told["Pole mass"]
     assert "12 degrees (angle" in told["12 degrees"]
     assert "there are 100" in told["20 iterations"]
     assert "percentiles of each recording" in told["Histogram range"]
     assert "simulated" in told["The culture"]
+
+
+def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
+    # Of one peak, which Otsu cuts in two: 0.5 is its cut; of two groups; and of no two values.
+    one_peak = responses_of([1.0] * 10, active_ratio=np.repeat([0.4, 0.5, 0.6, 0.7], [2, 5, 2, 1]))
+    two_groups = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5)
+    flat = responses_of([1.0] * 4)
+    words = dict(decisions(paper_study(), [one_peak, two_groups, flat]))["Bursts"]
+    assert words == (
+        "In the paper Otsu's threshold always cuts. Here its cut is kept only where the ratios of active channels form "
+        "two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 responses "
+        "that the paper's rule would leave out."
+    )
+    assert dict(decisions(paper_study()))["Bursts"].endswith("elsewhere no response is set apart.")
+    given = replace(paper_study(), simulators=Simulators(burst_threshold=0.5))
+    assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is given: 0.5 of the channels.")
+
+
+def test_what_a_quick_study_has_less_of_than_the_paper_is_told() -> None:
+    told = dict(decisions(paper_study(quick=True)))
+    assert told["Recordings"] == (
+        "The paper has 15 recordings, 10 minutes apart, of 100 trials of each stimulus, each frequency in a block. "
+        "Here there are 8 recordings, 20 minutes apart, of 100 trials of each stimulus, each frequency in a block."
+    )
+    assert told["Policies"] == "The paper has 10 per arm. Here there are 4."
+    assert told["Iterations on cartpole"] == "The paper trains a policy for 800,000. Here it is trained for 60,000."
+    assert "500,000" in told["Iterations on navigation"] and "60,000" in told["Iterations on navigation"]
+    papers = dict(decisions(paper_study()))
+    assert not any(name.startswith(("Recordings", "Policies", "Iterations")) for name in papers)
 
 
 def test_decisions_follow_a_changed_study() -> None:
@@ -200,7 +230,7 @@ def test_decisions_follow_a_changed_study() -> None:
     assert (
         "40 bins of equal width reach to 60 Hz" in told["Histogram range"] and "paper's 20" in told["Histogram range"]
     )
-    assert "Nine levels without zero" not in told and "Most probable actions" not in told
+    assert "Ten levels without zero" not in told and "Most probable actions" not in told
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
     alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))

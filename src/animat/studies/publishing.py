@@ -19,6 +19,7 @@ from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.style import FORMATS, save_figure
+from animat.responses.responses import Responses
 from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
 from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
@@ -56,9 +57,10 @@ class Publish(StudyTask):
         study, manifest = self.study, json.loads((folder / MANIFEST).read_text())
         results = read_typed(results_file(folder), Results)
         kept: dict[float, Fidelity] = {}
+        series: list[Responses] = []
         if study.needs_neurons:
-            timeline = load_timeline(folder / TIMELINE)
-            kept = controllability(timeline)
+            kept = controllability(load_timeline(folder / TIMELINE))
+            series = read_series(study, folder, as_one=True)
         headline = _headline(study, results, all_episodes(study, folder, study.robots))
         figure = draw_headline(headline)
         drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
@@ -69,11 +71,11 @@ class Publish(StudyTask):
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
         if kept:
             table = controllability_shown(study, folder, kept)
-            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(study, folder))
+            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(series))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
-            sections.append(_differences(study, results, kept))
+            sections.append(_differences(study, results, kept, series))
         settings = "All settings, as in study.toml, with which animat study makes the same study again."
         sections += [_noticed(results), Section("How it was done", (settings,), verbatim=study_to_toml(study))]
         versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
@@ -254,9 +256,8 @@ def _facts_of_robot(study: Study, spec: RobotSpec) -> dict[str, str]:
     }
 
 
-def _facts_of_culture(study: Study, folder: Path) -> dict[str, str]:
+def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
     """On how much the figures of the culture rest."""
-    series = read_series(study, folder, as_one=True)
     return {
         "channels": f"{series[0].n_channels:,}",
         "responses": f"{len(series[0]):,}",
@@ -303,7 +304,9 @@ def _controls(study: Study, results: Results) -> Section:
     )
 
 
-def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity]) -> Section:
+def _differences(
+    study: Study, results: Results, kept: Mapping[float, Fidelity], series: Sequence[Responses]
+) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
     lost = {at_min: of.largest_loss for at_min, of in kept.items()}
     otherwise = came_out_otherwise(rows, lost)
@@ -314,7 +317,7 @@ def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity])
     ]
     if rows and not otherwise:
         paragraphs.append("Every comparison came out as in the paper.")
-    return Section("Differences from the paper", tuple(paragraphs), (*otherwise, *decisions(study)))
+    return Section("Differences from the paper", tuple(paragraphs), (*otherwise, *decisions(study, series)))
 
 
 def _noticed(results: Results) -> Section:
