@@ -447,5 +447,16 @@ def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> No
     assert len(colours) == 6 and dashed.get_color() not in colours
 
 
+def test_the_legend_of_a_single_panel_is_whole() -> None:
+    minutes = np.array([0.0, 10.0])
+    names = ("before training", "without shadowing", "1 threshold")
+    courses = tuple(Course(name, minutes, np.ones((4, 2))) for name in names)
+    panel = Courses("1-threshold", courses, minutes, minutes, ((0.0, 1.0),))
+    figure = draw_over_time([panel], "cartpole", trained_until_min=5.0)
+    figure.canvas.draw()
+    within = figure.legends[0].get_window_extent()
+    assert within.x0 >= 0 and within.x1 <= figure.bbox.width
+
+
 def legend(figure: Any) -> set[str]:
     return {text.get_text() for legend in figure.legends for text in legend.get_texts()}

@@ -95,6 +95,8 @@ def test_the_drift_is_the_percentiles(series: list[Responses]) -> None:
     for i, line in enumerate(middle.lines[:5]):
         np.testing.assert_allclose(line.get_ydata(), [r.shares_above_median()[i] for r in series])
     np.testing.assert_allclose(lower.lines[0].get_ydata(), [r.is_burst.mean() for r in series])
+    # A share of 0 or 1 is a whole dot.
+    assert not any(line.get_clip_on() for line in (*middle.lines[:5], lower.lines[0]))
 
 
 def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
@@ -106,6 +108,22 @@ def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
     assert [text.get_text() for text in panels[0].get_yticklabels()] == ["0", "30", "60"]
     many = [replace(series[0], start_min=float(m)) for m in range(50)]
     assert draw_responses_over_time(many).get_suptitle() == "20 of 50 recordings"
+
+
+def test_a_few_bursts_that_were_kept_do_not_squeeze_the_other_responses(series: list[Responses]) -> None:
+    rates = series[1].rate_hz.copy()
+    rates[:3] = 50 * rates.max()
+    kept = replace(series[1], rate_hz=rates, is_burst=series[1].is_burst & (np.arange(len(rates)) >= 3))
+    figure = draw_responses_over_time([series[0], kept, series[2]])
+    n = sum(len(r.non_burst_rate_hz) for r in (series[0], kept, series[2]))
+    assert figure.get_suptitle().startswith(f"3 of {n:,} responses are larger than ")
+    without = draw_responses_over_time(series)
+    assert without.get_suptitle() == ""
+    reach_hz, before_hz = (each.axes[0].get_xlim()[1] for each in (figure, without))
+    assert reach_hz < 1.6 * before_hz
+    # Shares are of all responses, those beyond too.
+    drawn, *_ = figure.axes[0].patches[1].get_data()
+    assert np.count_nonzero(drawn) > 3
 
 
 def test_the_last_recording_is_an_outline_that_holds_every_response(series: list[Responses]) -> None:

@@ -58,13 +58,16 @@ def add_legend(axes: Axes, **place: Any) -> None:
 
 
 def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -> None:
-    """One legend under a figure for all its panels: whatever has a name in any of them, each name once."""
+    """One legend under a figure for all its panels: what has a name in any of them, once, in as many columns as fit."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
+        # A sample with the space around it, and a character of 8 points.
+        widest_in = 0.55 + 0.065 * max(map(len, entries))
+        fit = max(1, min(columns, int(figure.get_figwidth() / widest_in)))
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": fit}
         figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
 
 
