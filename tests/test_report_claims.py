@@ -16,7 +16,7 @@ from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
-from animat.report.html import Picture, Section, with_minus, write_page
+from animat.report.html import Picture, Section, with_links, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
@@ -420,6 +420,15 @@ def test_there_is_one_kind_of_minus() -> None:
     assert with_minus("constant -1 from -0.5 to -.5, 1.5e-05") == "constant −1 from −0.5 to −.5, 1.5e−05"
     same = "2-10 ms, p0-1, --at-min 5, tables/-1.csv, Mann-Whitney, recording_0-1, 2022-11-23"
     assert with_minus(same) == same
+    assert with_minus("by 41 % (+- 9 %), of interval:5+-25%") == "by 41 % (± 9 %), of interval:5+-25%"
+
+
+def test_files_that_a_page_names_are_links() -> None:
+    files = ("culture-1/report.html", "my-culture-1/report.html")
+    assert with_links(f"<b> & {files[1]}, {files[0]}.", files) == (
+        f'&lt;b&gt; &amp; <a href="{files[1]}">{files[1]}</a>, <a href="{files[0]}">{files[0]}</a>.'
+    )
+    assert with_links("a/report.html -1 <", ()) == "a/report.html −1 &lt;"
     low = Pair(replace(ROW, score_first=-0.07, score_second=-0.001), *np.array([[1.0, 2.0], [1.0, 2.0]]), 0.0)
     labels = [text.get_text() for text in draw_comparisons([low], "").axes[0].get_xticklabels()]
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]

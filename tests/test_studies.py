@@ -593,8 +593,12 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     for title in (*tables, "Controls"):
         assert f"<caption>{title}</caption>" in page
     assert "<dt>Pole mass</dt>" not in page, "there is no cartpole in this study"
-    for decision in ("20 iterations", "Walls", "Histogram range", "Most probable actions"):
+    for decision in ("20 iterations", "Walls", "Histogram range", "Most probable actions", "Bursts", "Policies"):
         assert f"<dt>{decision}</dt>" in page
+    assert 'all are in <a href="tables/findings.csv">tables/findings.csv</a>.' in page
+    assert "where the files are found under the same paths from where study.toml lies." in page
+    # No burst stands apart in its first recording.
+    assert "Here no response is set apart as one, so there is no threshold." in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "heuristic", "reflexes", "learning-curves", "optima", "controllability",

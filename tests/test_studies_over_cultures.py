@@ -141,6 +141,8 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
         "cultures": ["culture-1", "culture-2", "culture-3"],
         "failed": found.failed,
     }
+    page = "culture-3/report.html"
+    assert f'finished: <a href="{page}">{page}</a>' in found.report.read_text()
     table = pd.read_csv(tmp_path / cultures.COMPARISONS)
     assert table["culture"].tolist() == ["culture-1", "culture-3"]
     assert table["mean_second"].tolist() == [1.0, 3.0]

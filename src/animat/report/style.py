@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from animat.errors import InvalidArgument
 from animat.writing import atomic_write
 
@@ -64,11 +66,16 @@ def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        # A sample with the space around it, and a character of 8 points.
-        widest_in = 0.55 + 0.065 * max(map(len, entries))
-        fit = max(1, min(columns, int(figure.get_figwidth() / widest_in)))
-        place: dict[str, Any] = {"loc": "outside lower center", "ncols": fit}
+        while columns > 1 and _legend_in(list(entries), columns) > figure.get_figwidth():
+            columns -= 1
+        place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
         figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
+
+
+def _legend_in(labels: Sequence[str], columns: int) -> float:
+    """About how wide a legend in letters of 8 points is, in inches: of each column its longest label and a sample."""
+    parts = np.array_split(np.array([len(label) for label in labels]), columns)
+    return sum(0.53 + 0.062 * float(part.max()) for part in parts if len(part))
 
 
 def condition_colours(units: Sequence[str]) -> list[str]:

@@ -21,7 +21,7 @@ from animat.report.results import ComparedReturns, ControlReturns, Results, Scor
 from animat.report.style import FORMATS, save_figure
 from animat.responses.responses import Responses
 from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
-from animat.studies.captions import CULTURE, HEADLINE, ROBOT
+from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
@@ -76,7 +76,12 @@ class Publish(StudyTask):
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
             sections.append(_differences(study, results, kept, series))
-        settings = "All settings, as in study.toml, with which animat study makes the same study again."
+        settings = "All settings, as in study.toml, with which animat study makes the same study again"
+        settings += (
+            ", where the files are found under the same paths from where study.toml lies."
+            if study.culture.kind == "files"
+            else "."
+        )
         sections += [_noticed(results), Section("How it was done", (settings,), verbatim=study_to_toml(study))]
         versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
         colophon = [
@@ -137,7 +142,7 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
-            f"With {study.policies} policies a side no p can fall below {smallest:.2g}: this is a first look, not a "
+            f"With {study.policies} policies per side no p can fall below {smallest:.2g}: this is a first look, not a "
             "result."
         )
     picture = Picture(
@@ -262,6 +267,7 @@ def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
         "channels": f"{series[0].n_channels:,}",
         "responses": f"{len(series[0]):,}",
         "recordings": f"{len(series)}",
+        "cut": BURSTS if series[0].is_burst.any() else NO_BURSTS,
     }
 
 
@@ -292,7 +298,10 @@ def _controls(study: Study, results: Results) -> Section:
         ),
         ("silent", "The trained policies, but no pulse; what is there without stimuli is read (0 on a simulator)."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
-        ("coupling", "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and goal."),
+        (
+            "coupling",
+            "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and without a goal.",
+        ),
     )
     beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
     told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
@@ -332,4 +341,4 @@ def _noticed(results: Results) -> Section:
         (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()
     )
     left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)
-    return Section("Findings", (said,), left_out, table)
+    return Section("Findings", (said,), left_out, table, links=("tables/findings.csv",))
