@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.stimulation.array import MAXONE
 from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimuli
 from synthetic_recordings import synthetic_recording
 
 
@@ -56,6 +57,12 @@ def test_the_array_shows_every_site_and_counts_what_it_cannot_place(recordings: 
     # Synthetic cultures stimulate electrodes that no channel reads.
     assert len(axes.collections) == 1
     assert "32 stimulated electrodes that no channel reads are not drawn" in axes.figure.get_suptitle()
+    bar = axes.figure.axes[1]
+    assert bar.get_ylabel() == "firing rate, stimulated time included (Hz)"
+    stimuli = recordings[0].stimuli
+    none = Stimuli(*(getattr(stimuli, each.name)[:0] for each in fields(stimuli)))
+    unstimulated = replace(recordings[0], stimuli=none)
+    assert draw_array(unstimulated).axes[1].get_ylabel() == "firing rate (Hz)"
     unknown = recordings[0].channels.x_um.copy()
     unknown[:3] = np.nan
     some = draw_array(replace(recordings[0], channels=replace(recordings[0].channels, x_um=unknown))).axes[0]
