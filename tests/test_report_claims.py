@@ -23,6 +23,7 @@ from animat.report.results import ComparedReturns, ControlReturns, OverCultures,
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arms_shown, what_parts
+from animat.studies.captions import CULTURE
 from animat.studies.cultures import RanCultures
 from animat.studies.cultures_page import _in_short
 from animat.studies.differences import came_out_otherwise, decisions, explain
@@ -30,7 +31,7 @@ from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper
+from animat.studies.publishing import _as_in_paper, _facts_of_culture
 from animat.studies.results import write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.source import Source
@@ -194,6 +195,13 @@ def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
     assert dict(decisions(paper_study()))["Bursts"].endswith("elsewhere no response is set apart.")
     given = replace(paper_study(), simulators=Simulators(burst_threshold=0.5))
     assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is given: 0.5 of the channels.")
+
+
+def test_a_caption_promises_a_threshold_only_where_there_is_one() -> None:
+    with_bursts, without = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5), responses_of([1.0] * 20)
+    for responses, said in ((with_bursts, "Right of the dashed threshold"), (without, "so there is no threshold.")):
+        _, caption = CULTURE["bursts"]
+        assert said in caption.format(**_facts_of_culture([responses]))
 
 
 def test_what_a_quick_study_has_less_of_than_the_paper_is_told() -> None:

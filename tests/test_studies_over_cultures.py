@@ -64,6 +64,11 @@ def test_what_is_no_range_of_seeds_is_refused(text: str) -> None:
         Source(seeds=text)
 
 
+def test_a_seed_of_too_many_digits_is_refused_as_such() -> None:
+    with pytest.raises(InvalidArgument, match="seeds: expected numbers of at most 9 digits, got '1-99999999999'"):
+        Source(seeds="1-99999999999")
+
+
 @pytest.mark.parametrize(
     ("given", "told"),
     [
@@ -142,7 +147,7 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
         "failed": found.failed,
     }
     page = "culture-3/report.html"
-    assert f'finished: <a href="{page}">{page}</a>' in found.report.read_text()
+    assert f'finished: <a href="{page}">{page}</a>' in (tmp_path / "report.html").read_text()
     table = pd.read_csv(tmp_path / cultures.COMPARISONS)
     assert table["culture"].tolist() == ["culture-1", "culture-3"]
     assert table["mean_second"].tolist() == [1.0, 3.0]
