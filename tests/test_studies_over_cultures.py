@@ -26,6 +26,7 @@ from animat.evaluation.statistics import compare
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
 from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
+from animat.studies.cultures_page import write_cultures_page
 from animat.studies.places import results_file
 from animat.studies.results import write_typed
 from animat.studies.run import Ran, run_study
@@ -146,8 +147,9 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
         "cultures": ["culture-1", "culture-2", "culture-3"],
         "failed": found.failed,
     }
-    page = "culture-3/report.html"
-    assert f'finished: <a href="{page}">{page}</a>' in (tmp_path / "report.html").read_text()
+    page = write_cultures_page(study, replace(found, summary=())).read_text()
+    assert 'finished: <a href="culture-3/report.html">culture-3/report.html</a>' in page
+    assert "<dd>failed: recording 1: no responses</dd>" in page
     table = pd.read_csv(tmp_path / cultures.COMPARISONS)
     assert table["culture"].tolist() == ["culture-1", "culture-3"]
     assert table["mean_second"].tolist() == [1.0, 3.0]
