@@ -335,7 +335,7 @@ def main(seeds: list[int]) -> None:
 
     line("figure", "bound", [*(f"seed {f.seed}" for f in rows), "all"])
     print("|---" * (2 + len(columns)) + "|")
-    line("spontaneous rate, Hz a channel", "0.3-4", [f"{f.channel_rate_hz:.2f}" for f in columns])
+    line("spontaneous rate, Hz per channel", "0.3-4", [f"{f.channel_rate_hz:.2f}" for f in columns])
     bursts = [f"{f.bursts_per_min:.1f}" for f in columns]
     line("network bursts a minute (100-800 ms), first two minutes", "2-15", bursts)
     line("their mean duration, ms", "100-800", [f"{f.burst_ms:.0f}" for f in columns])

@@ -45,7 +45,7 @@ class Spontaneous(NamedTuple):
             "variation of intervals 0.3-1.5": 0.3 <= self.interval_cv <= 1.5,
             "150-800 ms": 150 <= self.burst_ms <= 800,
             "mean participation 0.5-0.9": 0.5 <= self.participation <= 0.9,
-            "0.5-2 Hz a neuron": 0.5 <= self.rate_hz <= 2,
+            "0.5-2 Hz per neuron": 0.5 <= self.rate_hz <= 2,
         }
         return [f"{name} at {self.first_min} min" for name, held in bounds.items() if not held]
 
@@ -142,10 +142,8 @@ def _after(rig: Rig) -> Spontaneous:
 
 def main(seeds: list[int], measure: Callable[[int], list[Spontaneous]]) -> None:
     """Print the table of the docs."""
-    names = (
-        "seed, from min, Hz a neuron, bursts a minute, variation of intervals, ms, participation (10th-90th percentile)"
-    )
-    columns = [*names.split(", "), "begun by ten channels", "missed"]
+    names = "seed, from min, Hz per neuron, bursts a minute, variation of intervals, ms"
+    columns = [*names.split(", "), "participation (10th-90th percentile)", "begun by ten channels", "missed"]
     print(f"| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
     for seed in seeds:

@@ -152,7 +152,7 @@ def main(seeds: list[int]) -> None:
     line("figure", "bound", [f"seed {r.seed}" for r in rows])
     print("|---" * (2 + len(rows)) + "|")
     line("channels", "at most 1,024", [f"{r.channels}" for r in rows])
-    line("spontaneous rate, Hz a channel", "0.3-4", [f"{r.rate_hz:.2f}" for r in rows])
+    line("spontaneous rate, Hz per channel", "0.3-4", [f"{r.rate_hz:.2f}" for r in rows])
     line("network bursts a minute (100-800 ms)", "2-15", [f"{r.bursts_per_min:.1f}" for r in rows])
     line("their mean duration, ms", "100-800", [f"{r.burst_ms:.0f}" for r in rows])
     hz = [" ".join(f"{x:.1f}" for x in r.medians_hz) for r in rows]

@@ -27,6 +27,8 @@ plain = st.recursive(
         ({"b": 1}, {"a": 2, "b": 1}, "a: nothing there, 2 now"),
         ({"a": 1, "b": 1}, {"a": 2, "b": 2}, "a: 1 there, 2 now"),
         ({"a": "x" * 99}, {"a": "y"}, f"a: '{'x' * 56}... there, 'y' now"),
+        ({"a": ["x" * 60, 1]}, {"a": ["x" * 60, 2, 3]}, "a[1]: 1 there, 2 now"),
+        ({"a": ["x" * 60, 1]}, {"a": ["x" * 60, 1, 3]}, "a, how many: 2 there, 3 now"),
         ({"a": {"id": 1}, "b": 1}, {"a": {"id": 2}, "b": 2}, "b: 1 there, 2 now"),
     ],
 )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from animat.cli import main
 from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
@@ -20,7 +21,8 @@ from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.reading import read_sources
-from animat.report.film.frame import HEIGHT_PX, WIDTH_PX
+from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames
+from animat.report.film.scene import Moment, Scene
 from animat.report.film.session import scene_of_session
 from animat.report.film.simulated import scene_of_policies
 from animat.report.film.writing import FRAMES_PER_S
@@ -159,6 +161,50 @@ def test_of_a_killed_session_what_is_there_is_shown(
     (tmp_path / LOG_FILE).write_bytes(log[:whole_records])
     assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0, 0.5) == 0
     assert "lost" not in capsys.readouterr().out
+
+
+def scene_of(rates_hz: list[float]) -> Scene:
+    """Ten responses of one policy a second, the last iteration number 9."""
+    moments = tuple(
+        Moment(0.1 * i, "p0", 0, i, 0, (), 0.0, float(i), "5 Hz", rate_hz) for i, rate_hz in enumerate(rates_hz)
+    )
+    return Scene("navigation", Navigation(), ("5 Hz",), moments, 0.0, 1.0)
+
+
+def written_by(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    texts: list[str] = []
+    write = ImageDraw.ImageDraw.text
+
+    def kept(draw: ImageDraw.ImageDraw, at: Any, text: str, *more: Any, **named: Any) -> None:
+        texts.append(text)
+        write(draw, at, text, *more, **named)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", kept)
+    Frames(scene, lambda _: None).at(1.0)
+    monkeypatch.undo()
+    return texts
+
+
+def test_a_film_says_which_responses_are_above_its_axis_and_counts_as_ticks_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = scene_of([5.0] * 40)
+    texts = written_by(usual, monkeypatch)
+    assert "response (Hz per channel)" in texts
+    assert "p0, episode 0, iteration 10 (both from 0)" in texts
+    beyond = scene_of([5.0] * 5 + [90.0] + [5.0] * 40)
+    assert "response (Hz per channel; triangles: larger)" in written_by(beyond, monkeypatch)
+    triangles: list[Any] = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "polygon", lambda _, corners, __: triangles.append(corners))
+    for scene in (usual, beyond):
+        Frames(scene, lambda _: None).at(1.0)
+    assert len(triangles) == 1
+
+
+def test_a_film_without_neurons_has_no_panel_of_responses(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = written_by(scene_of([math.nan] * 10), monkeypatch)
+    assert [text for text in texts if text.startswith(("response", "command", "return"))] == [
+        "command",
+        "return so far",
+    ]
 
 
 def test_what_cannot_be_filmed_is_one_line_and_leaves_nothing(

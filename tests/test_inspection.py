@@ -353,6 +353,21 @@ def test_a_raster_of_many_spikes_shades_rates_and_names_only_conditions_with_row
     assert [text.get_text() for text in lower.get_yticklabels()] == ["5 Hz", "10 Hz", "40 Hz", "80 Hz"]
 
 
+def test_spikes_on_a_sampling_grid_fall_into_one_bin_each() -> None:
+    """Every spike is 25 ms after a pulse, both in whole samples: it belongs into the bin that begins there."""
+    samples = 500 * np.arange(1, 400)
+    spikes = [(sample / 20_000, channel) for sample in samples[1:] for channel in range(12)]
+    source = recording(spikes, samples[:-1] / 20_000, 12, 20.0, frequency_hz=np.full(len(samples) - 1, 40.0))
+    edges_ms, count = (of := post_stimulus_histogram(source)).edges_ms, of.count
+    assert set(edges_ms[:-1][count > 0].round(6)) == {0.0, 25.0}
+    assert count[edges_ms[:-1].round(6) == 25].sum() == 12 * 398
+    upper, lower = axes_of(draw_raster(source, extract_responses(source, burst_threshold=1)))[:2]
+    (image,) = lower.images
+    assert set(np.flatnonzero(image.get_array().any(axis=0))) == {20, 45}
+    # Channels are counted.
+    assert all(tick == round(tick) for tick in upper.get_yticks())
+
+
 def test_an_artefact_does_not_dwarf_the_response_in_the_figure() -> None:
     source = answering({5: 10.0, 10: 10.0})
     artefact = [(t + 0.0005, 0) for t in source.stimuli.time_s for _ in range(200)]

@@ -456,6 +456,10 @@ def test_the_command_teaches_and_tells_where_each_policy_is(tmp_path: Path, caps
     assert assessed["best"]["lesson"] == 2
     assert printed[-2].startswith("p0: best after ")
     assert main(["evaluate", str(out / "best"), "--episodes", "3"]) == 0
+    file.write_text('[[lessons]]\nname = "early"\nrecordings_min = [0, 10]\n')
+    assert main(["train", "swing-up", "--mapping", "none", "--lessons", str(file), *few, "--out", str(out)]) == 1
+    said = "lesson 1 (early): recordings_min: expected only where shadowing is 'drawn' (--shadowing drawn), got it"
+    assert f"{file}: {said}" in capsys.readouterr().err
     assert main(["train", "swing-up", "--mapping", "none", "--assess", "0", *few, "--out", str(out)]) == 1
     assert "assess: expected at least 1" in capsys.readouterr().err
 

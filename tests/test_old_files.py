@@ -55,7 +55,7 @@ def test_recordings_are_what_they_were(
         assert recording.spike_times_s.sum() == pytest.approx(was["spike_times_s"], rel=1e-12)
         assert recording.stimuli.time_s.sum() == pytest.approx(was["stimulus_times_s"], rel=1e-12)
         assert sorted(set(recording.stimuli.frequency_hz.tolist())) == was["frequencies_hz"]
-        assert str(recording.presentation) == was["presentation"].replace("a presentation", "a trial")
+        assert str(recording.presentation) == was["presentation"].replace("a presentation", "per trial")
     assert [each.rate_hz.tolist() for each in extract_series(recordings)] == told["rate_hz"]
     assert main(["inspect", str(old / "recordings")]) == 0
     assert capsys.readouterr().out.count("usable") == 2

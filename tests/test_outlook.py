@@ -90,7 +90,15 @@ def test_one_line_tells_it() -> None:
         "has changed by 25 % in 24 min (11 min at least), beyond which adaptive thresholds may not help; the plan is "
         "longer: ask for fewer --episodes"
     )
-    assert str(Outlook(26.2, (-5.0, -9.0), 30.0)).endswith("the plan is longer: ask for fewer --episodes")
+    assert str(Outlook(26.2, (24.0, -9.0), 20.0)).endswith("the plan is longer: ask for fewer --episodes")
+    assert "in 24 min (0 min at least)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
+    assert str(Outlook(26.2, (-5.0, -9.0), math.inf)) == (
+        "the session is planned for about 26 min of the culture's time; by the recordings' drift the median response "
+        "had changed by 25 % already 5 min ago, beyond which adaptive thresholds may not help; take newer recordings, "
+        "with --at-min or by recording again"
+    )
+    drifted = str(Outlook(26.2, (-5.0, -9.0), 20.0))
+    assert drifted.endswith("--at-min or by recording again; the plan is longer: ask for fewer --episodes")
     assert "in more than 10 h (40 min at least)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
     assert str(Outlook(6.0, None, 7.0)) == (
         "the session is planned for about 6 min of the culture's time; how the culture drifts is known from two "

@@ -104,7 +104,7 @@ def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "presentation": (
         {"calibration": {"presentation": Presentation("blocked", 1)}},
-        "the recording was presented blocked, 1 pulse a trial, the loop mixed, 1 pulse a trial",
+        "the recording was presented blocked, 1 pulse per trial, the loop mixed, 1 pulse per trial",
     ),
     "few-samples": (
         {"calibration": {"responses_hz": (np.ones(7), np.full(200, 14.0))}},

@@ -51,7 +51,7 @@ def test_a_culture_is_recorded_as_the_file_says(
     (file,) = json.loads(capsys.readouterr().out.splitlines()[-1])["recordings"]
     recording = read_recording(file)
     assert recording.protocol == MINE
-    assert str(recording.presentation) == "mixed, 3 pulses a trial"
+    assert str(recording.presentation) == "mixed, 3 pulses per trial"
     frequency_hz, times = np.unique(recording.stimuli.frequency_hz, return_counts=True)
     assert (frequency_hz.tolist(), times.tolist()) == ([5.0, 40.0], [6, 6])
     assert recording.stimuli.time_s[0] == pytest.approx(3.0)

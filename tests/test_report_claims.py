@@ -16,13 +16,14 @@ from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
-from animat.report.html import Picture, Section, with_minus, write_page
+from animat.report.html import Picture, Section, with_links, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arms_shown, what_parts
+from animat.studies.captions import CULTURE
 from animat.studies.cultures import RanCultures
 from animat.studies.cultures_page import _in_short
 from animat.studies.differences import came_out_otherwise, decisions, explain
@@ -30,7 +31,7 @@ from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper
+from animat.studies.publishing import _as_in_paper, _facts_of_culture
 from animat.studies.results import write_typed
 from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.source import Source
@@ -38,6 +39,7 @@ from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
+from test_simulator import responses_of
 
 ROW = ComparedReturns(
     comparison="c", robot="cartpole", first="a", second="b", at_min=140.0, episodes=100, n=10, mean_first=5.0,
@@ -170,13 +172,49 @@ def test_what_binning_takes_is_said_where_it_takes_something() -> None:
 
 def test_decisions_of_the_papers_study_are_those_of_its_own() -> None:
     told = dict(decisions(paper_study()))
-    assert {"Nine levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
+    assert {"Ten levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
             "Most probable actions", "Walls", "Before training"} <= set(told)  # fmt: skip
     assert "0.055 kg, the simulator's" in told["Pole mass"]
     assert "12 degrees (angle" in told["12 degrees"]
     assert "there are 100" in told["20 iterations"]
     assert "percentiles of each recording" in told["Histogram range"]
     assert "simulated" in told["The culture"]
+
+
+def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
+    # Of one peak, which Otsu cuts in two: 0.5 is its cut; of two groups; and of no two values.
+    one_peak = responses_of([1.0] * 10, active_ratio=np.repeat([0.4, 0.5, 0.6, 0.7], [2, 5, 2, 1]))
+    two_groups = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5)
+    flat = responses_of([1.0] * 4)
+    words = dict(decisions(paper_study(), [one_peak, two_groups, flat]))["Bursts"]
+    assert words == (
+        "In the paper Otsu's threshold always cuts. Here its cut is kept only where the ratios of active channels form "
+        "two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 responses "
+        "that the paper's rule would leave out."
+    )
+    assert dict(decisions(paper_study()))["Bursts"].endswith("elsewhere no response is set apart.")
+    given = replace(paper_study(), simulators=Simulators(burst_threshold=0.5))
+    assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is given: 0.5 of the channels.")
+
+
+def test_a_caption_promises_a_threshold_only_where_there_is_one() -> None:
+    with_bursts, without = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5), responses_of([1.0] * 20)
+    for responses, said in ((with_bursts, "Right of the dashed threshold"), (without, "so there is no threshold.")):
+        _, caption = CULTURE["bursts"]
+        assert said in caption.format(**_facts_of_culture([responses]))
+
+
+def test_what_a_quick_study_has_less_of_than_the_paper_is_told() -> None:
+    told = dict(decisions(paper_study(quick=True)))
+    assert told["Recordings"] == (
+        "The paper has 15 recordings, 10 minutes apart, of 100 trials of each stimulus, each frequency in a block. "
+        "Here there are 8 recordings, 20 minutes apart, of 100 trials of each stimulus, each frequency in a block."
+    )
+    assert told["Policies"] == "The paper has 10 per arm. Here there are 4."
+    assert told["Iterations on cartpole"] == "The paper trains a policy for 800,000. Here it is trained for 60,000."
+    assert "500,000" in told["Iterations on navigation"] and "60,000" in told["Iterations on navigation"]
+    papers = dict(decisions(paper_study()))
+    assert not any(name.startswith(("Recordings", "Policies", "Iterations")) for name in papers)
 
 
 def test_decisions_follow_a_changed_study() -> None:
@@ -200,7 +238,7 @@ def test_decisions_follow_a_changed_study() -> None:
     assert (
         "40 bins of equal width reach to 60 Hz" in told["Histogram range"] and "paper's 20" in told["Histogram range"]
     )
-    assert "Nine levels without zero" not in told and "Most probable actions" not in told
+    assert "Ten levels without zero" not in told and "Most probable actions" not in told
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
     alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
@@ -390,6 +428,15 @@ def test_there_is_one_kind_of_minus() -> None:
     assert with_minus("constant -1 from -0.5 to -.5, 1.5e-05") == "constant −1 from −0.5 to −.5, 1.5e−05"
     same = "2-10 ms, p0-1, --at-min 5, tables/-1.csv, Mann-Whitney, recording_0-1, 2022-11-23"
     assert with_minus(same) == same
+    assert with_minus("by 41 % (+- 9 %), of interval:5+-25%") == "by 41 % (± 9 %), of interval:5+-25%"
+
+
+def test_files_that_a_page_names_are_links() -> None:
+    files = ("culture-1/report.html", "my-culture-1/report.html")
+    assert with_links(f"<b> & {files[1]}, {files[0]}.", files) == (
+        f'&lt;b&gt; &amp; <a href="{files[1]}">{files[1]}</a>, <a href="{files[0]}">{files[0]}</a>.'
+    )
+    assert with_links("a/report.html -1 <", ()) == "a/report.html −1 &lt;"
     low = Pair(replace(ROW, score_first=-0.07, score_second=-0.001), *np.array([[1.0, 2.0], [1.0, 2.0]]), 0.0)
     labels = [text.get_text() for text in draw_comparisons([low], "").axes[0].get_xticklabels()]
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
@@ -415,6 +462,17 @@ def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> No
     colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
     (dashed,) = [line for line in figure.axes[0].lines if "rough" in str(line.get_label())]
     assert len(colours) == 6 and dashed.get_color() not in colours
+
+
+def test_the_legend_of_a_single_panel_is_whole() -> None:
+    minutes = np.array([0.0, 10.0])
+    names = ("before training", "without shadowing", "1 threshold")
+    courses = tuple(Course(name, minutes, np.ones((4, 2))) for name in names)
+    panel = Courses("1-threshold", courses, minutes, minutes, ((0.0, 1.0),))
+    figure = draw_over_time([panel], "cartpole", trained_until_min=5.0)
+    figure.canvas.draw()
+    within = figure.legends[0].get_window_extent()
+    assert within.x0 >= 0 and within.x1 <= figure.bbox.width
 
 
 def legend(figure: Any) -> set[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.stimulation.array import MAXONE
 from animat.stimulation.selection import Selection
+from animat.stimulation.stimulus import Stimuli
 from synthetic_recordings import synthetic_recording
 
 
@@ -56,6 +57,12 @@ def test_the_array_shows_every_site_and_counts_what_it_cannot_place(recordings: 
     # Synthetic cultures stimulate electrodes that no channel reads.
     assert len(axes.collections) == 1
     assert "32 stimulated electrodes that no channel reads are not drawn" in axes.figure.get_suptitle()
+    bar = axes.figure.axes[1]
+    assert bar.get_ylabel() == "firing rate, stimulated time included (Hz)"
+    stimuli = recordings[0].stimuli
+    none = Stimuli(*(getattr(stimuli, each.name)[:0] for each in fields(stimuli)))
+    unstimulated = replace(recordings[0], stimuli=none)
+    assert draw_array(unstimulated).axes[1].get_ylabel() == "firing rate (Hz)"
     unknown = recordings[0].channels.x_um.copy()
     unknown[:3] = np.nan
     some = draw_array(replace(recordings[0], channels=replace(recordings[0].channels, x_um=unknown))).axes[0]
@@ -95,6 +102,8 @@ def test_the_drift_is_the_percentiles(series: list[Responses]) -> None:
     for i, line in enumerate(middle.lines[:5]):
         np.testing.assert_allclose(line.get_ydata(), [r.shares_above_median()[i] for r in series])
     np.testing.assert_allclose(lower.lines[0].get_ydata(), [r.is_burst.mean() for r in series])
+    # A share of 0 or 1 is a whole dot.
+    assert not any(line.get_clip_on() for line in (*middle.lines[:5], lower.lines[0]))
 
 
 def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
@@ -106,6 +115,22 @@ def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
     assert [text.get_text() for text in panels[0].get_yticklabels()] == ["0", "30", "60"]
     many = [replace(series[0], start_min=float(m)) for m in range(50)]
     assert draw_responses_over_time(many).get_suptitle() == "20 of 50 recordings"
+
+
+def test_a_few_bursts_that_were_kept_do_not_squeeze_the_other_responses(series: list[Responses]) -> None:
+    rates = series[1].rate_hz.copy()
+    rates[:3] = 50 * rates.max()
+    kept = replace(series[1], rate_hz=rates, is_burst=series[1].is_burst & (np.arange(len(rates)) >= 3))
+    figure = draw_responses_over_time([series[0], kept, series[2]])
+    n = sum(len(r.non_burst_rate_hz) for r in (series[0], kept, series[2]))
+    assert figure.get_suptitle().startswith(f"3 of {n:,} responses are larger than ")
+    without = draw_responses_over_time(series)
+    assert without.get_suptitle() == ""
+    reach_hz, before_hz = (each.axes[0].get_xlim()[1] for each in (figure, without))
+    assert reach_hz < 1.6 * before_hz
+    # Shares are of all responses, those beyond too.
+    drawn, *_ = figure.axes[0].patches[1].get_data()
+    assert np.count_nonzero(drawn) > 3
 
 
 def test_the_last_recording_is_an_outline_that_holds_every_response(series: list[Responses]) -> None:

@@ -593,8 +593,11 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     for title in (*tables, "Controls"):
         assert f"<caption>{title}</caption>" in page
     assert "<dt>Pole mass</dt>" not in page, "there is no cartpole in this study"
-    for decision in ("20 iterations", "Walls", "Histogram range", "Most probable actions"):
+    for decision in ("20 iterations", "Walls", "Histogram range", "Most probable actions", "Bursts", "Policies"):
         assert f"<dt>{decision}</dt>" in page
+    assert 'all are in <a href="tables/findings.csv">tables/findings.csv</a>.' in page
+    assert "where the files are found under the same paths from where study.toml lies." in page
+    assert "Right of the dashed threshold a response counts as one, as in the last panel." in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "heuristic", "reflexes", "learning-curves", "optima", "controllability",
@@ -794,8 +797,13 @@ COMPARED = (
         ("[robots.cartpole]\niterations = 3", "robots: expected [[robots]] for each, and its name in it, got [robots."),
         ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
         ("[[arms]]\nname = '10'", "which in a table would be a number"),
-        ("[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'", "expected each name once"),
+        (
+            "[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'",
+            "expected each name once, got 'a' 2 times: capitals, and spaces for dashes, make no difference",
+        ),
         ("[[arms]]\nname = 'a'\nmapping = '2'", "arms.mapping: expected one of"),
+        ("[[arms]]\nname = 'a'\nmapping = '2'", "named by its module:Class; none is without neurons"),
+        ("[tune]\ntrials = 3", "expected a study, got the file of a tuning, with [tune]: give it to animat tune"),
         (
             "[[arms]]\nname = 'a'\ndelivery = 'none'",
             "arms.delivery: expected 'chosen' or 'shuffled', got 'none'",
@@ -803,7 +811,10 @@ COMPARED = (
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the arms"),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another arm"),
         ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual' or 'files', got 'alive'"),
-        ("[culture]\nkind = 'files'", "culture.files, folders: expected some"),
+        (
+            "[culture]\nkind = 'files'",
+            "culture.files, folders: expected files or folders with kind = 'files', got none",
+        ),
         ("[culture]\nsessions = 0", "culture.sessions: expected at least 1"),
         ("[culture]\ninterval_min = inf", "culture.interval_min: expected a finite number, got inf"),
         ("[simulators]\nwindow_ms = [2]", "simulators.window_ms: expected at least 2 values"),

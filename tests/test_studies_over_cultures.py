@@ -26,6 +26,7 @@ from animat.evaluation.statistics import compare
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
 from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
+from animat.studies.cultures_page import write_cultures_page
 from animat.studies.places import results_file
 from animat.studies.results import write_typed
 from animat.studies.run import Ran, run_study
@@ -62,6 +63,11 @@ def test_seeds_are_what_their_ranges_hold(ranges: list[tuple[int, int]]) -> None
 def test_what_is_no_range_of_seeds_is_refused(text: str) -> None:
     with pytest.raises(InvalidArgument, match="seeds: expected"):
         Source(seeds=text)
+
+
+def test_a_seed_of_too_many_digits_is_refused_as_such() -> None:
+    with pytest.raises(InvalidArgument, match="seeds: expected numbers of at most 9 digits, got '1-99999999999'"):
+        Source(seeds="1-99999999999")
 
 
 @pytest.mark.parametrize(
@@ -141,6 +147,9 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
         "cultures": ["culture-1", "culture-2", "culture-3"],
         "failed": found.failed,
     }
+    page = write_cultures_page(study, replace(found, summary=())).read_text()
+    assert 'finished: <a href="culture-3/report.html">culture-3/report.html</a>' in page
+    assert "<dd>failed: recording 1: no responses</dd>" in page
     table = pd.read_csv(tmp_path / cultures.COMPARISONS)
     assert table["culture"].tolist() == ["culture-1", "culture-3"]
     assert table["mean_second"].tolist() == [1.0, 3.0]

@@ -11,6 +11,7 @@ from animat.report.results import Results
 from animat.studies.episodes import RANDOM, tabulated
 from animat.studies.heuristic import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, beside_heuristic, not_outperforming
 from animat.studies.specification import Arm, RobotSpec, Study
+from animat.studies.tabulating import performances
 
 
 def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
@@ -27,12 +28,15 @@ def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
             told = {"robot": "cartpole", "arm": "1-threshold", "agent": agent, "at_min": at_min}
             parts.append(tabulated(episodes_of(returns), **told))
 
-    rows = tuple(beside_heuristic(study, pd.concat(parts), spec))
+    table = pd.concat(parts)
+    rows = tuple(beside_heuristic(study, table, spec))
     assert [row.outcome for row in rows] == [OUTPERFORM, NOT, NOT, TOO_FEW]
     for row in rows:
         a, b = ours[row.at_min].ravel(), theirs[row.at_min].ravel()
         assert np.isclose(row.p, mannwhitneyu(a, b, method="asymptotic").pvalue)
         assert np.isclose(row.mean_return, np.mean(a)) and np.isclose(row.heuristic, np.mean(b))
+        # To the bit as in the scores, or the two round to different digits.
+        assert row.mean_return == performances(table, "cartpole", arm, row.at_min).mean()
 
     messages = not_outperforming(Results((), (), (), rows, (), ()))
     assert [message.split(": ")[0] for message in messages] == [

@@ -173,6 +173,12 @@ def test_what_is_asked_for_wrongly_is_said(app: Any) -> None:
     assert asked(app, "robot.png", at="-5", **{"in": "session"}).status == 409
 
 
+def test_the_folder_that_one_stands_in_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine").mkdir()
+    monkeypatch.chdir(tmp_path / "mine")
+    assert asked(app_for(Path(), TOKEN, PORT), "things").json["folder"] == "mine"
+
+
 def test_an_empty_folder_says_so_and_is_looked_at_again(tmp_path: Path) -> None:
     app = app_for(tmp_path / "to come", TOKEN, PORT)
     assert asked(app, "things").json == {"folder": "to come", "things": []}

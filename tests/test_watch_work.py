@@ -104,7 +104,7 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     assert block(before, "Entropy")["words"].startswith("Not in these files")
     stopped = TrainingView(tmp_path).view(None, 8.0)
     assert stopped["state"] == "silent"
-    assert "started again it goes on" in stopped["message"]
+    assert "start it again and it continues" in stopped["message"]
     # As all are trained at once: numbers in the file, and words of the first job alone.
     (tmp_path / ".unfinished" / "from-p0.npz").unlink()
     np.savez(tmp_path / ".unfinished" / "at-once-ab.npz", curve=curve, members=np.array([1, 2]), done=np.array(30))
@@ -143,6 +143,12 @@ def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
     assert block(found, "Running")["rows"] == [[jobs[2], "25 %", "a remark"]]
     assert sorted(block(found, "Done")["rows"]) == sorted([job, 2] for job in jobs[:2])
     assert [job for (job,) in block(found, "Waiting")["rows"]] == jobs[3:]
+    # Killed: what ran then waits.
+    killed = StudyView(tmp_path).view(None, 8.0)
+    rows = facts(killed, "Jobs")
+    assert (rows["jobs done"], rows["running"], rows["waiting"]) == (2, 0, len(jobs) - 2)
+    assert [job for (job,) in block(killed, "Waiting")["rows"]] == jobs[2:]
+    assert "was killed or failed" in killed["message"]
     for job in jobs:
         Receipt(job, "x", {}, {"a": "b"}).save(tmp_path / "jobs")
     assert StudyView(tmp_path).view(None, 8.0)["state"] == "silent"
@@ -182,7 +188,7 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
     assert view.about()["title"] == "study over 5 cultures"
     failed = view.view(None, 8.0)
     assert (failed["state"], facts(failed, "Cultures")["failed"]) == ("ended", 1)
-    assert failed["message"] == "1 of the cultures failed; started again it goes on"
+    assert failed["message"] == "1 of the cultures failed; start it again and it continues"
     assert block(failed, "Failed")["rows"] == [[names[4], "no responses"]]
     for damage in (b"comparison,robot,mean_first,mean_second\na and b,arm,nan,4", b"\xff\x00", b"comparison\nx"):
         (tmp_path / names[0] / "tables" / "comparisons.csv").write_bytes(damage)

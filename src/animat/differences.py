@@ -41,12 +41,19 @@ def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Colle
             for key in sorted(set(found) | set(wanted))
             if key not in ignoring
         ]
-    elif isinstance(found, list) and isinstance(wanted, list) and len(found) == len(wanted):
-        pairs = [(one, other, f"{name}[{i}]") for i, (one, other) in enumerate(zip(found, wanted, strict=True))]
+    elif isinstance(found, list) and isinstance(wanted, list) and _are_entered(found, wanted):
+        # What both have; of different lengths they differ at the latest where one ends.
+        pairs = [(one, other, f"{name}[{i}]") for i, (one, other) in enumerate(zip(found, wanted, strict=False))]
+        pairs += [(len(found), len(wanted), f"{name}, how many")]
     else:
         return "" if found == wanted else f"{name}: {_short(found)} there, {_short(wanted)} now"
     told = (first_difference(one, other, place, ignoring=ignoring) for one, other, place in pairs)
     return next((difference for difference in told if difference), "")
+
+
+def _are_entered(found: list[Any], wanted: list[Any]) -> bool:
+    """Whether lists are compared entry by entry: not where they are told as a whole, of different lengths but short."""
+    return len(found) == len(wanted) or max(len(repr(found)), len(repr(wanted))) > _LONGEST
 
 
 def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:

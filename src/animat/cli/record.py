@@ -42,8 +42,8 @@ class Record:
     pulses: int | None = None
     """Pulses per trial, the last one read; default: 1"""
     trials: int | None = None
-    """Presentations at each frequency, and at each place of --places; default: 1000, of several pulses or places (but
-    corners) as many fewer, with --paper 100"""
+    """Presentations at each frequency, and at each place of --places; default: 1000, proportionally fewer with several
+    pulses or places (except corners); with --paper 100"""
     places: str | None = None
     """corners: four places at 20 Hz, for a robot with two commands; halves, quadrants, or a file of JSON with groups of
     electrodes, [[1, 2], [3, 4]]: each at each frequency is a condition then, presented so often; default: at each

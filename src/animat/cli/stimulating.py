@@ -23,7 +23,8 @@ class Stimulating:
     culture_seed: int | None = None
     """Which virtual culture, or which patterns of a CL1; default: of run that of the recordings, else 1"""
     budget_pulses: int | None = None
-    """Most pulses in all, those of live's recordings included; default: no end, but the culture's limits"""
+    """Most pulses in all, those of live's recordings included; default: unlimited, apart from the culture's
+    own limits"""
     budget_per_electrode: int | None = None
     """Most pulses on any one electrode"""
     thresholds: Literal["adaptive", "fixed"] = "adaptive"

@@ -13,13 +13,15 @@ from tyro.conf import Positional
 
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import Fitting, say_findings
-from animat.errors import InvalidArgument, UnusableData, in_min
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_min
 from animat.records import as_json
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
     from animat.responses.readouts import Readouts
+    from animat.robots.base import Robot
+    from animat.training.lessons import Lesson
     from animat.training.policy import Policy
     from animat.training.specification import Training
 
@@ -138,7 +140,6 @@ class Train(Fitting):
         from animat.goals.robot import with_goal
         from animat.responses.readouts import ALL, USUAL_READOUTS, count_readouts, read_readouts
         from animat.robots.registry import robot_named
-        from animat.training.lessons import read_lessons
         from animat.training.specification import Training
 
         robot = robot_named(self.robot, **read_numbers("--parameters", self.parameters))
@@ -169,10 +170,23 @@ class Train(Fitting):
             algorithm=read_sac(self.sac),
             neural_observation=self.neural_observation,
             pulse_cost=self.pulse_cost,
-            lessons=() if self.lessons is None else read_lessons(self.lessons),
+            lessons=self._lessons(robot),
             assess=self.assess,
         )
         return training, readouts
+
+    def _lessons(self, robot: Robot[Any]) -> tuple[Lesson, ...]:
+        """Those of the file, which can be taught to this robot."""
+        from animat.training.lessons import expect_lessons, read_lessons
+
+        if self.lessons is None:
+            return ()
+        lessons = read_lessons(self.lessons)
+        try:
+            expect_lessons(lessons, robot, draws_recordings=self.shadowing == "drawn")
+        except InvalidArgument as error:
+            raise InvalidFile(f"{self.lessons}: {error}") from error
+        return lessons
 
     def _timeline(self, readouts: str | Readouts) -> SimulatorTimeline:
         """The simulators of the recordings."""

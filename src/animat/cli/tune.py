@@ -45,7 +45,8 @@ class TuneFile(Working):
             mean = "diverged" if final.returns is None else f"{final.mean:.4g}"
             cells.append([name, mean, error, settings_in_words(final.settings)])
         policies, episodes = tuning.study.policies, tuning.study.episodes
-        print(f"trained anew, {policies} policies of each in {episodes} fresh episodes each:")
+        counted = "1 policy" if policies == 1 else f"{policies} policies"
+        print(f"trained anew, {counted} of each, in {episodes} fresh episodes per policy:")
         print("\n".join(lined_up(["", "mean return", "s.e.", "settings"], cells)))
         if tuned.importance:
             shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())

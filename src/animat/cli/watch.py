@@ -18,7 +18,7 @@ class Watch:
     folder: Positional[Path]
     """Of a session, a training, a study, a tuning, recordings, or several of these"""
     port: int = 0
-    """That is listened on, on this machine alone; 0: any that is free"""
+    """Port to listen on, on this machine only; 0: any free port"""
     json: bool = False
     """End with a line of JSON"""
 

@@ -176,7 +176,7 @@ def best_returns(
     if episodes and kept_mib > _MOST_MIB:
         raise InvalidArgument(
             f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, of which "
-            f"they take {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations an episode): take a smaller one"
+            f"they take {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations per episode): take a smaller one"
         )
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []

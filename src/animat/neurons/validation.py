@@ -223,7 +223,7 @@ class Validation:
             return f"With care: the {better[-1]} simulator predicts better; train with --simulator {better[-1]}"
         return (
             f"Can be trusted: the held-out distribution is off by {distance:.2f} at most, and the condition is worth "
-            f"{conditions.value:.2f} ± {conditions.error:.2f} bits a trial"
+            f"{conditions.value:.2f} ± {conditions.error:.2f} bits per trial"
         )
 
 

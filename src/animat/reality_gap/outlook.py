@@ -33,22 +33,38 @@ class Outlook:
     @property
     def is_long(self) -> bool:
         """Whether the plan goes beyond the drift or the budget."""
-        drifted_min = np.inf if self.drifted_min is None else self.drifted_min[0]
-        return self.planned_min > min(drifted_min, self.budget_min)
+        return self.planned_min > self._lasts_min
+
+    @property
+    def has_drifted(self) -> bool:
+        """Whether the drift was so large already before the session."""
+        return self.drifted_min is not None and self.drifted_min[0] <= 0
+
+    @property
+    def _lasts_min(self) -> float:
+        return min(np.inf if self.drifted_min is None else self.drifted_min[0], self.budget_min)
 
     def __str__(self) -> str:
         if self.drifted_min is None:
             drift = "how the culture drifts is known from two recordings on"
         else:
-            likely, least = (max(0.0, each) for each in self.drifted_min)
-            drift = (
-                f"by the recordings' drift the median response has changed by {100 * LARGE:.0f} % in "
-                f"{_words(likely)} ({_words(least)} at least), beyond which adaptive thresholds may not help"
-            )
+            likely, least = self.drifted_min
+            drift = f"by the recordings' drift the median response {_when(likely, least)}, beyond which adaptive "
+            drift += "thresholds may not help"
         said = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
         if np.isfinite(self.budget_min):
             said += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
-        return said + ("; the plan is longer: ask for fewer --episodes" if self.is_long else "")
+        if self.has_drifted:
+            said += "; take newer recordings, with --at-min or by recording again"
+        lasts_min = self.budget_min if self.has_drifted else self._lasts_min
+        return said + ("; the plan is longer: ask for fewer --episodes" if self.planned_min > lasts_min else "")
+
+
+def _when(likely: float, least: float) -> str:
+    by = f"by {100 * LARGE:.0f} %"
+    if likely <= 0:
+        return f"had changed {by} already {_words(-likely)} ago"
+    return f"has changed {by} in {_words(likely)} ({_words(max(0.0, least))} at least)"
 
 
 def _words(minutes: float) -> str:

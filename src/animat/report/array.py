@@ -35,7 +35,8 @@ def draw_array(recording: Recording) -> Figure:
     of_rates: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
     drawn = axes.scatter(*places_um, s=9, linewidths=0, **of_rates)
     bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
-    bar.set_label("firing rate, stimulated time included (Hz)", fontsize=8)
+    included = ", stimulated time included" if len(stimuli) else ""
+    bar.set_label(f"firing rate{included} (Hz)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     stimulated = np.unique(stimuli.electrodes[stimuli.electrodes != UNKNOWN])
     place = {int(e): i for i, e in enumerate(channels.electrode.tolist()) if e != UNKNOWN and known[i]}

@@ -66,7 +66,8 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     conditions = series[0].conditions[:_MOST_CONDITIONS]
     colours = condition_colours([condition.unit for condition in series[0].conditions])
     for i, condition in enumerate(conditions):
-        middle.plot(minutes, drift.shares[:, i], color=colours[i], marker="o", markersize=3, label=condition.label)
+        line = {"color": colours[i], "marker": "o", "markersize": 3, "clip_on": False}
+        middle.plot(minutes, drift.shares[:, i], label=condition.label, **line)
     middle.axhline(0.5, color=GREY, linewidth=0.8, linestyle="--")
     middle.set_ylim(0, 1)
     left_out = len(series[0].conditions) - len(conditions)
@@ -74,7 +75,7 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     style_axes(middle, title, "", "P(x ≥ P50)")
     add_legend(middle, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    lower.plot(minutes, drift.bursts, color=BURST, marker="o", markersize=3)
+    lower.plot(minutes, drift.bursts, color=BURST, marker="o", markersize=3, clip_on=False)
     lower.set_ylim(0, max(0.1, 1.1 * float(np.nan_to_num(drift.bursts).max())))
     style_axes(lower, "responses that are bursts", "start of the recording (min)", "share")
     return figure

@@ -20,12 +20,24 @@ TEMPLATE = "report.html.j2"
 MINUS = "\u2212"
 
 # Not within a word, a range such as 2-10, an option or a file's name; the exponent's of 1.5e-05 is one.
-_HYPHEN = re.compile(r"(?:(?<![\w.\-/])-(?=\.?\d))|(?<=\de)-(?=\d)")
+_HYPHEN = re.compile(r"(?:(?<![\w.\-/+])-(?=\.?\d))|(?<=\de)-(?=\d)")
 
 
 def with_minus(text: str) -> str:
-    """A text with a minus sign before each negative number, in place of a hyphen."""
-    return _HYPHEN.sub(MINUS, text)
+    """A text with a minus sign before each negative number, in place of a hyphen, and one sign before an error."""
+    return _HYPHEN.sub(MINUS, text).replace("+- ", "± ")
+
+
+def with_links(text: str, files: Sequence[str] = ()) -> str:
+    """The same as HTML, in which each of these files is a link where it is named."""
+    from markupsafe import Markup, escape
+
+    # The longest first: another's name can be its end.
+    names = "|".join(re.escape(with_minus(file)) for file in sorted(files, key=len, reverse=True))
+    parts = re.split(f"({names})", with_minus(text)) if names else [with_minus(text)]
+    # Every second part is a name.
+    linked = (Markup('<a href="{0}">{0}</a>').format(part) if i % 2 else escape(part) for i, part in enumerate(parts))
+    return Markup("").join(linked)
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,10 @@ def table_of(title: str, records: Sequence[Any], columns: Columns, **more: Any) 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: paragraphs, then points of a list, figures, tables, and a text as it stands in a file."""
+    """A section of the page: paragraphs, then points of a list, figures, tables, and a text as it stands in a file.
+
+    Files of `links`, relative to the page, are links where paragraphs and points name them.
+    """
 
     title: str
     paragraphs: tuple[str, ...] = ()
@@ -116,6 +131,7 @@ class Section:
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
     verbatim: str = ""
+    links: tuple[str, ...] = ()
 
     @property
     def anchor(self) -> str:
@@ -143,7 +159,7 @@ def write_page(
         lstrip_blocks=True,
     )
     environment.filters["cell"] = cell
-    environment.filters["prose"] = with_minus
+    environment.filters["prose"] = with_links
     text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
     return write_whole(Path(path), text)
 

@@ -10,6 +10,7 @@ from jaxtyping import Float64, Int64
 from animat.recordings.recording import Recording
 from animat.report.style import (
     BLACK,
+    BLUE,
     RED,
     WINDOW,
     Axes,
@@ -20,7 +21,7 @@ from animat.report.style import (
     style_axes,
 )
 from animat.responses.responses import Responses
-from animat.responses.windows import spikes_in
+from animat.responses.windows import HALF_NS_S, spikes_in
 from animat.tables import evenly
 
 _MOST_STIMULI = 300
@@ -47,6 +48,8 @@ def draw_raster(recording: Recording, responses: Responses) -> Figure:
 
 def _draw_stretch(axes: Axes, recording: Recording) -> None:
     """All channels over the time of the recording's middle six stimuli; without any, over the whole recording."""
+    from matplotlib.ticker import MaxNLocator
+
     times_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
     from_s, to_s = recording.start_s, max(recording.stop_s, recording.start_s + 1e-3)
     shown = times_s[max(0, len(times_s) // 2 - 3) : len(times_s) // 2 + 3]
@@ -64,6 +67,7 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
     axes.set_xlim(from_s, to_s)
     axes.set_ylim(-1, len(recording.channels))
     title = f"{len(inside)} stimuli in the middle of the recording, each spike a dot" if len(inside) else "every spike"
+    axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
     style_axes(axes, title, "time (s)", "channel (row)")
 
 
@@ -73,7 +77,8 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     times_s = np.empty(0) if responses.time_s is None else responses.time_s
     chosen = evenly(len(times_s), _MOST_STIMULI)
     chosen = chosen[np.argsort(responses.condition[chosen], kind="stable")]
-    row, spike = spikes_in(recording, times_s[chosen] + from_ms * 1e-3, times_s[chosen] + to_ms * 1e-3)
+    from_s, to_s = from_ms * 1e-3 - HALF_NS_S, to_ms * 1e-3 - HALF_NS_S
+    row, spike = spikes_in(recording, times_s[chosen] + from_s, times_s[chosen] + to_s)
     lag_ms = 1e3 * (recording.spike_times_s[spike] - times_s[chosen[row]])
     condition = responses.condition[chosen]
     are_dots = len(spike) <= _MOST_DOTS
@@ -97,7 +102,8 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     every = max(1, -(-len(drawn) // _MOST_LABELS))
     axes.set_yticks(middle[::every], [responses.conditions[i].label for i in drawn[::every]])
     for edge in first[1:].tolist():
-        axes.axhline(edge - 0.5, color=BLACK, linewidth=0.6)
+        # Not black, as a row of a burst is.
+        axes.axhline(edge - 0.5, color=BLUE, linewidth=0.8)
     axes.set_xlim(from_ms, to_ms)
     axes.set_ylim(-0.5, max(len(chosen), 1) - 0.5)
     thinned = "" if len(chosen) == len(times_s) else f"{len(chosen)} of "
@@ -116,7 +122,7 @@ def _draw_rates(
 ) -> None:
     """The rate in each row and bin as a shade: dots of so many spikes would run into one."""
     edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
-    count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(rows + 1) - 0.5, edges_ms])
+    count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(rows + 1) - 0.5, edges_ms - 1e3 * HALF_NS_S])
     rate_hz = 1e3 * count / channels / (edges_ms[1] - edges_ms[0])
     # A burst in a row or two must not leave all others pale.
     drawn = axes.imshow(

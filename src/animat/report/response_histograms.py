@@ -37,12 +37,12 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
         share = f", P(x ≥ P50) = {shares[i]:.2f}" if len(x) else ""
         style_axes(axes, f"{responses.conditions[i].label}: n = {len(x):,}{share}", "", "fraction")
         if math.isfinite(responses.median_rate_hz):
-            label = f"P50 = {responses.median_rate_hz:.1f} Hz"
+            label = f"P50 = {responses.median_rate_hz:.3g} Hz"
             axes.axvline(responses.median_rate_hz, color=MEDIAN, linewidth=1.2, linestyle="--", label=label)
         if last is not None and math.isfinite(last.median_rate_hz):
             x = last.rates_of(i)
             axes.stairs(np.histogram(x, edges_hz)[0] / max(len(x), 1), edges_hz, color=BLACK, linewidth=1.2)
-            label = f"P50 at {last.start_min:g} min = {last.median_rate_hz:.1f} Hz"
+            label = f"P50 at {last.start_min:g} min = {last.median_rate_hz:.3g} Hz"
             axes.axvline(last.median_rate_hz, color=BLACK, linewidth=1.2, linestyle=":", label=label)
         if i == drawn[0] and axes.lines:
             add_legend(axes, loc="best")

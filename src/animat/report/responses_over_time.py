@@ -19,13 +19,18 @@ _MOST_CONDITIONS = 8
 def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     """A column a condition, a row a recording, the first at the top: its non-burst responses, and their median.
 
-    At most 20 recordings, evenly over the series, and 8 conditions are drawn; the title says so. All recordings, in the
-    order of time, have the same conditions.
+    At most 20 recordings, evenly over the series, and 8 conditions are drawn, up to one and a half times the 99th
+    percentile of all responses; the title says what is not. All recordings, in the order of time, have the same
+    conditions.
     """
     shown = [series[row] for row in evenly(len(series), _MOST_ROWS)]
     conditions = shown[0].conditions[:_MOST_CONDITIONS]
     rates = [[responses.rates_of(i) for responses in shown] for i in range(len(conditions))]
-    edges_hz = rate_edges(shown[0], np.concatenate([x for of in rates for x in of]), _BINS)
+    all_hz = np.concatenate([x for of in rates for x in of])
+    # A few bursts that no threshold set apart must not squeeze all others into one bin.
+    reach_hz = 1.5 * float(np.quantile(all_hz, 0.99)) if len(all_hz) else 0.0
+    edges_hz = rate_edges(shown[0], all_hz[all_hz <= reach_hz], _BINS)
+    beyond = int(np.count_nonzero(all_hz > edges_hz[-1]))
     columns = len(conditions) if len(conditions) <= 5 else 4
     down = -(-len(conditions) // columns)
     figure = new_figure(1.0 + (2.2 if columns <= 4 else 1.9) * columns, 0.6 + down * (0.7 + 0.3 * len(shown)))
@@ -53,6 +58,8 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
         left_out.append(f"{len(shown)} of {len(series)} recordings")
     if len(conditions) < len(shown[0].conditions):
         left_out.append(f"{len(conditions)} of {len(shown[0].conditions)} conditions")
+    if beyond:
+        left_out.append(f"{beyond:,} of {len(all_hz):,} responses are larger than {edges_hz[-1]:.3g} Hz and not drawn")
     if left_out:
         figure.suptitle(", ".join(left_out), fontsize=10)
     figure.supxlabel("response x (Hz per channel)", fontsize=9)

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from animat.errors import InvalidArgument
 from animat.writing import atomic_write
 
@@ -58,14 +60,22 @@ def add_legend(axes: Axes, **place: Any) -> None:
 
 
 def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -> None:
-    """One legend under a figure for all its panels: whatever has a name in any of them, each name once."""
+    """One legend under a figure for all its panels: what has a name in any of them, once, in as many columns as fit."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
+        while columns > 1 and _legend_in(list(entries), columns) > figure.get_figwidth():
+            columns -= 1
         place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
         figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
+
+
+def _legend_in(labels: Sequence[str], columns: int) -> float:
+    """About how wide a legend in letters of 8 points is, in inches: of each column its longest label and a sample."""
+    parts = np.array_split(np.array([len(label) for label in labels]), columns)
+    return sum(0.53 + 0.062 * float(part.max()) for part in parts if len(part))
 
 
 def condition_colours(units: Sequence[str]) -> list[str]:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.errors import InvalidArgument
 from animat.recordings.recording import Recording
+from animat.responses.windows import HALF_NS_S
 
 # Spikes before a stimulus count as spontaneous from 100 ms after the previous one (the longest direct responses known
 # to us are over by then; a longer window moves it), until 20 ms before the next (filters smear artefacts backwards),
@@ -70,8 +71,8 @@ def post_stimulus_histogram(
 
     Args:
         from_ms, to_ms: the span, from the stimulus; negative is before it. It grows to a whole number of bins.
-        bin_ms: width of the bins, which are half-open and compared as in `count_spikes`, so that bins inside a window
-            add up to the spikes of that window.
+        bin_ms: width of the bins, which are half-open, of lags rounded to a nanosecond. So bins inside a window add
+            up to the spikes of that window (`animat.responses.windows.count_spikes`), but for those on its edges.
         stimuli: which pulses to take, shape (stimuli,); None for those that end a presentation.
 
     Raises:
@@ -86,7 +87,8 @@ def post_stimulus_histogram(
     # The small number keeps 70.000000001 bins from becoming 71.
     n_bins = max(1, math.ceil((to_ms - from_ms) / bin_ms - 1e-9))
     edges_ms = from_ms + bin_ms * np.arange(n_bins + 1)
-    before = np.array([np.searchsorted(recording.spike_times_s, times_s + edge * 1e-3).sum() for edge in edges_ms])
+    edges_s = edges_ms * 1e-3 - HALF_NS_S
+    before = np.array([np.searchsorted(recording.spike_times_s, times_s + edge_s).sum() for edge_s in edges_s])
     return PostStimulusHistogram(edges_ms, np.diff(before.astype(np.int64)), len(times_s), len(recording.channels))
 
 

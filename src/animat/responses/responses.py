@@ -1,4 +1,4 @@
-"""The culture's responses: what a stimulus of each condition makes it do, one row a stimulus."""
+"""The culture's responses: what a stimulus of each condition makes it do, one row per stimulus."""
 
 from __future__ import annotations
 

@@ -14,6 +14,9 @@ from animat.errors import InvalidArgument, expect_several, shown
 
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
+HALF_NS_S = 0.5e-9
+"""Histograms of lags begin each bin so much earlier, as if lags were rounded to a nanosecond: else the rounding of
+differences would decide about lags on an edge, where times on a sampling grid often lie."""
 
 
 class Spiking(Protocol):

@@ -50,7 +50,7 @@ class Presentation:
     pulses: Pulses = 1
 
     def __str__(self) -> str:
-        return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} a trial"
+        return f"{self.order}, {self.pulses} pulse{'' if self.pulses == 1 else 's'} per trial"
 
 
 @record

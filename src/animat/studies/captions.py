@@ -9,30 +9,30 @@ HEADLINE = (
     "Each line is an arm, explained in the table below, at the last recording that it was evaluated on; further right "
     "is better. Small dots: each policy's mean return. Large dot: their interquartile mean (that of the middle half), "
     "with its 95 % interval; an arrow says that the interval goes on beyond the axis. Crosses: random actions. Bars: "
-    "the optimal return, which no controller can exceed, where it is known. {policies} policies an arm."
+    "the optimal return, which no controller can exceed, where it is known. {policies} policies per arm."
 )
 
 CULTURE: dict[str, tuple[str, str]] = {
     "array": (
         "the array",
-        "The array from above: a dot a recording site, the brighter the more it fires, a circle round each electrode "
-        "that was stimulated. The first recording, {channels} channels.",
+        "The array from above: one dot per recording site, the brighter the more it fires, and a circle round each "
+        "electrode that was stimulated. The first recording, {channels} channels.",
     ),
     "raster": (
         "spikes around stimuli",
         "Above: each spike of a short stretch of the first recording; rows are channels. Below: what follows each "
-        "stimulus, a row a stimulus; the darker, the more spikes. Between the two yellow lines a response is read.",
+        "stimulus, one row per stimulus; the darker, the more spikes. Between the two yellow lines a response is read.",
     ),
     "psth": (
         "post-stimulus time histogram",
-        "Mean rate of a channel against the time from the stimulus, over all {responses} stimuli of the first "
-        "recording; responses are read in the shaded window.",
+        "Mean rate per channel against the time from the stimulus, over all stimuli of the first recording; above "
+        "stands how many there are. Responses are read in the shaded window.",
     ),
     "bursts": (
         "bursts set apart",
-        "A dot a response, {responses} of the first recording. A burst activates many channels at once: what lies "
-        "right of the dashed threshold (Otsu's) counts as one. Bursts come regardless of the stimulus and are left "
-        "out.",
+        "The {responses} responses of the first recording: how often each size x occurs, x against the share of "
+        "active channels, one dot per response, and how often each share occurs. A burst activates many channels at "
+        "once. {cut}",
     ),
     "responses": (
         "responses to each stimulus",
@@ -43,34 +43,42 @@ CULTURE: dict[str, tuple[str, str]] = {
     ),
     "over-time": (
         "each stimulus over time",
-        "A column a stimulus, a row a recording, from top to bottom; the mark is the median. A histogram that moves "
-        "left is a culture that answers with less. Bursts are left out.",
+        "One column per stimulus, one row per recording, from top to bottom; the mark is the median. A histogram that "
+        "moves left is a culture that answers with less. Bursts are left out. Shares are of all responses; above "
+        "stands how many lie beyond the axis, if any.",
     ),
     "drift": (
         "drift",
-        "Above: percentiles of all responses. Middle: how often each stimulus is answered above the median of all; "
-        "curves that come together are control that is lost. Below: the share of bursts. {recordings} recordings of "
-        "about {responses} responses each.",
+        "Above: percentiles of all non-burst responses. Middle: how often each stimulus is answered above their "
+        "median; curves that come together are control that is lost. Below: the share of bursts. {recordings} "
+        "recordings of about {responses} responses each.",
     ),
 }
+
+BURSTS = (
+    "Right of the dashed threshold a response counts as one, as in the last panel. Bursts come regardless of the "
+    "stimulus and are left out."
+)
+NO_BURSTS = "Here no response is set apart as one, so there is no threshold."
+"""Of `bursts`, for {cut}."""
 
 ROBOT: dict[str, tuple[str, str]] = {
     "learning": (
         "learning curves",
         "Return against iterations of training; up is better. Thin: each of {policies} policies. Thick: their mean "
         "with its 95 % bootstrap interval. Each point is over the episodes that ended within the {round} iterations "
-        "before, in which every environment ends at least one; curves begin there, as the first to end are no fair "
-        "sample. Actions are drawn. Lines: random actions and the optimal return with the simulator in use, which "
-        "steps on with it (from the second recording on: on a rough grid). A control has no such return: whatever it "
-        "chooses is as good as random.",
+        "before, in which every environment ends at least one; curves begin there, because the first episodes to end "
+        "are not a representative sample. Actions are drawn. Lines: random actions and the optimal return with the "
+        "simulator in use, which steps on with it (from the second recording on: on a rough grid). A control has no "
+        "such return: whatever it chooses is as good as random.",
     ),
     "comparisons": (
         "comparisons",
-        "A column a comparison, {policies} policies a side, each a point: its mean return over the episodes. Boxes: "
-        "quartiles and median; whiskers reach to the furthest point within 1.5 times the box's height. Above with "
-        "random actions and the optimal return, below close up. Stars: * p < 0.05, ** p < 0.01, *** p < 0.001, n.s. "
-        "neither; p is two-sided, Mann-Whitney, normal approximation, corrected by Holm: “p corrected” of the table. "
-        "Score, under each arm: (mean − random) / (optimal − random).",
+        "One column per comparison, {policies} policies per side, each a point: its mean return over the episodes. "
+        "Boxes: quartiles and median; whiskers reach to the furthest point within 1.5 times the box's height. Above "
+        "with random actions and the optimal return, below close up. Stars: * p < 0.05, ** p < 0.01, *** p < 0.001, "
+        "n.s. neither; p is two-sided, Mann-Whitney, normal approximation, corrected by Holm: “p corrected” of the "
+        "table. Score, under each arm: (mean − random) / (optimal − random).",
     ),
     "over-time": (
         "at every recording",
@@ -82,18 +90,18 @@ ROBOT: dict[str, tuple[str, str]] = {
     ),
     "controls": (
         "controls",
-        "A line an agent; further right is better. A control that does as well as trained policies says that what it "
-        "lacks was not needed. Whiskers: standard errors over policies (for a control of one actor: over episodes), of "
-        "{episodes} episodes each where no comparison says otherwise.",
+        "One line per agent; further right is better. A control that does as well as trained policies says that what "
+        "it lacks was not needed. Whiskers: standard errors over policies (for a control of one actor: over "
+        "episodes), of {episodes} episodes each where no comparison says otherwise.",
     ),
     "paths": (
         "episodes",
         "One episode of each policy at the last recording. Blue: it arrived, or stayed up to the end; orange: not. "
-        "Examples: the figures above count.",
+        "These are only examples; rely on the figures above.",
     ),
     "frames": (
         "frames",
-        "From the start of an episode to its end; the number under a frame is the iteration. One episode an arm, that "
+        "From the start of an episode to its end; the number under a frame is the iteration. One episode per arm, that "
         "of middle length: an example.",
     ),
 }

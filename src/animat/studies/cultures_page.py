@@ -26,9 +26,10 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"over-cultures.{ending}")
         sections.append(_in_short(study, found))
-    points = [(name, f"finished: {name}/{REPORT}") for name in found.ran]
+    pages = tuple(f"{name}/{REPORT}" for name in found.ran)
+    points = [(name, f"finished: {page}") for name, page in zip(found.ran, pages, strict=True)]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
-    sections.append(Section("Each culture", points=tuple(points)))
+    sections.append(Section("Each culture", points=tuple(points), links=pages))
     cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
     lead = f"{cultures}. {many_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
+
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import LARGEST_LOSS
 from animat.report.results import ComparedReturns
+from animat.responses.bursts import otsu_threshold
+from animat.responses.responses import Responses
+from animat.studies.paper import PRINTED
+from animat.studies.source import Source
 from animat.studies.specification import Study
 from animat.studies.tabulating import LEVEL
 
 AIM = 0.97
 """Normalised score from which an arm counts as being as good as its optimum allows."""
+
+PAPER_POLICIES = 10
+"""Per arm. Source: Sawada et al. 2022."""
 
 _CULTURES = {
     "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
@@ -20,9 +29,40 @@ _CULTURES = {
 }
 
 
-def decisions(study: Study) -> tuple[tuple[str, str], ...]:
-    """What the paper leaves open or contradicts, and what this study does about it."""
-    return (*_of_culture(study), *_of_commands(study), *_of_simulators(study), *_of_learning(study))
+def decisions(study: Study, series: Sequence[Responses] = ()) -> tuple[tuple[str, str], ...]:
+    """What the paper leaves open or contradicts, and what this study does about it, with these responses."""
+    return (
+        *_of_size(study),
+        *_of_culture(study),
+        *_of_commands(study),
+        *_of_simulators(study, series),
+        *_of_learning(study),
+    )
+
+
+def _of_size(study: Study) -> Iterator[tuple[str, str]]:
+    """Where there are more or fewer recordings, policies or iterations."""
+    here, papers = study.culture, Source()
+    if here.kind == "virtual" and _recorded(here) != _recorded(papers):
+        yield "Recordings", f"The paper has {_recorded(papers)}. Here there are {_recorded(here)}."
+    if study.policies != PAPER_POLICIES:
+        yield "Policies", f"The paper has {PAPER_POLICIES} per arm. Here there are {study.policies}."
+    trained = [spec for spec in study.robots if (spec.kind or spec.name) in {robot for _, robot in PRINTED}]
+    for spec in trained:
+        if spec.trained_for != (papers_own := spec.robot().paper_iterations):
+            yield (
+                f"Iterations on {spec.name}",
+                f"The paper trains a policy for {papers_own:,}. Here it is trained for {spec.trained_for:,}.",
+            )
+
+
+def _recorded(culture: Source) -> str:
+    mixed = "frequencies mixed" if culture.order == "mixed" else "each frequency in a block"
+    pulses = "" if culture.pulses == 1 else f" of {culture.pulses} pulses"
+    return (
+        f"{culture.sessions} recordings, {culture.interval_min:g} minutes apart, of {culture.trials:,} trials of each "
+        f"stimulus{pulses}, {mixed}"
+    )
 
 
 def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
@@ -38,7 +78,7 @@ def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
 def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
     if any(arm.mapping == "9-thresholds" for arm in study.arms):
         yield (
-            "Nine levels without zero",
+            "Ten levels without zero",
             "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
             "eleven. Zero is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
         )
@@ -46,8 +86,9 @@ def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
         yield from spec.robot().departures()
 
 
-def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
+def _of_simulators(study: Study, series: Sequence[Responses]) -> Iterator[tuple[str, str]]:
     simulators = study.simulators
+    yield "Bursts", f"In the paper Otsu's threshold always cuts. {_cut(simulators.burst_threshold, series)}"
     papers = "The paper's 20 bins reach from 0 to 120 Hz, chosen for its culture. "
     if simulators.kind == "empirical":
         yield "Histogram", papers + "Here there are none: one of the measured responses is drawn."
@@ -82,6 +123,24 @@ def _of_simulators(study: Study) -> Iterator[tuple[str, str]]:
         "The paper does not say which recording the thresholds are taken from. Here they come from the recording whose "
         "simulator is in use, so "
         + ("they move, except in the arms with those of the first recording." if fixed else "they move with it."),
+    )
+
+
+def _cut(threshold: float | None, series: Sequence[Responses]) -> str:
+    """What sets bursts apart here, and how many responses stay that would not in the paper."""
+    if threshold is not None:
+        return f"Here the threshold is given: {threshold:g} of the channels."
+    here = (
+        "Here its cut is kept only where the ratios of active channels form two groups; elsewhere no response is set "
+        "apart."
+    )
+    if not series:
+        return here
+    uncut = [of.active_ratio for of in series if not of.is_burst.any()]
+    above = [n for ratios in uncut if (n := int(np.count_nonzero(ratios > otsu_threshold(ratios))))]
+    return (
+        f"{here} That is so in {len(above)} of {len(series)} recordings, which keep {sum(above):,} of "
+        f"{sum(map(len, series)):,} responses that the paper's rule would leave out."
     )
 
 
@@ -148,7 +207,9 @@ def explain(row: ComparedReturns) -> str:
     n = row.n
     smallest = p_of_u(0.0, n, n)
     if smallest >= LEVEL:
-        return f"With {n} policies a side p cannot fall below {smallest:.2g}, however they differ: take more policies."
+        return (
+            f"With {n} policies per side p cannot fall below {smallest:.2g}, however they differ: take more policies."
+        )
     first, second, random = row.optimum_first, row.optimum_second, row.random_second
     if second is None or random is None:
         return "There is no optimum to compare with."

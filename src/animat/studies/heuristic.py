@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from animat.evaluation.verdict import beside, is_worse
 from animat.report.results import BesideHeuristic, Results
-from animat.studies.episodes import POLICY, DataFrame
+from animat.studies.episodes import POLICY, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
 from animat.studies.specification import RobotSpec, Study, named_mapping
 
@@ -20,14 +20,15 @@ def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterato
     for arm in filter(is_usual, study.arms):
         through = named_mapping(*arm.kind)
         heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
-        policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")["return"]
+        policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")
         rule = {at_min: returns.to_numpy() for at_min, returns in heuristic}
-        for at_min, returns in policies:
+        for at_min, episodes in policies:
             if at_min in rule:
-                ours, theirs = returns.to_numpy(), rule[at_min]
+                ours, theirs = episodes["return"].to_numpy(), rule[at_min]
                 found = beside(ours, theirs)
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.can_tell else TOO_FEW
-                means = float(ours.mean()), float(theirs.mean())
+                # Of the policies' means, as in the scores: another order of summing can round to another digit.
+                means = float(mean_returns(episodes).mean()), float(theirs.mean())
                 yield BesideHeuristic(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
 
 

@@ -19,8 +19,9 @@ from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.style import FORMATS, save_figure
+from animat.responses.responses import Responses
 from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
-from animat.studies.captions import CULTURE, HEADLINE, ROBOT
+from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT
 from animat.studies.differences import came_out_otherwise, decisions
 from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
@@ -56,9 +57,10 @@ class Publish(StudyTask):
         study, manifest = self.study, json.loads((folder / MANIFEST).read_text())
         results = read_typed(results_file(folder), Results)
         kept: dict[float, Fidelity] = {}
+        series: list[Responses] = []
         if study.needs_neurons:
-            timeline = load_timeline(folder / TIMELINE)
-            kept = controllability(timeline)
+            kept = controllability(load_timeline(folder / TIMELINE))
+            series = read_series(study, folder, as_one=True)
         headline = _headline(study, results, all_episodes(study, folder, study.robots))
         figure = draw_headline(headline)
         drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
@@ -69,12 +71,17 @@ class Publish(StudyTask):
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
         if kept:
             table = controllability_shown(study, folder, kept)
-            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(study, folder))
+            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(series))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
-            sections.append(_differences(study, results, kept))
-        settings = "All settings, as in study.toml, with which animat study makes the same study again."
+            sections.append(_differences(study, results, kept, series))
+        settings = "All settings, as in study.toml, with which animat study makes the same study again"
+        settings += (
+            ", where the files are found under the same paths from where study.toml lies."
+            if study.culture.kind == "files"
+            else "."
+        )
         sections += [_noticed(results), Section("How it was done", (settings,), verbatim=study_to_toml(study))]
         versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
         colophon = [
@@ -135,7 +142,7 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
-            f"With {study.policies} policies a side no p can fall below {smallest:.2g}: this is a first look, not a "
+            f"With {study.policies} policies per side no p can fall below {smallest:.2g}: this is a first look, not a "
             "result."
         )
     picture = Picture(
@@ -254,13 +261,13 @@ def _facts_of_robot(study: Study, spec: RobotSpec) -> dict[str, str]:
     }
 
 
-def _facts_of_culture(study: Study, folder: Path) -> dict[str, str]:
+def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
     """On how much the figures of the culture rest."""
-    series = read_series(study, folder, as_one=True)
     return {
         "channels": f"{series[0].n_channels:,}",
         "responses": f"{len(series[0]):,}",
         "recordings": f"{len(series)}",
+        "cut": BURSTS if series[0].is_burst.any() else NO_BURSTS,
     }
 
 
@@ -291,7 +298,10 @@ def _controls(study: Study, results: Results) -> Section:
         ),
         ("silent", "The trained policies, but no pulse; what is there without stimuli is read (0 on a simulator)."),
         ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
-        ("coupling", "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and goal."),
+        (
+            "coupling",
+            "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and without a goal.",
+        ),
     )
     beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
     told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
@@ -303,7 +313,9 @@ def _controls(study: Study, results: Results) -> Section:
     )
 
 
-def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity]) -> Section:
+def _differences(
+    study: Study, results: Results, kept: Mapping[float, Fidelity], series: Sequence[Responses]
+) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
     lost = {at_min: of.largest_loss for at_min, of in kept.items()}
     otherwise = came_out_otherwise(rows, lost)
@@ -314,7 +326,7 @@ def _differences(study: Study, results: Results, kept: Mapping[float, Fidelity])
     ]
     if rows and not otherwise:
         paragraphs.append("Every comparison came out as in the paper.")
-    return Section("Differences from the paper", tuple(paragraphs), (*otherwise, *decisions(study)))
+    return Section("Differences from the paper", tuple(paragraphs), (*otherwise, *decisions(study, series)))
 
 
 def _noticed(results: Results) -> Section:
@@ -329,4 +341,4 @@ def _noticed(results: Results) -> Section:
         (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()
     )
     left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)
-    return Section("Findings", (said,), left_out, table)
+    return Section("Findings", (said,), left_out, table, links=("tables/findings.csv",))

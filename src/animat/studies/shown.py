@@ -238,8 +238,8 @@ def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
             ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
             ("context score", _interval("score", "score_low_95", "score_high_95")),
         ],
-        note="Best coupling: a fixed rule from what is sensed to a stimulus, without memory and goal, found by a "
-        "search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
+        note="Best coupling: a fixed rule from what is sensed to a stimulus, without memory and without a goal, found "
+        "by a search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
         "score: (policies − coupling) / (optimum − coupling), where the task needs more. With 95 % intervals.",
         beside="tables/reflexes.csv",
     )

@@ -15,6 +15,7 @@ from animat.records import Positive, Seed, Whole, record
 from animat.stimulation.protocol import TWO_COMMANDS, Protocol
 
 MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
+MOST_DIGITS = 9
 """Recordings, trials in each, and entries of a list; `docs/studies.md` states them."""
 
 LISTED = Field(max_length=MOST_ENTRIES)
@@ -50,7 +51,9 @@ class Source:
     folders: Annotated[tuple[str, ...], LISTED] | None = None
 
     def __post_init__(self) -> None:
-        if (self.kind == "files") != bool(self.files or self.folders):
+        if self.kind == "files" and not (self.files or self.folders):
+            raise InvalidArgument("files, folders: expected files or folders with kind = 'files', got none")
+        if self.kind != "files" and (self.files or self.folders):
             n = len(self.files) + len(self.folders or ())
             raise InvalidArgument(f"files, folders: expected some for kind = 'files' only, got {n} for {self.kind!r}")
         if self.files and self.folders:
@@ -92,7 +95,9 @@ def read_seeds(text: str) -> list[int]:
     """Seeds that are written as numbers and ranges, such as `1-5, 8`; InvalidArgument for all else, or too many."""
     seeds: list[int] = []
     for part in text.split(","):
-        found = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", part)
+        found = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", part)
+        if found and max(len(each or "") for each in found.groups()) > MOST_DIGITS:
+            raise InvalidArgument(f"seeds: expected numbers of at most {MOST_DIGITS} digits, got {shown(text)}")
         first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, -1)
         if last < first:
             raise InvalidArgument(f"seeds: expected numbers and ranges, such as '1-5, 8', got {shown(text)}")

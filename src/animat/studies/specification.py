@@ -166,7 +166,13 @@ class Arm:
     trained: Flag = True
 
     def __post_init__(self) -> None:
-        if self.through_neurons and not is_ours(mapping := mapping_named(self.mapping)):
+        if not self.through_neurons:
+            return
+        try:
+            mapping = mapping_named(self.mapping)
+        except InvalidArgument as error:
+            raise InvalidArgument(f"{error}; none is without neurons") from error
+        if not is_ours(mapping):
             # Workers know it by that.
             object.__setattr__(self, "mapping", place_of(type(mapping)))
 
@@ -291,7 +297,7 @@ class Study:
                 except InvalidArgument as error:
                     raise InvalidArgument(f"robots.lessons: {error} ({spec.name}, {arm.name})") from error
         _expect_unlike("robots", [spec.name for spec in self.robots])
-        _expect_unlike("arms", [arm.slug for arm in self.arms])
+        _expect_unlike("arms", [arm.slug for arm in self.arms], ": capitals, and spaces for dashes, make no difference")
         _expect_unlike("comparisons", [compared.name for compared in self.comparisons])
         # All policies are evaluated side by side.
         for name, episodes in (
@@ -379,7 +385,7 @@ class Study:
         return any(arm.through_neurons for arm in self.arms)
 
 
-def _expect_unlike(what: str, names: Sequence[str]) -> None:
+def _expect_unlike(what: str, names: Sequence[str], note: str = "") -> None:
     for name, times in Counter(names).items():
         if times > 1:
-            raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times")
+            raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times{note}")

@@ -211,7 +211,7 @@ def outcome_of(told: Comparison) -> str:
     """In words: which arm is better, that neither was found to be, or that it could not have been found."""
     if told.p_normal < LEVEL:
         return SECOND if told.effect.value > 0 else FIRST
-    # With four policies a side even U = 0 has p = 0.03: nothing could be found, which says nothing of a difference.
+    # With four policies per side even U = 0 has p = 0.03: nothing could be found, which says nothing of a difference.
     return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
 
 

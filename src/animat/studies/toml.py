@@ -54,6 +54,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
     """The study of a file's plain data; errors as those of `read_study`."""
+    if "tune" in data:
+        raise InvalidFile(f"{path}: expected a study, got the file of a tuning, with [tune]: give it to animat tune")
     for name in ("robots", "arms", "comparisons"):
         if isinstance(table := data.get(name), dict):
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")

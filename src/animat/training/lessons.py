@@ -110,7 +110,7 @@ def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_record
             f"lessons: expected a robot that is stepped by JAX, got {robot.name}, which its own library steps"
         )
     for number, lesson in enumerate(lessons, 1):
-        where = f"lesson {number}"
+        where = f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"
         if number < len(lessons) and not lesson.goes_on:
             raise InvalidArgument(
                 f"{where}: expected success or until_return, which say when to go on to the next one, got neither"
@@ -121,7 +121,10 @@ def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_record
                 "has no method `succeeded`; go on by until_return"
             )
         if lesson.recordings_min is not None and not draws_recordings:
-            raise InvalidArgument(f"{where}: recordings_min: expected only where shadowing is 'drawn'")
+            raise InvalidArgument(
+                f"{where}: recordings_min: expected only where shadowing is 'drawn' (--shadowing drawn), got it where "
+                "each episode has the same recordings"
+            )
         try:
             _expect_parameters(lesson, robot)
         except InvalidArgument as error:

@@ -65,7 +65,7 @@ class Watched:
             # A name that is no text cannot be asked for.
             if text(each.place, 4096) == each.place
         ]
-        return {"folder": text(self.folder.name or str(self.folder)), "things": found}
+        return {"folder": text(self.folder.resolve().name or str(self.folder)), "things": found}
 
     def about(self, kind: str, place: str) -> dict[str, Any]:
         """What something is."""

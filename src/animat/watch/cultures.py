@@ -46,7 +46,10 @@ class CulturesView(View):
         state = state_of(self.folder, changed_s, is_done=len(done) == len(names))
         running = shares if state["state"] == "running" else {}
         if failed and state["state"] == "silent":
-            state = {"state": "ended", "message": f"{len(failed)} of the cultures failed; started again it goes on"}
+            state = {
+                "state": "ended",
+                "message": f"{len(failed)} of the cultures failed; start it again and it continues",
+            }
         rows: list[tuple[str, Any]] = [
             ("cultures done", f"{len(done):,} of {len(names):,}"),
             ("running", len(running)),

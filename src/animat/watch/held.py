@@ -33,6 +33,7 @@ def state_of(folder: Path, changed_s: float, *, is_done: bool) -> dict[str, Any]
     if held or (held is None and silent_s < _SILENT_S):
         return {"state": "running", "message": ""}
     message = (
-        "no program works in the folder: it was stopped or it failed, as its command said; started again it goes on"
+        "no program works in the folder: it was stopped, was killed or failed, in which case its command said why; "
+        "start it again and it continues"
     )
     return {"state": "silent", "message": message}

@@ -40,12 +40,12 @@ class StudyView(View):
         changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / UNFINISHED).glob("*/*.json")])
         state = state_of(self.folder, changed_s, is_done=is_done)
         is_running = state["state"] == "running"
-        waiting = [name for name in costs if name not in done and name not in told]
+        waiting = [name for name in costs if name not in done and not (is_running and name in told)]
         rows: list[tuple[str, Any]] = [
             ("jobs done", len(done)),
             ("running", len(told) if is_running else 0),
             ("waiting", len(waiting) if costs or is_done else "not known"),
-            ("failed", "none" if is_running or is_done else "its command said which, if any"),
+            ("failed", "none" if is_running or is_done else "not known here"),
             ("time left", time_left(self._speed.left_s(sum(costs.values()) - worked), state)),
         ]
         blocks = [

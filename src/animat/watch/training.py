@@ -111,10 +111,10 @@ def _in_use(training: dict[str, Any], simulators: dict[str, Any], share: float) 
         return [("recordings", "none: it is trained without neurons")]
     named = ", ".join(f"{each:g}" for each in minutes)
     if training.get("shadowing") == "drawn":
-        return [("recordings", f"of minutes {named}; each episode draws one")]
+        return [("recordings", f"at minutes {named}; each episode draws one")]
     clock = _minute(training, minutes, share)
     used = max((each for each in minutes if each <= clock + 1e-9), default=minutes[0])
-    return [("recordings", f"of minutes {named}"), ("in use", f"that of minute {used:g}")]
+    return [("recordings", f"at minutes {named}"), ("in use", f"that of minute {used:g}")]
 
 
 def _minute(training: dict[str, Any], minutes: list[float], share: float) -> float:

@@ -32,8 +32,9 @@ class Frames:
         self._times_s = np.array([moment.time_s for moment in scene.moments])
         self._colours = dict(zip(scene.conditions, condition_colours(["Hz"] * len(scene.conditions)), strict=True))
         rates = np.array([moment.rate_hz for moment in scene.moments if math.isfinite(moment.rate_hz)])
-        # Bursts would press all others to the ground: they are at the upper edge.
-        self._most_hz = _round_up(max(1.0, float(np.percentile(rates, 95)))) if len(rates) else 1.0
+        # Bursts would press all others to the ground: they are triangles at the upper edge.
+        self._most_hz = _round_up(max(1.0, float(np.percentile(rates, 95)))) if len(rates) else None
+        self._is_some_beyond = bool(len(rates)) and float(rates.max()) > (self._most_hz or 0.0)
         self._has_room_for_all = sum(_font(14).getlength(label) + 14 for label in scene.conditions) < _LEFT - 28
         totals = np.array([moment.total for moment in scene.moments])
         self._totals = min(0.0, float(totals.min())), max(1.0, float(totals.max()))
@@ -59,16 +60,20 @@ class Frames:
         if scene.n_channels:
             self._draw_raster(_Strip(draw, (top, 150), time_s, (-1, scene.n_channels), "spikes by channel", ""), time_s)
             top = 178
-        height = (HEIGHT_PX - 26 - top) // 3
-        strips = [(top + i * height, top + (i + 1) * height - 26) for i in range(3)]
-        response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), "response", "Hz per channel")
-        for each in past:
-            if math.isfinite(each.rate_hz):
-                response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
-        command = _Strip(draw, strips[1], time_s, (-1.0, 1.0), "command", "", zero=True)
+        # Without neurons there is no response.
+        n_strips = 3 if self._most_hz else 2
+        height = (HEIGHT_PX - 26 - top) // n_strips
+        strips = [(top + i * height, top + (i + 1) * height - 26) for i in range(n_strips)]
+        if self._most_hz:
+            beyond = "; triangles: larger" if self._is_some_beyond else ""
+            response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), "response", f"Hz per channel{beyond}")
+            for each in past:
+                if math.isfinite(each.rate_hz):
+                    response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
+        command = _Strip(draw, strips[-2], time_s, (-1.0, 1.0), "command", "", zero=True)
         for i in range(scene.robot.n_commands if scene.robot.n_commands > 1 else 0):
             command.name(i)
-        total = _Strip(draw, strips[2], time_s, self._totals, "return so far", "")
+        total = _Strip(draw, strips[-1], time_s, self._totals, "return so far", "")
         for episode in dict.fromkeys(each.episode for each in past):
             of_it = [each for each in past if each.episode == episode]
             until_s = time_s if episode == moment.episode else of_it[-1].time_s
@@ -91,7 +96,8 @@ class Frames:
         image.paste(robot, (14 + (box_px[0] - robot.width) // 2, 40 + (box_px[1] - robot.height) // 2))
 
     def _draw_words(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
-        step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration + 1:,}"
+        # As in ticks.csv.
+        step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration:,} (both from 0)"
         draw.text((14, HEIGHT_PX - 48), f"{moment.agent}, episode {moment.episode}, {step}", _INK, _font(15))
         if not self._has_room_for_all:
             if moment.delivered:
@@ -137,8 +143,14 @@ class _Strip:
             self._draw.line((_LEFT, self._y(0.0), _RIGHT, self._y(0.0)), _LINE)
 
     def dot(self, time_s: float, value: float, colour: str) -> None:
-        if time_s >= self._now_s - SHOWN_S:
-            self._draw.circle((self._x(time_s), self._y(value)), 3, colour)
+        """A dot, or at the upper edge a triangle for what is above it."""
+        if time_s < self._now_s - SHOWN_S:
+            return
+        x, y = self._x(time_s), self._y(value)
+        if value > self._span[1]:
+            self._draw.polygon([(x - 4, y + 6), (x, y - 1), (x + 4, y + 6)], colour)
+        else:
+            self._draw.circle((x, y), 3, colour)
 
     def name(self, i: int) -> None:
         """The number of a command, in its colour."""

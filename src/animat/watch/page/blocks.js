@@ -48,7 +48,7 @@ export class BlocksPage {
     body.hidden = !block.series.length;
     if (body.hidden) { legend.replaceChildren(); return; }
     const xs = block.series.flatMap((each) => each.x), ys = block.series.flatMap((each) => each.y);
-    const frame = new Frame(body, spanOf([...xs, ...block.marks.map(([at]) => at), ...(block.until === null ? [] : [0, block.until])]), spanOf(ys), { top: block.marks.length || block.y ? 22 : 6, xLabel: block.x });
+    const frame = new Frame(body, spanOf([...xs, ...block.marks.map(([at]) => at), ...(block.until === null ? [] : [0, block.until])]), spanOf(ys), { top: block.marks.length || block.y ? 22 : 6, xLabel: block.x, isCounted: xs.every((x) => x === null || Number.isInteger(x)) });
     frame.text(block.y, 0, 10, colour("faint"));
     let free = frame.g.measureText(block.y).width + 6;
     const named = block.series.filter((each) => each.name);

@@ -38,7 +38,14 @@ function marks(low, high, most) {
   const raw = (high - low) / Math.max(1, most);
   if (!(raw > 0) || !Number.isFinite(raw)) return [low];
   const unit = 10 ** Math.floor(Math.log10(raw));
-  const step = [1, 2, 5, 10].map((k) => k * unit).find((each) => each >= raw * 0.999);
+  const steps = [0.2, 0.5, 1, 2, 5, 10].map((k) => k * unit);
+  let which = steps.findIndex((each) => each >= raw * 0.999), found = multiples(steps[which], low, high);
+  // A single number gives no scale.
+  while (found.length < 2 && which > 0) found = multiples(steps[which -= 1], low, high);
+  return found;
+}
+
+function multiples(step, low, high) {
   const found = [];
   for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i += 1) found.push(Number((i * step).toPrecision(12)));
   return found;
@@ -86,6 +93,7 @@ export class Frame {
       g.textBaseline = "top";
       const most = Math.max(2, Math.floor((this.right - this.left) / 70));
       for (const each of options.xMarks ?? marks(this.x[0], this.x[1], most)) {
+        if (options.isCounted && !Number.isInteger(each)) continue;
         const at = this.atX(each);
         if (at < this.left - 1 || at > this.right + 1) continue;
         this.#rule(at, this.bottom, at, this.bottom + 3, colour("faint"));

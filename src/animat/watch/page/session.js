@@ -29,7 +29,7 @@ export class SessionPage {
     this.raster = card(main, "two-thirds", "Spikes by channel", "tall");
     this.legend = make("div", { className: "legend", id: "legend" });
     this.raster.section.insertBefore(this.legend, this.raster.words);
-    this.response = card(main, "half", "Response (Hz a channel) against thresholds", "");
+    this.response = card(main, "half", "Response (Hz per channel) against thresholds", "");
     this.command = card(main, "half", "Command", "");
     this.array = card(main, "third", "Array: spikes a second on each channel", "square");
     this.observed = make("section", { className: "two-thirds" }, make("h2", { textContent: "Observation" }));
@@ -88,9 +88,9 @@ export class SessionPage {
       ["tick", shown(at("number"))],
       ["time", `${shown(at("time_s"), 7)} s`],
       ["agent", at("agent")],
-      ["episode, iteration", `${shown(at("episode"))}, ${at("iteration") < 0 ? "warm-up" : shown(at("iteration"))}`],
+      ["episode, iteration", `${shown(at("episode"))}, ${at("iteration") < 0 ? "warm-up" : shown(at("iteration"))} (both from 0)`],
       ["stimulus", at("chosen") === at("delivered") ? label(at("delivered")) : `${label(at("delivered"))} (chosen: ${label(at("chosen"))})`],
-      ["response", `${shown(at("rate_hz"), 6)} Hz a channel, ${shown(at("spikes"))} spikes${at("is_burst") ? ", a burst" : ""}${handled === "used" ? "" : `, ${handled}`}`],
+      ["response", `${shown(at("rate_hz"), 6)} Hz per channel, ${shown(at("spikes"))} spikes${at("is_burst") ? ", a burst" : ""}${handled === "used" ? "" : `, ${handled}`}`],
       ["command", command.length ? command.map((each) => shown(each)).join(", ") : "none: the robot was not moved"],
       ["reward", at("reward") === null ? "none" : shown(at("reward"))],
       ["return so far", at("total") === null ? "being added up" : shown(at("total"), 6)],
@@ -214,7 +214,7 @@ export class SessionPage {
       if (rate !== null && ticks.time_s[i] !== null) frame.dot(ticks.time_s[i], rate, ticks.is_burst[i] ? colour("red") : this.condition(ticks.delivered[i]), { ring: Boolean(ticks.is_burst[i]) });
     });
     const thresholds = this.about.thresholds.map((i) => shown(now[i], 3)).join(", ");
-    const response = last < 0 ? "no response here" : `last response ${shown(ticks.rate_hz[last], 6)} Hz a channel`;
+    const response = last < 0 ? "no response here" : `last response ${shown(ticks.rate_hz[last], 6)} Hz per channel`;
     const of = this.about.readouts.length > 1 ? ` of ${this.about.readouts[0]}, the first of ${this.about.readouts.length} readouts` : "";
     this.response.words.textContent = `${response}; thresholds${of} (dashed, ${this.about.adaptive ? "adaptive" : "fixed"}): ${thresholds} Hz. A dot has the colour of its stimulus, a ring is a burst; what is above the frame is at its edge.`;
   }
