@@ -77,6 +77,23 @@ def test_an_import_is_not_cut_short(number: signal.Signals, tmp_path: Path, monk
     assert sys.modules.pop(name).whole
 
 
+def test_two_in_one_import_raise_once(tmp_path: Path, monkeypatch) -> None:
+    """So that the second does not cut short what the first one's end closes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "impatient.py").write_text(
+        "import signal, time\nfor _ in range(2):\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(0.1)\n"
+    )
+    closed = False
+    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+        try:
+            importlib.import_module("impatient")
+            time.sleep(5.0)
+        finally:
+            time.sleep(0.4)
+            closed = True
+    assert closed
+
+
 def test_an_import_that_does_not_end_is(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("animat.ctrl_c._LONGEST_IMPORT_S", 0.2)

@@ -349,6 +349,22 @@ def test_who_is_saturated_for_long_is_blanked_to_its_end(until_ms: float, chunk_
     assert f"at most {until_ms + 0.25:.1f} ms" in message
 
 
+@pytest.mark.parametrize("chunk_s", [0.5, 20.0])
+@pytest.mark.parametrize("from_s", [1.03, 1.14, 1.25])
+def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(from_s: float, chunk_s: float) -> None:
+    voltage, truth = noisy(4, 20.0)
+    pulses = np.arange(from_s, 19.0, 0.05)
+    is_railed = np.zeros(len(voltage), dtype=bool)
+    for start_s in pulses[10:340:15]:
+        is_railed[round(start_s * RATE_HZ) : round((start_s + 0.17) * RATE_HZ)] = True
+    voltage[is_railed, 1] = 32_000
+    source = RawTraces.of_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
+    found = find_spikes(source, pulses, Detection(chunk_s=chunk_s))
+    on_it = np.rint(found.time_s[found.channel == 1] * RATE_HZ).astype(np.int64)
+    assert not np.any(is_railed[on_it])
+    assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1
+
+
 def test_samples_that_are_no_numbers_are_blank_and_the_rest_of_the_channel_is_heard() -> None:
     voltage, truth = noisy(4, 4.0)
     voltage_uv = voltage.astype(np.float32) * np.float32(0.1)

@@ -44,6 +44,8 @@ def test_a_clock_that_does_not_begin_at_0_is_warned_of_and_its_start_can_be_give
     told = read_recording(path, start_s=from_s)
     assert not {"start-unknown", "silence", "times-not-in-seconds"} & set(said(told))
     assert (told.start_s, told.stop_s) == (from_s, source.stop_s)
+    assert said(told)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, in place of 0 s"
+    assert "start-given" not in said(read_recording(path, start_s=0.0))
     inspection = inspect_recording(told)
     # 20,000 spikes on 30 channels in 600 s, independent of each other.
     assert inspection.spontaneous_rate_hz == pytest.approx(20_000 / 30 / 600, rel=1e-3)

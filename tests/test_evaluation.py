@@ -269,20 +269,24 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
     """The optimum is `best_return` of the very simulator; scores are worked out again from the means."""
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, SHORT, seed=1), "b": policy_of(timeline, SHORT, seed=2)}
-    told: list[str] = []
+    told: dict[str, set[float]] = {}
 
     class Noting:
         def update(self, done: float, total: float, note: str = "") -> None:
             assert done <= total
-            told.append(note)
+            told.setdefault(note, set()).add(total)
 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
     found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, optimum_resolution=0.25, progress=Noting())
     environment = Animat(SHORT, Thresholds(1), 3)
     assert found.optimum is not None
     assert replace(found.optimum, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
-    assert list(dict.fromkeys(told))[-4:-2] == ["coupling", "optimal return"]
-    assert told[-1] == "its interval"
+    # Nine rows, then the phase of the optimum: its own half, and that of its interval.
+    names = [row.name for row in found.rows]
+    assert len(names) == 9 and all(told[name] == {9} for name in names)
+    *_, last_row, own, value, interval = told
+    assert (last_row, own, interval) == ("coupling", "optimal return", "its interval")
+    assert value.startswith("optimum ") and told[own] == told[value] == told[interval] == {2}
     assert set(found.optimum.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))

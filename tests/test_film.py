@@ -189,7 +189,7 @@ def test_a_film_says_which_responses_are_above_its_axis_and_counts_as_ticks_do(m
     usual = scene_of([5.0] * 40)
     texts = written_by(usual, monkeypatch)
     assert "response (Hz per channel)" in texts
-    assert "p0, episode 0, iteration 10 (both from 0)" in texts
+    assert "p0, episode 0, iteration 10 (counted from 0)" in texts
     beyond = scene_of([5.0] * 5 + [90.0] + [5.0] * 40)
     assert "response (Hz per channel; triangles: larger)" in written_by(beyond, monkeypatch)
     triangles: list[Any] = []

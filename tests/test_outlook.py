@@ -74,8 +74,8 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     assert found.planned_min == pytest.approx(total_s / 60)
     assert found.drifted_min == pytest.approx((-100 * math.log(0.75) - 5, -50 * math.log(0.75) - 5))
     assert found.budget_min == pytest.approx(total_s / 60 / 4)
-    assert found.is_long
-    assert not replace(found, budget_min=math.inf).is_long
+    assert str(found).endswith("; the plan is longer: ask for fewer --episodes")
+    assert "the plan is longer" not in str(replace(found, budget_min=math.inf))
     # Three more pauses before the first episode, with six of each.
     longer = outlook(replace(loop, settling=3), calibration, plan, account, 15.0)
     longer_s = total_s + 3 * (3 + 6 / 5 + 6 / 80)

@@ -242,6 +242,9 @@ def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
     at_the_end = lambda self, uniforms, state, u: (At(state.x_m + 1.0), u, u < 2)  # noqa: E731
     with pytest.raises(InvalidArgument, match="x: expected from -1 to 1, the bounds of its Quantity, got 2"):
         check_robot(slider(**bounded, advance=at_the_end))
+    # What float32 rounds is not held against it, at a bound of 0 either.
+    just_below = {"observation_spec": (Quantity("x", "m", 1.0, 0.0, 1.0),), "observe": lambda *_: jnp.full(1, -1e-9)}
+    check_robot(slider(**just_below))
 
 
 def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:

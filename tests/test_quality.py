@@ -199,7 +199,7 @@ def test_an_artefact_is_compared_with_as_much_time_as_it_takes() -> None:
     ]
     spikes = [(t, 0) for t in [*every_s, *more_s]]
     finding = findings(recording(spikes, stimulus_s, 4, 60.0))["artefact-spikes"]
-    assert finding.message.startswith("from -1 to 1 ms there are 130.0 spikes a stimulus, 32.5 times as many")
+    assert finding.message.startswith("from -1 to 1 ms there are 130.0 spikes per stimulus, 32.5 times as many")
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,12 @@ from animat.coding.mapping import Thresholds
 from animat.cultures.devices.cl1 import CL1_PULSE
 from animat.cultures.series import STATE_FILE, record_series
 from animat.cultures.virtual import VirtualCulture
+from animat.errors import in_min
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.reading import read_recording
+from animat.recordings.reading import read_recording, read_recordings
 from animat.responses.condition import Condition
 from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.series import extract_series
@@ -171,6 +172,14 @@ def test_a_loop_delivers_the_pulse_of_its_recordings_and_names_it_first(
     assert f"the loop delivers {delivered},{warned}" in found.get("unknown-pulse", f"the loop delivers {delivered},")
 
 
+@pytest.mark.parametrize(
+    ("minutes", "told"),
+    [(0.0, "0 min"), (1 / 60, "0.02 min"), (14400.25, "14400.25 min"), (1_500_004.0, "1500004 min")],
+)
+def test_minutes_have_two_decimals_at_most(minutes: float, told: str) -> None:
+    assert in_min(minutes) == told
+
+
 def test_a_rehearsal_of_currents_is_given_voltages(
     series: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -201,6 +210,11 @@ def test_recordings_of_several_pulses_are_refused_before_a_culture_is_made(
     recordings = recorded_by(series, tmp_path / "recordings", *pulses)
     assert run(tmp_path / "session", policy_of(0), recordings, *given) == 1
     assert words in capsys.readouterr().err.splitlines()[-1]
+    # Also where messages round both minutes to the same one.
+    for minute, recording in zip((0.001, 0.002), read_recordings([recordings]), strict=True):
+        write_nwb(replace(recording, start_min=minute), tmp_path / "near" / f"{minute}.nwb")
+    assert run(tmp_path / "session", policy_of(0), tmp_path / "near", *given) == 1
+    assert words.split(" (at")[0] in capsys.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "session").exists()
 
 

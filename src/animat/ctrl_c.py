@@ -32,7 +32,19 @@ def heard_everywhere() -> Iterator[None]:
     goes on as if nothing had been. An import is not cut short, unless it takes long: what is half imported may crash as
     Python exits, and libraries make another error of it. Ctrl-C is left alone where it does not raise already.
     """
-    told, waits_since_s = sys.unraisablehook, 0.0
+    told, waits_since_s, is_asking = sys.unraisablehook, 0.0, False
+
+    def ask_again() -> None:
+        nonlocal is_asking
+        if not is_asking:
+            is_asking = True
+            _thread.start_new_thread(in_a_moment, ())
+
+    def in_a_moment() -> None:
+        nonlocal is_asking
+        time.sleep(_AGAIN_S)
+        is_asking = False
+        _raise_again()
 
     def interrupt(_number: int, frame: FrameType | None) -> None:
         nonlocal waits_since_s
@@ -41,11 +53,11 @@ def heard_everywhere() -> Iterator[None]:
             waits_since_s = 0.0
             raise KeyboardInterrupt
         # Not a `Thread`: it takes a lock, which what was interrupted may hold.
-        _thread.start_new_thread(_ask_again, ())
+        ask_again()
 
     def dropped(unraisable: Any) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            _thread.start_new_thread(_ask_again, ())
+            ask_again()
         else:
             told(unraisable)
 
@@ -74,8 +86,7 @@ def handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) -
             signal.signal(number, old)
 
 
-def _ask_again() -> None:
-    time.sleep(_AGAIN_S)
+def _raise_again() -> None:
     # Of the signals here it is never ignored; where nobody handles it any more, the command has ended.
     if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         os.kill(os.getpid(), signal.SIGTERM)

@@ -71,7 +71,7 @@ class BodyFailed(AnimatError):
 
 def in_min(minutes: float) -> str:
     """A time on the culture's clock as messages and tables have it: with two decimals at most."""
-    return f"{round(minutes, 2):g} min"
+    return f"{round(minutes, 2):.10g} min"
 
 
 def shown(value: object) -> str:

@@ -48,7 +48,7 @@ class Convert:
     start_min: float | None = None
     """Start on the culture's clock, in minutes"""
     start_s: float | None = None
-    """Start on the clock of its own times, in seconds, of a file that does not say it"""
+    """When the recording starts on the clock of its own times, in seconds, if the file does not say"""
     stimuli: str | None = None
     """Which of several things in the file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     stimuli_path: Path | None = None
@@ -83,7 +83,8 @@ class Convert:
                 "format with --reader where the folder is one recording"
             )
         finds_spikes = self.raw or self.reader is not None
-        if not finds_spikes and (given := [name for name in OF_DETECTION if getattr(self, name) != _default(name)]):
+        given = [name for name in OF_DETECTION if getattr(self, name) != getattr(Convert, name)]
+        if given and not finds_spikes:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise InvalidArgument(
                 f"{options}: expected only where spikes are found in raw traces; add --raw or --reader, or leave it out"
@@ -123,7 +124,3 @@ class Convert:
             "stimuli": n_stimuli,
             "findings": [finding.name for finding in findings],
         }
-
-
-def _default(name: str) -> Any:
-    return next(field.default for field in fields(Convert) if field.name == name)

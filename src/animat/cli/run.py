@@ -46,7 +46,7 @@ class Run(Stimulating):
     at_min: float | None = None
     """Minute whose newest recording is taken; default: the last that the policies were trained on"""
     protocol: Path | None = None
-    """The file of record --protocol by which the recordings were made, where they do not tell their pulse themselves"""
+    """The file of record --protocol that the recordings were made with, if they do not state their pulse"""
     state: Path | None = None
     """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
     episodes: int = 5
@@ -179,9 +179,9 @@ class Run(Stimulating):
 
         usual = replace(CLOSED_LOOP, pulse=pulse_for(self.culture))
         given = None if self.protocol is None else read_protocol(self.protocol, usual)
-        told = {f"at {in_min(each.start_min)}": each.protocol for each in recordings}
-        told |= {str(self.protocol): given}
-        pulses = {protocol.pulse: where for where, protocol in told.items() if protocol is not None}
+        told = [(f"at {in_min(each.start_min)}", each.protocol) for each in recordings]
+        told.append((str(self.protocol), given))
+        pulses = {protocol.pulse: where for where, protocol in told if protocol is not None}
         if len(pulses) > 1:
             (one, there), (other, elsewhere), *_ = pulses.items()
             raise Mismatch(

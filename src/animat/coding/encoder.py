@@ -58,7 +58,7 @@ class Encoder:
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
             raise InvalidArgument(
-                f"pulses: expected trials of {1 / SLOWEST_HZ:g} s at most, got {shown(self.pulses)} pulses a trial, "
+                f"pulses: expected trials of {1 / SLOWEST_HZ:g} s at most, got {shown(self.pulses)} pulses per trial, "
                 f"which at {slowest_hz:g} Hz are {self.pulses / slowest_hz:,.0f} s: ask for fewer"
             )
 

@@ -131,9 +131,9 @@ def record_series(
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
                 continue
+            culture.rest(max(0.0, due_s - culture.now_s))
             # Again before each: what cannot be written is not recorded.
             expect_writable(folder, room_bytes=room_bytes)
-            culture.rest(max(0.0, due_s - culture.now_s))
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
             if not file.exists():

@@ -54,7 +54,7 @@ class Band(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """By how much one kind predicts better than another, a trial, with the standard error."""
+    """By how much one kind predicts better than another, per trial, with the standard error."""
 
     value: float
     error: float

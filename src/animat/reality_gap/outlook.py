@@ -31,11 +31,6 @@ class Outlook:
     budget_min: float
 
     @property
-    def is_long(self) -> bool:
-        """Whether the plan goes beyond the drift or the budget."""
-        return self.planned_min > self._lasts_min
-
-    @property
     def has_drifted(self) -> bool:
         """Whether the drift was so large already before the session."""
         return self.drifted_min is not None and self.drifted_min[0] <= 0

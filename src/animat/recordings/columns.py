@@ -230,13 +230,16 @@ class PlainColumns:
 
 
 def started_at(recording: Recording, start_s: float) -> Recording:
-    """The recording with its start, which its file does not say, and the end that it had; it is no longer asked for.
+    """The recording with another start than it was read with, which is noted, and the end that it had.
 
     Raises:
         UnusableData: if events come before it.
     """
     duration_s = _duration_s(start_s, max(recording.stop_s, start_s))
     findings = tuple(finding for finding in recording.findings if finding.name != "start-unknown")
+    if start_s != recording.start_s:
+        message = f"the recording starts at {start_s:.12g} s, as given, in place of {recording.start_s:.12g} s"
+        findings += (Finding("start-given", "note", message, float(start_s)),)
     return replace(recording, start_s=float(start_s), duration_s=duration_s, findings=findings)
 
 

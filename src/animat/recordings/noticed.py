@@ -89,16 +89,17 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 
-TWICE = 0.03
+TWICE = 0.03, 20
+"""Share of the spikes, and how many, from which on they are told."""
 
 
 def _duplicates(recording: Recording) -> Iterable[Finding]:
     """Spikes of one channel at one time, which no channel can have."""
     same = (np.diff(recording.spike_times_s) == 0) & (np.diff(recording.spike_channels) == 0)
-    share = float(np.count_nonzero(same)) / max(len(recording.spike_times_s), 1)
-    if share > TWICE:
+    n, share = int(np.count_nonzero(same)), float(np.mean(same)) if len(same) else 0.0
+    if share > TWICE[0] and n >= TWICE[1]:
         message = (
-            f"{np.count_nonzero(same):,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at the "
+            f"{n:,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at the "
             "very time of another on their channel: are they in the file twice, or times coarse? Each is counted; "
             "bring them once"
         )

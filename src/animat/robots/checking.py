@@ -104,7 +104,7 @@ def _expect_within_bounds(robot: Robot[Any], observations: list[Any]) -> None:
     for seen in observations:
         for number, quantity in zip(seen, robot.observation_spec, strict=True):
             within = np.clip(number, quantity.low, quantity.high)
-            if not np.isclose(number, within, rtol=1e-5, atol=0.0):
+            if not np.isclose(number, within, rtol=1e-5, atol=1e-5 * quantity.scale):
                 raise InvalidArgument(
                     f"{type(robot).__name__}.observe: {quantity.name}: expected from {quantity.low:g} to "
                     f"{quantity.high:g}, the bounds of its Quantity, got {number:g}"

@@ -25,8 +25,8 @@ CULTURE: dict[str, tuple[str, str]] = {
     ),
     "psth": (
         "post-stimulus time histogram",
-        "Mean rate per channel against the time from the stimulus, over all stimuli of the first recording; above "
-        "stands how many there are. Responses are read in the shaded window.",
+        "Mean rate per channel against the time from the stimulus, over all stimuli of the first recording, whose "
+        "number is given above. Responses are read in the shaded window.",
     ),
     "bursts": (
         "bursts set apart",

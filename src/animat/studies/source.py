@@ -15,8 +15,8 @@ from animat.records import Positive, Seed, Whole, record
 from animat.stimulation.protocol import TWO_COMMANDS, Protocol
 
 MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
-MOST_DIGITS = 9
 """Recordings, trials in each, and entries of a list; `docs/studies.md` states them."""
+MOST_DIGITS = 9
 
 LISTED = Field(max_length=MOST_ENTRIES)
 

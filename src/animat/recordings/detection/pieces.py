@@ -90,8 +90,9 @@ def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start
     begin = start - margin
     followed, rest = (round(seconds * traces.sampling_rate_hz) for seconds in (FOLLOWED_S, REST_S))
     first_stimulus, last_stimulus = np.searchsorted(stimulus, [begin + rest, stop + margin]).tolist()
-    if first_stimulus and stimulus[first_stimulus - 1] > begin - followed:
-        first_stimulus -= 1
+    earliest = int(np.searchsorted(stimulus, begin - followed, side="right"))
+    if earliest < first_stimulus:
+        first_stimulus = earliest
         begin = min(max(int(stimulus[first_stimulus]) - rest, 0), begin)
     first, last = max(begin, 0), min(stop + margin, traces.samples)
     voltage_uv = traces.read_uv(first, last)

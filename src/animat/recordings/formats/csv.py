@@ -65,7 +65,7 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
     provenance = {"source": path.name, "format": "CSV"}
     columns, findings = _columns(read_text_table(path), SPIKE_COLUMNS)
     if not len(columns["spike_time_s"]):
-        raise InvalidFile(f"{path}: expected a line a spike, got a header without any: there are no spikes in it")
+        raise InvalidFile(f"{path}: expected one line per spike, got only a header")
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))

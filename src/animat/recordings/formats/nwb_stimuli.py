@@ -73,12 +73,14 @@ def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | 
             choose(f"{file.path}: stimuli", "--stimuli", every or ["none (nothing in the file can be stimuli)"], asked)
         return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
     candidates = first or [at for at in elsewhere if SPEAKS_OF_STIMULI.search(at.rpartition("/")[2])]
-    if not candidates and elsewhere:
+    # Regular samples, and epochs, are hardly ever stimuli.
+    perhaps = [at for at in elsewhere if not (file.has(f"{at}/starting_time") or at.endswith("/epochs"))]
+    if not candidates and perhaps:
         message = (
-            f"no stimulus: nothing in the file speaks of stimuli; if one of {some_of(elsewhere)} holds them, choose it "
-            "with --stimuli NAME (animat inspect, animat convert), else bring the stimulus times too"
+            f"nothing in the file speaks of stimuli; if one of {some_of(perhaps)} holds them, choose it with "
+            "--stimuli NAME (animat inspect, animat convert)"
         )
-        findings.append(Finding("no-stimuli", "refuse", message))
+        findings.append(Finding("stimuli-elsewhere", "note", message))
     return choose(f"{file.path}: stimuli", "--stimuli", candidates, None) if candidates else None
 
 

@@ -97,7 +97,7 @@ class Frames:
 
     def _draw_words(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
         # As in ticks.csv.
-        step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration:,} (both from 0)"
+        step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration:,} (counted from 0)"
         draw.text((14, HEIGHT_PX - 48), f"{moment.agent}, episode {moment.episode}, {step}", _INK, _font(15))
         if not self._has_room_for_all:
             if moment.delivered:

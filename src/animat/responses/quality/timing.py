@@ -137,7 +137,7 @@ def _artefact_finding(
         else f"the window from {window_ms[0]:g} ms on does not hold them"
     )
     message = (
-        f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes a stimulus, "
+        f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
         f"{spikes / (usual * len(count)):.3g} times as many as is usual in as much time: an artefact counted "
         f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
         f"({100 * spikes / max(n_spikes, 1):.1f} % of all); {remedy}"

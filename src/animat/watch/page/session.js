@@ -88,7 +88,7 @@ export class SessionPage {
       ["tick", shown(at("number"))],
       ["time", `${shown(at("time_s"), 7)} s`],
       ["agent", at("agent")],
-      ["episode, iteration", `${shown(at("episode"))}, ${at("iteration") < 0 ? "warm-up" : shown(at("iteration"))} (both from 0)`],
+      ["episode, iteration", `${shown(at("episode"))}, ${at("iteration") < 0 ? "warm-up" : shown(at("iteration"))} (counted from 0)`],
       ["stimulus", at("chosen") === at("delivered") ? label(at("delivered")) : `${label(at("delivered"))} (chosen: ${label(at("chosen"))})`],
       ["response", `${shown(at("rate_hz"), 6)} Hz per channel, ${shown(at("spikes"))} spikes${at("is_burst") ? ", a burst" : ""}${handled === "used" ? "" : `, ${handled}`}`],
       ["command", command.length ? command.map((each) => shown(each)).join(", ") : "none: the robot was not moved"],
