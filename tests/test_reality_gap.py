@@ -821,7 +821,7 @@ class TestCommand:
             (["--seed", "-1"], "--seed: expected 0 or more"),
             (["--culture-seed", "-1"], "--culture-seed: expected 0 or more, got -1"),
             (["--pulses", "0"], "--pulses: expected at least 1"),
-            (["--pulses", "1000000"], "--pulses: expected trials of 1000 s at most, got 1000000 pulses a trial"),
+            (["--pulses", "1000000"], "--pulses: expected trials of 1000 s at most, got 1000000 pulses per trial"),
             (["--pause-s", "-1"], "--pause-s: expected a finite number from 0"),
             (["--warm-up", "-1"], "--warm-up: expected a whole number from 0 to 100, got -1"),
             (["--warm-up", "101"], "--warm-up: expected a whole number from 0 to 100, got 101"),
