@@ -223,6 +223,9 @@ tell(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
     from animat.recordings.formats.cl1 import read_cl1
 
     own = read_cl1(file).stimuli
-    assert own.frequency_hz.tolist() == found["hz"]
-    assert own.pattern.tolist() == found["pattern"]
+    # The SDK's index repeats itself after a hundred entries (1.0.0): the rest is not told, and nothing untrue.
+    known = ~np.isnan(own.frequency_hz)
+    assert len(known) == len(found["hz"]) and np.all(known[:100])
+    assert own.frequency_hz[known].tolist() == np.array(found["hz"])[known].tolist()
+    assert own.pattern[known].tolist() == np.array(found["pattern"])[known].tolist()
     np.testing.assert_allclose(np.diff(own.time_s), np.diff(found["times"]), atol=1e-6)

@@ -395,6 +395,23 @@ def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False
     return path
 
 
+def test_an_index_of_a_cl1_that_repeats_itself_tells_nothing_from_there_on(tmp_path: Path) -> None:
+    said = [packed_text(json.dumps({"frequency_hz": hz, "pattern": n})) for n, hz in enumerate((5.0, 10.0, 20.0, 40.0))]
+    frames = (1000, 2000, 3000, 4000)
+    stims = [(frame, 2) for frame in frames]
+    path = write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=stims, stream=list(zip(frames, said, strict=True)))
+    assert read_recording(path).stimuli.frequency_hz.tolist() == [5.0, 10.0, 20.0, 40.0]
+    with h5py.File(path, "r+") as file:
+        index = file["data_stream/animat_stimuli/index"][:]
+        index[2:] = index[:2]
+        file["data_stream/animat_stimuli/index"][:] = index
+    read = read_recording(path)
+    np.testing.assert_array_equal(read.stimuli.frequency_hz, [5.0, 10.0, np.nan, np.nan])
+    lost = next(finding for finding in read.findings if finding.name == "stimulus-words-lost")
+    assert lost.severity == "warning" and "after 2 of 4 entries" in lost.message
+    assert "of the last 2 stimuli are not known" in lost.message
+
+
 def test_tables_that_may_be_stimuli_are_named_where_none_speaks_of_them(tmp_path: Path) -> None:
     path = write_trials(tmp_path / "a.nwb", None)
     found = {f.name: f for f in noticed(read_recording(path))}

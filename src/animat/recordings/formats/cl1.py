@@ -71,7 +71,7 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
             n_channels = CHANNELS
         stimulus_frame, columns = _stimuli(file)
         start = _first_frame(file, frame, stimulus_frame)
-        columns |= _parameters(file, stimulus_frame)
+        columns |= _parameters(file, stimulus_frame, findings)
         frames = file.attribute("/", "duration_frames")
         created = file.attribute("/", "created_utc")
     if len(channel) and int(channel.max()) >= n_channels:
@@ -137,7 +137,7 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
     return frames, {"stimulus_electrodes": padded([sorted(electrodes) for electrodes in lists])}
 
 
-def _parameters(file: Hdf5File, stimulus: Column) -> dict[str, Any]:
+def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:
     """What animat's data stream says of the stimuli; electrodes are known from the stimuli themselves."""
     at = f"data_stream/{STIMULUS_STREAM}"
     if not len(stimulus) or not file.has(f"{at}/index") or not file.has(f"{at}/data"):
@@ -146,10 +146,22 @@ def _parameters(file: Hdf5File, stimulus: Column) -> dict[str, Any]:
     starts = file.read(f"{at}/index", "start_index").astype(np.int64)
     ends = file.read(f"{at}/index", "end_index").astype(np.int64)
     data = file.read(f"{at}/data").astype(np.uint8).tobytes()
-    order = np.argsort(frame, kind="stable")
+    # Some versions of the SDK write the first rows of the index over and over: from there on nothing is known.
+    _, first = np.unique(np.stack([frame, starts, ends]), axis=1, return_index=True)
+    told = int(np.setdiff1d(np.arange(len(frame)), first).min(initial=len(frame)))
+    is_lost = stimulus > frame[:told].max(initial=-1) if told < len(frame) else np.zeros(len(stimulus), bool)
+    if lost := int(np.count_nonzero(is_lost)):
+        message = (
+            f"the index of the data stream repeats itself after {told:,} of {len(frame):,} entries, as the SDK wrote "
+            f"it: frequency and pattern of the last {lost:,} stimuli are not known; what animat wrote itself has them"
+        )
+        findings.append(Finding("stimulus-words-lost", "warning", message, float(lost)))
+    order = np.argsort(frame[:told], kind="stable")
     texts = [_text(data, int(starts[i]), int(ends[i])) for i in order]
     entry = np.searchsorted(frame[order], stimulus, side="right") - 1
-    columns = stimulus_columns([texts[i] if i >= 0 else "" for i in entry])
+    columns = stimulus_columns(
+        [texts[i] if i >= 0 and not gone else "" for i, gone in zip(entry, is_lost, strict=True)]
+    )
     columns.pop("stimulus_electrodes", None)
     return columns
 
