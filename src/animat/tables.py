@@ -41,6 +41,15 @@ def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[An
     return array
 
 
+MOST_PADDED = 50_000_000
+
+
+def fits_padded(lists: Sequence[Sequence[int]]) -> bool:
+    """Whether lists of whole numbers can be padded: one long row must not fill memory, nor a number lose digits."""
+    most = max([1, *map(len, lists)]) * len(lists)
+    return most <= MOST_PADDED and all(abs(number) < 2**53 for row in lists for number in row)
+
+
 def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]:
     """Lists of electrodes as one table, padded with `UNKNOWN`."""
     table = np.full((len(lists), max([1, *map(len, lists)])), UNKNOWN, dtype=np.int64)

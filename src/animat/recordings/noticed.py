@@ -140,15 +140,11 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     if len(noisy):
         share = float(count[noisy].sum() / n_spikes)
         names = ", ".join(channels.label[noisy[:NAMED]]) + (", ..." if len(noisy) > NAMED else "")
+        one = ("fires", "holds", "it carries", "its threshold", "it")
+        several = ("fire", "hold", "they carry", "their threshold", "them")
+        fire, hold, carry, threshold, them = one if len(noisy) == 1 else several
         message = (
-            f"{len(noisy):,} of {n:,} channels ({names}) "
-            + ("fires as no neurons do and holds" if len(noisy) == 1 else "fire as no neurons do and hold")
-            + f" {100 * share:.0f} % of all spikes: "
-            + (
-                "it carries noise; raise its threshold or leave it out"
-                if len(noisy) == 1
-                else "they carry noise; raise their threshold or leave them out"
-            )
-            + " of the routing"
+            f"{len(noisy):,} of {n:,} channels ({names}) {fire} as no neurons do and {hold} {100 * share:.0f} % of all "
+            f"spikes: {carry} noise; raise {threshold} or leave {them} out of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

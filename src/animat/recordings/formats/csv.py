@@ -26,7 +26,7 @@ from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_of
 from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
-from animat.tables import padded
+from animat.tables import fits_padded, padded
 
 SPIKE_COLUMNS = {
     "spike_time_s": ("spike_time_s", "time_s", "time"),
@@ -39,7 +39,6 @@ STIMULUS_COLUMNS = {
     "stimulus_presentation": ("stimulus_presentation", "stim_presentation", "presentation"),
     "stimulus_electrodes": ("stimulus_electrodes", "stim_electrodes", "electrodes"),
 }
-MOST_ELECTRODES = 50_000_000
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 NAMES = ("spike_channel", "stimulus_pattern")
 """Columns that may be text."""
@@ -200,8 +199,8 @@ def _electrodes(table: TextTable, place: int) -> Column:
             raise table.wrong(
                 row, f"stimulus_electrodes: expected whole numbers separated by spaces, got {cell[:40]!r}"
             ) from error
-    width = max([1, *map(len, lists)])
-    if width * len(lists) > MOST_ELECTRODES or any(abs(e) >= 2**53 for electrodes in lists for e in electrodes):
+    if not fits_padded(lists):
+        width = max(map(len, lists))
         raise InvalidFile(
             f"{table.path}: stimulus_electrodes: expected a few electrodes a stimulus, got {width} in one line"
         )

@@ -25,7 +25,7 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File, choose
-from animat.tables import padded
+from animat.tables import fits_padded, padded
 
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")
@@ -36,7 +36,6 @@ COLUMNS = {
     "stimulus_presentation": ("presentation",),
 }
 ELECTRODES = ("electrode_ids", "electrode_id", "electrodes", "electrode")
-MOST_ELECTRODES = 50_000_000
 APART_S = 0.001
 _BLOCK = 2**20
 
@@ -135,8 +134,7 @@ def _in_words(cells: Sequence[str]) -> Column | None:
         lists = [[int(word) for word in cell.replace(",", " ").split()] for cell in cells]
     except (ValueError, OverflowError):
         return None
-    too_many = max(map(len, lists), default=0) * len(lists) > MOST_ELECTRODES
-    return None if too_many or any(abs(e) >= 2**53 for some in lists for e in some) else padded(lists)
+    return padded(lists) if fits_padded(lists) else None
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:
