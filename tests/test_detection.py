@@ -365,6 +365,21 @@ def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(f
     assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1
 
 
+def test_an_amplifier_that_is_mostly_saturated_is_blanked_wherever_pieces_begin() -> None:
+    voltage, truth = noisy(4, 20.0)
+    pulses = np.arange(1.03, 19.0, 0.2)
+    is_railed = np.zeros(len(voltage), dtype=bool)
+    for start_s in pulses[2:30:5]:
+        is_railed[round(start_s * RATE_HZ) : round((start_s + 0.65) * RATE_HZ)] = True
+    voltage[is_railed, 1] = 32_000
+    source = RawTraces.of_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
+    for chunk_s in (0.2, 0.5, 20.0):
+        found = find_spikes(source, pulses, Detection(chunk_s=chunk_s))
+        on_it = np.rint(found.time_s[found.channel == 1] * RATE_HZ).astype(np.int64)
+        assert not np.any(is_railed[on_it])
+        assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1
+
+
 def test_samples_that_are_no_numbers_are_blank_and_the_rest_of_the_channel_is_heard() -> None:
     voltage, truth = noisy(4, 4.0)
     voltage_uv = voltage.astype(np.float32) * np.float32(0.1)

@@ -61,6 +61,7 @@ def without_artefacts(
     noise_uv: Float32[np.ndarray, " channels"],
     rate_hz: float,
     settings: Detection,
+    rest_uv: Float32[np.ndarray, " channels"] | None = None,
 ) -> Cleaned:
     """Remove artefacts from a stretch of traces, in place.
 
@@ -69,6 +70,8 @@ def without_artefacts(
         stimulus: sample of each pulse in the stretch, rising; may be outside it, by as much as is blanked or followed.
         noise_uv: of each channel, to tell a large deviation from a small one.
         settings: how long to blank.
+        rest_uv: of each channel, before the pulses before the stretch; a channel that is far from there and does not
+            move just before the first pulse has been saturated since one of them.
     """
     samples = voltage_uv.shape[1]
     saturated, longest_ms = np.zeros(len(stimulus), np.int64), np.zeros(len(stimulus), np.float32)
@@ -79,7 +82,14 @@ def without_artefacts(
     follow = round(settings.recovery_ms * per_ms)
     is_blank = np.zeros(voltage_uv.shape, dtype=bool)
     following = np.append(stimulus[1:], samples + before)
-    rest_uv, is_held = np.zeros(len(voltage_uv), np.float32), np.zeros(len(voltage_uv), dtype=bool)
+    flat, pause = max(round(FLAT_MS * per_ms), 3), round(PAUSE_MS * per_ms)
+    is_held = np.zeros(len(voltage_uv), dtype=bool)
+    if rest_uv is None:
+        rest_uv = np.zeros(len(voltage_uv), np.float32)
+    else:
+        first = max(int(stimulus[0]) - before, 0)
+        is_held = _saturated_until(voltage_uv[:, :first] - rest_uv[:, None], noise_uv, settings, flat) > first - pause
+        voltage_uv[is_held, :first] = rest_uv[is_held, None]
     for i, (at, next_at) in enumerate(zip(stimulus.tolist(), following.tolist(), strict=True)):
         start, end = max(at - before, 0), min(at + after, samples)
         limit = min(next_at - before, samples)
@@ -95,13 +105,12 @@ def without_artefacts(
         rest_uv = np.where(is_held, rest_uv, before_uv)
         # From the pulse on: what stands still at the blank's end did so before.
         pulse = max(at, 0)
-        flat = max(round(FLAT_MS * per_ms), 3)
         saturated_until = _saturated_until(voltage_uv[:, pulse:stop] - rest_uv[:, None], noise_uv, settings, flat)
         until = np.maximum(pulse + saturated_until, end)
         longer = np.flatnonzero(pulse + saturated_until == stop) if stop < limit else np.empty(0, np.int64)
         if len(longer):
             trace = voltage_uv[longer, stop - flat : limit] - rest_uv[longer, None]
-            more = _saturated_until(trace, noise_uv[longer], settings, flat, round(PAUSE_MS * per_ms))
+            more = _saturated_until(trace, noise_uv[longer], settings, flat, pause)
             until[longer] = np.maximum(stop - flat + more, stop)
         is_held = until == limit
         late = until > end

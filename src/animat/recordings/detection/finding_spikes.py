@@ -73,8 +73,8 @@ def find_spikes(
         check_band(settings.band_hz, traces.sampling_rate_hz)
     stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
     workers = workers or len(os.sched_getaffinity(0))
-    noise_uv = _noise_uv(traces, stimulus, settings, workers)
-    sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, settings, workers, progress)
+    noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
+    sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, level_uv, settings, workers, progress)
     order = np.lexsort((channel, sample))
     return FoundSpikes(
         time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
@@ -102,25 +102,26 @@ def blocks(channels: int) -> Iterator[slice]:
         yield slice(first, min(first + BLOCK, channels))
 
 
-def _noise_uv(
+def _noise_and_level_uv(
     traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection, workers: int
-) -> Float32[np.ndarray, " channels"]:
-    """The noise of each channel: the median over pieces from all over the recording."""
+) -> Float32[np.ndarray, "2 channels"]:
+    """The noise of each channel and its usual voltage: medians over pieces from all over the recording."""
     rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
     length, margin = round(NOISE_PIECE_S * rate_hz), round(MARGIN_S * rate_hz)
     n = max(1, min(NOISE_PIECES, traces.samples // max(length, 1)))
     starts = np.linspace(0, max(traces.samples - length, 0), n).astype(np.int64)
 
     def of_piece(start: int) -> np.ndarray:
-        found = np.zeros(channels, np.float32)
+        found = np.zeros((2, channels), np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
-            first = median_noise_uv(_filtered(piece.rows(columns), settings, rate_hz)[:, margin:-margin])
+            rows = piece.rows(columns)
+            first, level_uv = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin]), np.median(rows, 1)
             if len(piece.stimulus) or piece.is_lost is not None:
-                cleaned = piece.cleaned(columns, first, rate_hz, settings)
+                cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
                 first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
-            found[columns] = first
+            found[:, columns] = first, level_uv
         return found
 
     with ThreadPoolExecutor(workers) as pool:
@@ -140,6 +141,7 @@ def _detect(
     traces: RawTraces,
     stimulus: Int64[np.ndarray, " stimuli"],
     noise_uv: Float32[np.ndarray, " channels"],
+    level_uv: Float32[np.ndarray, " channels"],
     settings: Detection,
     workers: int,
     progress: Progress,
@@ -154,7 +156,7 @@ def _detect(
     depth_uv = depths_uv(noise_uv, settings.threshold)
 
     def of_block(piece: Piece, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        cleaned = piece.cleaned(columns, noise_uv[columns], rate_hz, settings)
+        cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
         filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
         if cleaned.is_blank is not None:
             filtered[cleaned.is_blank] = 0.0
