@@ -21,6 +21,7 @@ from animat.cultures.same_culture import other_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import said
+from animat.recordings.recording import RecordedCulture
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE, Phase, Pulse
 from animat.stimulation.stimulus import Stimulus
@@ -79,23 +80,25 @@ def test_another_chip_rig_or_kind_of_culture_is_told(monkeypatch: pytest.MonkeyP
         recording = culture.record(Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1), seed=1)
     names = {"system_id": "stand-in", "chip_id": "none", "cell_batch_id": "7"}
 
-    def told(**words: str) -> str | None:
+    def told(kind: RecordedCulture | None = recording.culture, **words: str) -> str | None:
         monkeypatch.setattr(sys.modules["cl"], "get_system_attributes", lambda: names)
         with CL1Culture() as culture:
-            found = other_culture(replace(recording, provenance={**recording.provenance, **words}), culture)
+            changed = replace(recording, provenance={**recording.provenance, **words}, culture=kind)
+            found = other_culture(changed, culture)
         return None if found is None else found.message
 
     assert told() is told(cell_batch_id="7") is None
     assert told(chip_id="A3") == (
-        "the recordings are of chip_id A3, and this is chip_id none: another culture has other percentiles"
+        "the recordings are of chip_id A3, but this is chip_id none: percentiles differ between cultures"
     )
-    assert "system_id rig 2, and this is system_id stand-in" in str(told(system_id="rig 2"))
-    assert "cell_batch_id 6, and this is cell_batch_id 7" in str(told(cell_batch_id="6"))
-    assert "of a MaxOne, and this is a CL1 (" in str(told(source="MaxOne by animat.cultures.maxone"))
-    virtual = VirtualCulture(1).settings
-    assert "of a virtual culture, and this is a CL1 (" in str(told(source=virtual["source"]))
+    assert "system_id rig 2, but this is system_id stand-in" in str(told(system_id="rig 2"))
+    assert "cell_batch_id 6, but this is cell_batch_id 7" in str(told(cell_batch_id="6"))
+    assert "of a MaxOne, but this is a CL1" in str(told(RecordedCulture("maxone")))
+    assert "of a virtual culture, but this is a CL1" in str(told(VirtualCulture(1).recorded_as))
+    is_simulated = recording.culture is not None and recording.culture.is_simulated
+    assert "of a CL1" in str(told(RecordedCulture("cl1", 1, not is_simulated)))
     # A converted file says nothing of where it comes from; and a replay answers from whatever was recorded.
-    assert told(source="rig.h5") is None
+    assert told(None, source="rig.h5") is None
     foreign = replace(recording, provenance={**recording.provenance, "chip_id": "A3"})
     with ReplayCulture([foreign]) as replayed:
         assert other_culture(recording, replayed) is None

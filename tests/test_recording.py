@@ -142,7 +142,10 @@ def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
     again = from_words(in_words(made))
     assert recording(**again).equals(made)
     assert from_words({"source": "CL1 (device)", "pattern_seed": "3"})["culture"] == RecordedCulture("cl1", 3)
-    assert from_words({"source": "CL1 (device)", "pattern_seed": "none: they were given"})["culture"] is None
+    given = {"source": "CL1 (the SDK's simulator) by animat.cultures.cl1", "pattern_seed": "none: they were given"}
+    assert from_words(given)["culture"] == RecordedCulture("cl1", None, is_simulated=True)
+    assert from_words({"source": "MaxOne by animat.cultures.maxone"})["culture"] == RecordedCulture("maxone")
+    assert from_words({"source": "rig.h5", "seed": "1"})["culture"] is None
     with pytest.raises(InvalidArgument, match="protocol: expected JSON"):
         from_words({"protocol": "mixed"})
     found = noticed(recording(findings=noted))

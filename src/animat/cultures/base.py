@@ -73,7 +73,7 @@ class Culture(Openable):
 
     @property
     def recorded_as(self) -> RecordedCulture | None:
-        """What has this culture again, as its recordings keep it; None for what no seed makes."""
+        """Which culture its recordings are of; None for one that cannot be recognised."""
         return None
 
     @property

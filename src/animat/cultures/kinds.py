@@ -89,7 +89,7 @@ def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: 
     it is stimulated through the electrodes that it was recorded with.
     """
     culture = recordings[0].culture if recordings else None
-    if culture is None or culture.kind != kind:
+    if culture is None or culture.kind != kind or culture.seed is None:
         return {}
     found: dict[str, Any] = {"seed": culture.seed}
     if kind == "virtual":

@@ -12,7 +12,7 @@ from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
-from animat.recordings.recording import Channels, Recording
+from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
@@ -102,6 +102,10 @@ class ReplayCulture(ComputedCulture):
         """That of the recordings; 20 kHz where it is not known."""
         rate_hz = self._recordings[0].sampling_rate_hz
         return rate_hz if np.isfinite(rate_hz) else 20_000.0
+
+    @property
+    def recorded_as(self) -> RecordedCulture:
+        return RecordedCulture("replay")
 
     @property
     def provenance(self) -> dict[str, str]:

@@ -64,17 +64,27 @@ class Channels:
         return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
 
 
+_CULTURES = {"virtual": "virtual culture", "replay": "replay of recordings", "cl1": "CL1", "maxone": "MaxOne"}
+
+
 @dataclass(frozen=True)
 class RecordedCulture:
-    """Which culture a recording is of, where that can be had again.
+    """Which culture a recording is of.
 
     Attributes:
         kind: as `animat.cultures.kinds` names it.
-        seed: of a virtual culture, or of a CL1's patterns.
+        seed: of a virtual culture, or of a CL1's patterns; None where none was drawn.
+        is_simulated: whether a simulator stands in for the device, as the CL1's SDK has one.
     """
 
     kind: str
-    seed: int
+    seed: int | None = None
+    is_simulated: bool = False
+
+    def __str__(self) -> str:
+        """As messages name its kind."""
+        name = _CULTURES.get(self.kind, self.kind)
+        return f"{name} (the SDK's simulator)" if self.is_simulated else name
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +105,7 @@ class Recording:
         presentation: how stimuli were presented, None where it is not known.
         provenance: where the recording came from, words by words, for people.
         protocol: that it was recorded by, None where it is not known.
-        culture: which one it is of, None where that is not known or cannot be had again.
+        culture: which one it is of, None where that is not known.
         findings: what was noticed when it was read, or its spikes were found.
 
     Raises:

@@ -24,7 +24,7 @@ def in_words(recording: Recording) -> dict[str, str]:
         )
     if (culture := _culture_of(words)) != recording.culture:
         raise InvalidArgument(
-            f"culture: expected the one that source and seed of the provenance tell, {culture}, got {recording.culture}"
+            f"culture: expected that of the provenance's source and seed, {culture!r}, got {recording.culture!r}"
         )
     if recording.protocol is not None:
         words["protocol"] = recording.protocol.to_json()
@@ -55,8 +55,20 @@ def _is_finding(key: str) -> bool:
     return bool(colon) and severity in get_args(Severity)
 
 
+_KINDS = {
+    "virtual culture": ("virtual", "seed"),
+    "CL1": ("cl1", "pattern_seed"),
+    "MaxOne by animat": ("maxone", ""),
+    "replay of recordings": ("replay", ""),
+}
+"""Of each culture the words that its source begins with, as a file has it: its kind, and the key of its seed."""
+
+
 def _culture_of(words: Mapping[str, str]) -> RecordedCulture | None:
-    for kind, begins, seed in (("virtual", "virtual culture", "seed"), ("cl1", "CL1", "pattern_seed")):
-        if words.get("source", "").startswith(begins) and words.get(seed, "").isdecimal() and len(words[seed]) <= 20:
-            return RecordedCulture(kind, int(words[seed]))
+    source = words.get("source", "")
+    for begins, (kind, key) in _KINDS.items():
+        if source.startswith(begins):
+            seed = words.get(key, "")
+            known = int(seed) if seed.isdecimal() and len(seed) <= 20 else None
+            return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source)
     return None

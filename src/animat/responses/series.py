@@ -27,8 +27,6 @@ REFUSING = (
     "several-cultures",
 )
 """Names of the findings that make training pointless; a user may go on in spite of them."""
-_SIMULATED = ("virtual culture", "synthetic", "made up")
-"""How the source of a recording begins whose culture is known by its seed; the last two are of before."""
 
 
 def extract_series(
@@ -60,9 +58,8 @@ def extract_series(
     kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings makes"
     recordings = expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
-    # A replay has a seed too, and it is no culture's.
-    told = [each.provenance for each in recordings if each.provenance.get("source", "").startswith(_SIMULATED)]
-    seeds = {words["seed"] for words in told if "seed" in words}
+    cultures = [each.culture for each in recordings if isinstance(each, Recording)]
+    seeds = {str(culture.seed) for culture in cultures if culture and culture.kind == "virtual"}
     if len(seeds) > 1 and "several-cultures" not in allow:
         raise UnusableData(
             f"recordings: expected those of one culture, got simulated ones of seeds {', '.join(sorted(seeds))}; "

@@ -161,9 +161,12 @@ class CL1Culture(Culture):
         return float(FRAMES_PER_S)
 
     @property
-    def recorded_as(self) -> RecordedCulture | None:
-        """The seed of its patterns, where they were drawn."""
-        return None if self._seed is None else RecordedCulture("cl1", self._seed)
+    def recorded_as(self) -> RecordedCulture:
+        """With the seed of its patterns, where they were drawn."""
+        self._opened_neurons()
+        assert self._cl is not None
+        with as_device_failure("CL1", "say what it is"):
+            return RecordedCulture("cl1", self._seed, bool(self._cl.is_simulator()))
 
     @property
     def provenance(self) -> dict[str, str]:

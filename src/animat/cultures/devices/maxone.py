@@ -26,7 +26,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace, from_zero
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
-from animat.recordings.recording import Channels
+from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.selection import Selection
 from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN
@@ -157,6 +157,10 @@ class MaxOneCulture(Culture):
     @property
     def sampling_rate_hz(self) -> float:
         return float(FRAMES_PER_S)
+
+    @property
+    def recorded_as(self) -> RecordedCulture:
+        return RecordedCulture("maxone")
 
     @property
     def provenance(self) -> dict[str, str]:
