@@ -131,8 +131,8 @@ def test_a_culture_too_large_for_real_time_says_so(
 ) -> None:
     culture = SimulatedCL1(2, neurons=neurons)
     monkeypatch.setattr(culture, "share_of_real_time", lambda: share)
-    told = culture.too_large()
-    assert told is None if words is None else told is not None and re.search(words, told)
+    warning = culture.real_time_warning()
+    assert warning is None if words is None else warning is not None and re.search(words, warning)
 
 
 @pytest.mark.parametrize("bad", [{"pitch_um": 0.0}, {"reach_um": -1.0}, {"charge_nc": float("nan")}])
