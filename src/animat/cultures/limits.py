@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import floor, isfinite
 from typing import Any
 
 from animat.errors import InvalidArgument
 from animat.stimulation.plain import number, whole_number
-from animat.stimulation.pulse import Kind, Phase, Pulse
+from animat.stimulation.pulse import Kind, Pulse
 
 
 @dataclass(frozen=True)
@@ -153,10 +153,9 @@ def delivered_pulse(pulse: Pulse, amplitude_step: float) -> Pulse:
     """The pulse that a device delivers, with amplitudes rounded to whole steps, half away from 0; step 0: unchanged."""
     if amplitude_step == 0:
         return pulse
-    rounded = [steps_of(phase.amplitude, amplitude_step) * amplitude_step for phase in pulse.phases]
-    if pulse.kind == "voltage":
-        return Pulse(tuple(Phase(p.duration_us, amplitude_mv=a) for p, a in zip(pulse.phases, rounded, strict=True)))
-    return Pulse(tuple(Phase(p.duration_us, amplitude_ua=a) for p, a in zip(pulse.phases, rounded, strict=True)))
+    unit = "amplitude_mv" if pulse.kind == "voltage" else "amplitude_ua"
+    steps = [steps_of(phase.amplitude, amplitude_step) for phase in pulse.phases]
+    return Pulse(tuple(replace(p, **{unit: n * amplitude_step}) for p, n in zip(pulse.phases, steps, strict=True)))
 
 
 def steps_of(amplitude: float, amplitude_step: float) -> int:

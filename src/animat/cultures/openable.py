@@ -122,7 +122,7 @@ class Openable(abc.ABC):
     @property
     @abc.abstractmethod
     def device_limits(self) -> Limits:
-        """What the device and the culture stand."""
+        """What the device and the culture tolerate."""
 
     @property
     @abc.abstractmethod
@@ -262,7 +262,7 @@ class Openable(abc.ABC):
         return self._opened().guard.delivered
 
     @final
-    def stop(self, reason: str = "asked for") -> None:
+    def stop(self, reason: str = "requested") -> None:
         """Emergency stop: deliver nothing more until the culture is closed and opened again. Safe from any thread.
 
         Raises:

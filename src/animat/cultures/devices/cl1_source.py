@@ -165,7 +165,7 @@ class SimulatedCL1:
             InvalidArgument: for a culture that was already read.
         """
         if self._next:
-            raise InvalidArgument(f"expected a culture that was not read, got one that was read to frame {self._next}")
+            raise InvalidArgument(f"culture: expected one not yet read, got one that was read to frame {self._next}")
         before, begun_s = self._tissue.snapshot(), time.perf_counter()
         for frame in range(0, TIMED_FRAMES, FRAMES_PER_READ):
             self.read(frame, FRAMES_PER_READ)
