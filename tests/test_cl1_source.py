@@ -92,7 +92,7 @@ def test_time_only_goes_on_and_may_be_skipped() -> None:
     frames, spikes = culture.read(5000, 500)
     assert all(5000 <= frame < 5500 for frame, _, _ in spikes)
     assert frames.shape == (500, 64)
-    with pytest.raises(InvalidArgument, match="time only goes on"):
+    with pytest.raises(InvalidArgument, match="time only moves forward"):
         culture.read(5499, 10)
 
 

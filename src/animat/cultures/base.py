@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.failures import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, with_rests
+from animat.cultures.observed import Observed, Spikes, assemble, more_left_out, with_rests
 from animat.cultures.openable import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
@@ -231,7 +231,7 @@ class Culture(Openable):
         observed: list[Observed] = []
 
         def so_far() -> Recording:
-            return assembled(
+            return assemble(
                 replace(schedule, blocks=tuple(parts)),
                 observed,
                 channels=self.channels,

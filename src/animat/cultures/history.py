@@ -53,7 +53,7 @@ class History:
                 starts.append(start_ns)
             self.busy_until_ns = end_ns
 
-    def go_on(self, now_ns: int) -> None:
+    def resume(self, now_ns: int) -> None:
         """Continue in a new session whose clock is at `now_ns`.
 
         A clock behind its last reading was restarted: no time is assumed to have passed. Stimuli admitted for later

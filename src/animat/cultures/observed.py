@@ -66,7 +66,7 @@ def with_rests(observed: Observed, stimuli: Sequence[Stimulus], now_s: float) ->
     return replace(observed, stimulus_time_s=time_s)
 
 
-def assembled(
+def assemble(
     schedule: Schedule,
     observed: Sequence[Observed],
     *,

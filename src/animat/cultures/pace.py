@@ -10,7 +10,7 @@ from animat.cultures.safety import Guard, Limits
 from animat.errors import UnsafeStimulus
 from animat.stimulation.stimulus import Stimulus
 
-LATER_S = 0.001
+DELAY_STEP_S = 0.001
 """Step by which stimuli are delayed when they would come too soon after earlier ones."""
 PATIENCE_S = 2.0
 """Rates cover a second: what does not fit after two is not due to a late start."""
@@ -33,7 +33,7 @@ class Pace:
     def __init__(self, limits: Limits, sites: Iterable[int], history: History, now_s: float) -> None:
         self._guard = Guard(limits, sites, history, now_s)
 
-    def soonest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
+    def earliest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
         """The earliest time from `from_s` on, on the device's clock, at which the stimuli may begin.
 
         Args:
@@ -50,7 +50,7 @@ class Pace:
             except UnsafeStimulus as error:
                 if error.limit not in _PACE or waited_s >= PATIENCE_S:
                     raise
-                waited_s += LATER_S
+                waited_s += DELAY_STEP_S
             else:
                 return from_s + waited_s
 

@@ -144,12 +144,11 @@ class ReplayCulture(ComputedCulture):
         minute = (self.now_s + stimulus.time_s) / 60
         row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
         recording = self._recordings[row]
-        frequency_hz = recording.stimuli.frequency_hz
+        stimuli, frequency_hz = recording.stimuli, recording.stimuli.frequency_hz
         same = (frequency_hz == stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
         number_of, set_of_pulse = self._sets[row]
         electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
-        is_rest = recording.stimuli.is_rest == stimulus.is_rest
-        for narrower in (is_rest, recording.stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
+        for narrower in (~stimuli.is_rest, stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
             same = same & narrower if np.any(same & narrower) else same
         pool = np.flatnonzero(same)
         if not len(pool):

@@ -72,7 +72,7 @@ class Guard:
         self._history = History()
         if history is not None:
             self._history = history
-            history.go_on(round(now_s * NS))
+            history.resume(round(now_s * NS))
 
     @property
     def delivered(self) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from animat.cultures.base import Culture
 from animat.cultures.safety import Guard
 from animat.cultures.same_culture import other_patterns
-from animat.cultures.under_way import UnderWay
+from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, Mismatch, shown
@@ -105,7 +105,7 @@ def record_series(
         if virtual is not None:
             Guard(virtual.limits, ()).check_pulse(protocol.pulse)
             _check_recordings(files, virtual, protocol, interval_s, seed)
-            virtual, recorded = _resumed(make_culture, virtual, files)
+            virtual, recorded = _resume(make_culture, virtual, files)
             culture = virtual
         room_bytes = BYTES_PER_MIN * minutes_of(protocol, n_patterns)
         if not all(file.exists() for file in files):
@@ -121,7 +121,7 @@ def record_series(
         for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
             for leftover in folder.glob(f"{name}.*.partial*"):
                 clear_away(leftover)
-        follow = opened.enter_context(UnderWay(folder))
+        follow = opened.enter_context(PartialRecording(folder))
         if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
             virtual.selection.save(folder / SELECTION_FILE)
         if virtual is not None and not recorded:
@@ -158,7 +158,7 @@ def order_seed(seed: int, session: int) -> int:
     return seed * 10_000 + session
 
 
-def _resumed(
+def _resume(
     make_culture: Callable[[], Culture], culture: VirtualCulture, files: list[Path]
 ) -> tuple[VirtualCulture, int]:
     """The culture as it was after the existing recordings, or at the last known state before; and after how many."""

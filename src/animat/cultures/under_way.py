@@ -20,7 +20,7 @@ EVERY_S = 3.0
 """Shortest time between two writes, in seconds."""
 
 
-class UnderWay:
+class PartialRecording:
     """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
 
     Args:

@@ -62,7 +62,7 @@ class Visibility:
         )
         self.recovery_ms = np.clip(np.where(is_excitatory, 0.45 + 0.1 * draw[1], 0.25 + 0.06 * draw[1]), 0.1, 0.9)
         self._x_um, self._y_um = x_um, y_um
-        self.pairs = self._see()
+        self.pairs = self._find_pairs()
 
     def pairs_of(self, electrodes: Int64[np.ndarray, " electrodes"]) -> Pairs:
         """The pairs of some electrodes, in their order; `electrode` becomes the row in `electrodes`."""
@@ -109,7 +109,7 @@ class Visibility:
             recovery_ms=mean(self.recovery_ms[pairs.neuron]) + jitter_ms * blur[2],
         )
 
-    def _see(self) -> Pairs:
+    def _find_pairs(self) -> Pairs:
         pitch_um = self.array.pitch_um
         # Positions relative to electrode 0.
         x_um, y_um = self._x_um - pitch_um / 2, self._y_um - pitch_um / 2

@@ -117,9 +117,9 @@ class Delivery:
 
     def _queue(self, stimulus: Stimulus, frame: int) -> int:
         """Queue one stimulus on the device, at a frame or as soon as possible after it; returns the frame."""
-        soonest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
+        earliest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
         alone = [replace(stimulus, time_s=0.0)]
-        frame = round(self._pace.soonest(alone, max(frame, soonest) / FRAMES_PER_S) * FRAMES_PER_S)
+        frame = round(self._pace.earliest(alone, max(frame, earliest) / FRAMES_PER_S) * FRAMES_PER_S)
         self._pace.count(alone, frame / FRAMES_PER_S)
         plan = self._neurons.create_stim_plan()
         plan.stim(self._cl.ChannelSet(*stimulus.electrodes), self._design(stimulus.pulse), lead_time_us=LEAD_US)

@@ -110,22 +110,22 @@ class SimulatedCL1:
         self._next = 0
         self._pulses: list[Pulse] = []
         self._held: list[tuple[int, int, int]] = []
-        self._sounding: list[tuple[int, int, int]] = []
+        self._unfinished: list[tuple[int, int, int]] = []
         self._block: tuple[int, Int16[np.ndarray, "frames channels"]] | None = None
 
     def stimulate(self, events: Sequence[StimulusEvent]) -> None:
         """Schedule pulses; those of one frame on several channels are one stimulus. Late ones act immediately."""
-        strength: dict[tuple[int, float], list[int]] = {}
+        channels_of: dict[tuple[int, float], list[int]] = {}
         for event in events:
             if 0 <= event.channel < CHANNELS and self._is_electrode[event.channel]:
                 charges = zip(event.phase_durations_us, event.phase_currents_uA, strict=True)
                 cathodic_nc = max([0.0, *(-us * ua / 1000 for us, ua in charges)])
                 if cathodic_nc > 0:
                     key = (event.timestamp, min(2.0, cathodic_nc / self._charge_nc))
-                    strength.setdefault(key, []).append(event.channel)
-        for (frame, how), channels in sorted(strength.items()):
+                    channels_of.setdefault(key, []).append(event.channel)
+        for (frame, strength), channels in sorted(channels_of.items()):
             at_s = (self._zero_frames + max(0, frame)) / FRAMES_PER_S
-            self._pulses.append(Pulse(at_s, self.x_um[sorted(channels)], self.y_um[sorted(channels)], how))
+            self._pulses.append(Pulse(at_s, self.x_um[sorted(channels)], self.y_um[sorted(channels)], strength))
 
     def read(
         self, from_frame: int, frame_count: int
@@ -136,23 +136,25 @@ class SimulatedCL1:
             InvalidArgument: for frames that were already read.
         """
         if from_frame < self._next:
-            raise InvalidArgument(f"from_frame: expected {self._next} or later, as time only goes on, got {from_frame}")
+            raise InvalidArgument(
+                f"from_frame: expected {self._next} or later, as time only moves forward, got {from_frame}"
+            )
         to_frame = from_frame + frame_count
         self._advance(to_frame)
         # Spikes in skipped frames are dropped.
         due = [spike for spike in self._held if from_frame <= spike[0] < to_frame]
         self._held = [spike for spike in self._held if spike[0] >= to_frame]
-        sounding = [*(self._sounding if from_frame == self._next else ()), *due]
+        unfinished = [*(self._unfinished if from_frame == self._next else ()), *due]
         frames = self._noise(from_frame, frame_count)
-        if sounding:
+        if unfinished:
             signal = frames.astype(np.float32)
-            for frame, channel, neuron in sounding:
+            for frame, channel, neuron in unfinished:
                 shape = self._shapes[neuron, BEFORE:] / np.float32(UV_PER_UNIT)
                 part = shape[max(0, from_frame - frame) : to_frame - frame]
                 first = max(0, frame - from_frame)
                 signal[first : first + len(part), channel] += part
             frames = np.clip(np.rint(signal), -32768, 32767).astype(np.int16)
-        self._sounding = [spike for spike in sounding if spike[0] + SAMPLES - BEFORE > to_frame]
+        self._unfinished = [spike for spike in unfinished if spike[0] + SAMPLES - BEFORE > to_frame]
         self._next = to_frame
         return frames, [(frame, channel, self._shapes[neuron]) for frame, channel, neuron in due]
 
@@ -171,7 +173,7 @@ class SimulatedCL1:
             self.read(frame, FRAMES_PER_READ)
         took_s = time.perf_counter() - begun_s
         self._tissue.restore(before)
-        self._next, self._held, self._sounding = 0, [], []
+        self._next, self._held, self._unfinished = 0, [], []
         return took_s / (TIMED_FRAMES / FRAMES_PER_S)
 
     def real_time_warning(self) -> str | None:

@@ -229,9 +229,9 @@ class MaxOneCulture(Culture):
         for group, sequence in zip(groups, built, strict=True):
             due = start + round(group[0].time_s * FRAMES_PER_S) + late
             relative = from_zero(group)
-            soonest = max(due, stream.frame() + INITIAL_DELAY)
-            soonest = round(pace.soonest(relative, soonest / FRAMES_PER_S) * FRAMES_PER_S)
-            stream.wait(soonest - INITIAL_DELAY)
+            earliest = max(due, stream.frame() + INITIAL_DELAY)
+            earliest = round(pace.earliest(relative, earliest / FRAMES_PER_S) * FRAMES_PER_S)
+            stream.wait(earliest - INITIAL_DELAY)
             if halted.is_set():
                 raise DeviceFailed(
                     f"MaxOne: stopped while delivering: {len(begun)} of {len(admitted.stimuli)} stimuli had been sent, "

@@ -116,7 +116,7 @@ def arrivals_of(state: State) -> Arrivals:
     return Arrivals(is_arriving.sum(2, dtype=np.int32), targets_first.astype(np.int32))
 
 
-def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
+def pack(constants: Constants) -> Shaped[np.ndarray, " 1"]:
     """The constants as one record with the same names: unpacking a tuple of 34 values takes 3 us in each call."""
     values = {name: np.asarray(value) for name, value in constants._asdict().items()}
     record = np.zeros(1, np.dtype([(name, value.dtype, value.shape) for name, value in values.items()], align=True))

@@ -290,7 +290,7 @@ def advance(
     Unpacking a named tuple takes a call twice as long as a plain one, which matters for calls of 60 steps of 2 us.
 
     Args:
-        record, wires, values, arriving: the tissue, as `packed` constants and plain tuples of `Wiring`, `State` and
+        record, wires, values, arriving: the tissue: constants from `pack`, and plain tuples of `Wiring`, `State` and
             `Arrivals`; the last two are changed in place.
         first_step, n_steps: the tissue's clock, in steps, and the number of steps.
         gain: factor on excitatory weights during this call.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from animat.cultures.tissue import kernel
-from animat.cultures.tissue.arrays import State, arrivals_of, packed
+from animat.cultures.tissue.arrays import State, arrivals_of, pack
 from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
 from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.network import grow
@@ -61,7 +61,7 @@ class Tissue:
         self._network = grow(seed, self.parameters)
         self._coupling = Coupling(seed, self.parameters, self._network)
         self._drift = Drift(seed, self.parameters)
-        self._constants = packed(prepare_constants(self.parameters))
+        self._constants = pack(prepare_constants(self.parameters))
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
         self._adopt(fresh_state(seed, self.parameters, self._network, self._wiring))
         self._step_ns = round(self.parameters.step_ms * 1e6)
