@@ -579,7 +579,7 @@ def test_what_was_admitted_is_neither_changed_nor_copied() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        *("deliver", "stop", "limits", "__enter__", "_opened", "_end", "_rehearse", "_close_after"),
+        *("deliver", "stop", "limits", "__enter__", "_opened", "close", "_rehearse", "__exit__"),
         *("__getattribute__", "__setattr__", "__reduce_ex__", "__copy__", "__deepcopy__"),
     ],
 )

@@ -190,7 +190,11 @@ class Openable(abc.ABC):
                     self.__turns = Turns(Guard(limits, self.stimulation_electrodes, self.__history, now_s))
             except BaseException as error:
                 self.__turns = None
-                self._close_after(error, None)
+                try:
+                    with as_device_failure(self.name, "close"), self.__hold.pop_all():
+                        self._close()
+                except Exception as failed:
+                    error.add_note(f"and then: {failed}")
                 raise
             for reason in self.__stops:
                 self.__turns.guard.stop(reason)
@@ -210,9 +214,19 @@ class Openable(abc.ABC):
         """
         with self.__closing():
             turns, self.__turns = self.__turns, None
-            if turns is not None:
-                with as_device_failure(self.name, "close"):
-                    self._end(turns)
+            if turns is None:
+                return
+            with as_device_failure(self.name, "close"), self.__hold.pop_all():
+                if turns.is_elsewhere:
+                    # A fork's copy is not a culture of this process, which must not close the device.
+                    return
+                try:
+                    turns.guard.stop("it was closed")
+                    if turns.is_taken_elsewhere:
+                        self._halt()
+                    turns.end(self.ends_within_s)
+                finally:
+                    self._close()
 
     @final
     def __enter__(self) -> Self:
@@ -222,13 +236,12 @@ class Openable(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is None:
+        try:
             self.close()
-        else:
-            with self.__closing():
-                turns, self.__turns = self.__turns, None
-                if turns is not None:
-                    self._close_after(error, turns)
+        except Exception as failed:
+            if error is None:
+                raise
+            error.add_note(f"and then: {failed}")
 
     def __closing(self) -> AbstractContextManager[object]:
         # A fork copies a lock that another thread holds, but not the thread that would release it.
@@ -274,29 +287,6 @@ class Openable(abc.ABC):
             turns.guard.stop(reason)
         with as_device_failure(self.name, "stop"):
             self._halt()
-
-    def _end(self, turns: Turns | None) -> None:
-        """End a session, leave the device safe and release it."""
-        with self.__hold.pop_all():
-            if turns is not None and turns.is_elsewhere:
-                # A fork's copy is not a culture of this process, which must not close the device.
-                return
-            try:
-                if turns is not None:
-                    turns.guard.stop("it was closed")
-                    if turns.is_taken_elsewhere:
-                        self._halt()
-                    turns.end(self.ends_within_s)
-            finally:
-                self._close()
-
-    def _close_after(self, error: BaseException, turns: Turns | None) -> None:
-        """Close because of an error; if closing fails too, that becomes a note of the error."""
-        try:
-            with as_device_failure(self.name, "close"):
-                self._end(turns)
-        except Exception as failed:
-            error.add_note(f"and then: {failed}")
 
     def _opened(self) -> Turns:
         turns = self.__turns
