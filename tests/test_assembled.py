@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from animat.cultures.observed import Observed, Spikes, assembled
+from animat.cultures.observed import Observed, Spikes, assemble
 from animat.recordings.recording import Channels
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
@@ -32,7 +32,7 @@ def test_all_that_was_seen_lies_within_and_at_its_sample(
         spikes = Spikes(np.array(spikes_ns) / 1e9, np.zeros(len(spikes_ns), np.int64))
         observed.append(Observed(0.0, us / 1e6, spikes, np.array([0.0, 0.5]) * us / 1e6))
         expected_ns += [int(ends_ns[number]) - 1000 * us + ns for ns in spikes_ns]
-    recording = assembled(
+    recording = assemble(
         make_schedule(PROTOCOL, np.array([[0]]), 0),
         observed,
         channels=ONE_CHANNEL,

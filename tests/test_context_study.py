@@ -89,7 +89,7 @@ def test_a_recording_is_over_when_the_next_one_is_due(
     def looked_for(*_: object) -> None:
         raise NotImplementedError("earlier recordings")
 
-    monkeypatch.setattr("animat.cultures.series._expect_lived", looked_for)
+    monkeypatch.setattr("animat.cultures.series._check_recordings", looked_for)
     # Recordings that take too long are refused before earlier ones are looked for.
     with pytest.raises(NotImplementedError, match="earlier recordings"):
         RecordCulture(1, n_commands).run(tmp_path, Silent())

@@ -43,7 +43,7 @@ def test_the_contract_finds_a_backend_that_breaks_it() -> None:
             return Leaky([synthetic_recording(1, channels=32)])
 
     with pytest.raises(AssertionError):
-        OfLeaky().test_its_clock_runs_forward_by_at_least_what_was_asked()
+        OfLeaky().test_its_clock_advances_by_at_least_the_requested_time()
 
 
 def test_a_device_that_fails_while_it_is_opened_is_let_go_of() -> None:

@@ -19,7 +19,7 @@ from animat.cultures import under_way
 from animat.cultures.budget import Account, Budget, record_within
 from animat.cultures.kinds import recorded_culture
 from animat.cultures.observed import Observed
-from animat.cultures.under_way import UnderWay
+from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import (
     AnimatError,
@@ -80,7 +80,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen) -> tuple[LiveRun, 
     """A run whose recordings are watched as they are made."""
     folder = tmp_path_factory.mktemp("live") / "live"
 
-    class Watched(UnderWay):
+    class Watched(PartialRecording):
         def __call__(self, so_far: Any) -> None:
             super().__call__(so_far)
             found = RecordingView(folder / "recordings").view(None, 8.0)
@@ -89,7 +89,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory, seen: Seen) -> tuple[LiveRun, 
 
     with pytest.MonkeyPatch.context() as patch, FakeCulture() as culture:
         patch.setattr(under_way, "EVERY_S", 0.0)
-        patch.setattr(shadowing, "UnderWay", Watched)
+        patch.setattr(shadowing, "PartialRecording", Watched)
         found = live(TRAINING, culture, BLOCKED, folder, timetable=QUICK, episodes=3)
         return found, folder, culture.delivered
 

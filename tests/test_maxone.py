@@ -217,7 +217,7 @@ def test_whatever_goes_wrong_meanwhile_takes_the_power(rig: Rig) -> None:
             assert not rig.powered
             assert culture.is_stopped
             rig.on_send = None
-            with pytest.raises(UnsafeStimulus, match=f"stopped: .* broken off by {wrong.__name__}: now"):
+            with pytest.raises(UnsafeStimulus, match=f"stopped: .* interrupted by {wrong.__name__}: now"):
                 culture.deliver([Stimulus(0.1, (SITES[0],), BALANCED_PULSE)], 0.2)
         assert rig.delivered == []
 
@@ -378,7 +378,7 @@ def test_a_stream_that_falls_silent_is_a_lost_connection(monkeypatch: pytest.Mon
     monkeypatch.setattr("animat.cultures.devices.maxone_stream.PATIENCE_S", 0.0)
     stream = ZmqSpikes()
     stream.hear([np.uint64(42).tobytes(), b""])
-    with pytest.raises(DeviceFailed, match="got none any more: is MaxLab Live's server running") as failed:
+    with pytest.raises(DeviceFailed, match="got none for 0 s: is MaxLab Live's server running") as failed:
         stream.wait(43)
     assert isinstance(failed.value.__cause__, ConnectionError)
 

@@ -74,7 +74,7 @@ def test_a_rest_is_said_and_no_set_that_is_empty_by_mistake() -> None:
         with pytest.raises(UnsafeStimulus, match="expected 1 to 32 electrodes, got 0"):
             culture.deliver([replace(REST, pattern=-1)], 0.1)
         for times_s in ((0.06, 0.01), (-0.01, 0.06), (float("nan"), 0.06)):
-            with pytest.raises(InvalidArgument, match=r"stimuli: expected times (from 0 s on that do not fall|before)"):
+            with pytest.raises(InvalidArgument, match=r"stimuli: expected times (from 0 s in ascending order|before)"):
                 culture.deliver([replace(each, time_s=t) for each, t in zip((REST, PULSE), times_s, strict=True)], 0.1)
         assert culture.delivered == 0
 

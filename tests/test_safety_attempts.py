@@ -160,7 +160,7 @@ def test_a_delivery_from_within_a_delivery_is_refused() -> None:
                 self.deliver([], 0.1)
             return super()._deliver(admitted, duration_s)
 
-    with Within() as culture, pytest.raises(InvalidArgument, match="one call to be over before the next"):
+    with Within() as culture, pytest.raises(InvalidArgument, match="one call to end before the next"):
         culture.deliver([one()], 0.1)
 
 
@@ -556,7 +556,7 @@ def test_what_a_fork_copied_delivers_nothing_and_closes_nothing(tmp_path: Path) 
                 os._exit(0)
         os.waitpid(child, 0)
         assert told.read_text() == (
-            "culture: expected one that this process opened, got a copy that a fork made; 0; closed 0"
+            "culture: expected one that this process opened, got a copy made by a fork; 0; closed 0"
         )
         culture.deliver([one()], 0.1)
 
@@ -579,7 +579,7 @@ def test_what_was_admitted_is_neither_changed_nor_copied() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        *("deliver", "stop", "limits", "__enter__", "_opened", "_end", "_rehearse", "_close_after"),
+        *("deliver", "stop", "limits", "__enter__", "_opened", "close", "_rehearse", "__exit__"),
         *("__getattribute__", "__setattr__", "__reduce_ex__", "__copy__", "__deepcopy__"),
     ],
 )
@@ -660,7 +660,7 @@ import sys
 from pathlib import Path
 from animat.cultures import holding
 holding.MACHINE = Path(sys.argv[1])
-with holding.held(holding.of_the_machine("maxone"), "another"):
+with holding.hold(holding.of_the_machine("maxone"), "another"):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -687,7 +687,7 @@ def test_a_device_is_open_to_all_users_whatever_the_umask(tmp_path: Path) -> Non
     before = os.umask(0o077)
     try:
         for holder, is_handed_over in (("a", False), ("a", False), ("b", True)):
-            with holding.held(device, holder) as found:
+            with holding.hold(device, holder) as found:
                 assert found is is_handed_over
     finally:
         os.umask(before)
@@ -706,7 +706,7 @@ def test_a_folder_that_cannot_hold_a_device_is_its_failure_and_no_link_is_follow
     planted.mkdir()
     (planted / "held_last_by").symlink_to(mine / "letter")
     for device in (file, link, planted):
-        with pytest.raises(DeviceFailed, match=f"^{device.name}: expected") as failed, holding.held(device, "a"):
+        with pytest.raises(DeviceFailed, match=f"^{device.name}: expected") as failed, holding.hold(device, "a"):
             pass
         assert "--out" not in str(failed.value)
     assert stat.S_IMODE(mine.stat().st_mode) == 0o700

@@ -10,7 +10,7 @@ import pytest
 
 from animat.cultures.observed import Observed
 from animat.cultures.series import record_series
-from animat.cultures.under_way import UNDER_WAY, UnderWay
+from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed
 from animat.recordings.reading import read_recording, read_recordings
@@ -115,14 +115,14 @@ def test_one_that_fails_leaves_nothing_and_one_that_was_killed_is_told(tmp_path:
     assert list(tmp_path.iterdir()) == []
     with FakeCulture() as culture:
         recording = culture.record(SHORT, 1)
-    UnderWay(tmp_path)(lambda: recording)
+    PartialRecording(tmp_path)(lambda: recording)
     assert read_recording(tmp_path / UNDER_WAY).spike_times_s.tolist() == recording.spike_times_s.tolist()
     found = RecordingView(tmp_path).view(None, 1.0)
     assert found["state"] == "silent"
     assert "was interrupted" in found["message"]
     # The next run is rid of it.
     (tmp_path / f".{UNDER_WAY}.ab12.partial.npz").write_bytes(b"half")
-    with exclusive_lock(tmp_path), UnderWay(tmp_path):
+    with exclusive_lock(tmp_path), PartialRecording(tmp_path):
         assert [file.name for file in tmp_path.iterdir() if file.suffix == ".npz"] == []
 
 

@@ -24,7 +24,7 @@ from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
 from animat.neurons.remembering import Remembered
 from animat.responses.extraction import SILENCE_S
@@ -114,7 +114,7 @@ class Driver:
         except Stop as stop:
             return stop.ending
         except Exception as error:
-            return Ending("crash", f"an error of the loop itself: {in_words(error)}")
+            return Ending("crash", f"an error of the loop itself: {describe_error(error)}")
         return Ending("plan", f"all {len(self._turns)} episodes were run")
 
     def _run_episode(self, episode: int, agent: Agent) -> None:
@@ -168,7 +168,7 @@ class Driver:
         try:
             observation = self._runner.reset(turn)
         except Exception as error:
-            raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
+            raise Stop(Ending("robot", f"the robot raised {describe_error(error)}")) from error
         if not np.all(np.isfinite(observation)):
             raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
@@ -189,7 +189,7 @@ class Driver:
         try:
             chosen = int(controller.act(observation, self._rng))
         except Exception as error:
-            raise Stop(Ending("controller", f"{agent.name} raised {in_words(error)}")) from error
+            raise Stop(Ending("controller", f"{agent.name} raised {describe_error(error)}")) from error
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -290,7 +290,7 @@ class Driver:
             if iteration + 1 == agent.switch_at and not moved.terminated:
                 moved = moved._replace(observation=self._runner.switch_goal(self._presented))
         except Exception as error:
-            raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
+            raise Stop(Ending("robot", f"the robot raised {describe_error(error)}")) from error
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
             raise Stop(Ending("robot", f"the robot came to {moved.observation.tolist()} with reward {moved.reward:g}"))
         return {

@@ -29,7 +29,7 @@ from animat.closed_loop.tick import Ending
 from animat.closed_loop.timing import Clock, WallClock, ahead_of_other_programs, among_other_programs
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.cultures.observed import more_left_out
 from animat.cultures.safety import Guard
 from animat.errors import AnimatError, InvalidArgument, Mismatch, shown, some_of
@@ -115,7 +115,7 @@ def run_session(
             session.write()
         except Exception as error:
             # What was measured comes back, whatever its files are like.
-            told = error if isinstance(error, AnimatError) else f"its files cannot be made: {in_words(error)}"
+            told = error if isinstance(error, AnimatError) else f"its files cannot be made: {describe_error(error)}"
             told = str(told).removesuffix(UNCHANGED)
             message = f"{ending.message}; {told} (animat recover {folder} writes the files, once that is mended)"
             session = replace(session, ending=replace(ending, message=message))
@@ -158,7 +158,7 @@ class _Supervisor:
             except BaseException as error:
                 # The caller's progress, or a fault of our own: a loop that nobody watches must not go on.
                 is_person = isinstance(error, KeyboardInterrupt)
-                told = "stopped by a person" if is_person else f"what watches the loop raised {in_words(error)}"
+                told = "stopped by a person" if is_person else f"what watches the loop raised {describe_error(error)}"
                 with suppress(Exception):
                     self._end_it(thread, Ending("person" if is_person else "crash", told))
                 raise
@@ -269,7 +269,7 @@ class _Supervisor:
         try:
             self._culture.stop(reason)
         except Exception as error:
-            self._not_halted = f"the culture could not be stopped ({in_words(error)})"
+            self._not_halted = f"the culture could not be stopped ({describe_error(error)})"
         else:
             self._not_halted = None
 

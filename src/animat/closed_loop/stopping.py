@@ -6,7 +6,7 @@ from pathlib import Path
 
 from animat.closed_loop.tick import Ending
 from animat.cultures.base import Culture
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.errors import UnsafeStimulus
 
 
@@ -40,7 +40,7 @@ def ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
     if isinstance(error, UnsafeStimulus) and culture.is_stopped:
         return Ending("culture", f"the culture was stopped: {error}")
     lost = "the connection to the culture is lost: " if _is_lost(error) else "the culture raised "
-    return Ending("culture", lost + in_words(error))
+    return Ending("culture", lost + describe_error(error))
 
 
 def _is_lost(error: BaseException | None) -> bool:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.cultures.observed import Observed
 from animat.recordings.recording import Channels
 from animat.responses.windows import read_windows
@@ -121,7 +121,7 @@ def wrong_with(
         if len(channel) and not (channel.min() >= 0 and channel.max() < n_channels):
             return f"the culture answered channel {int(channel.max())} of {n_channels}"
     except Exception as error:
-        return f"the culture answered something that cannot be read: {in_words(error)}"
+        return f"the culture answered something that cannot be read: {describe_error(error)}"
     return None
 
 

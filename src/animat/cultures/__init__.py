@@ -1,2 +1,1 @@
-"""What can be stimulated and recorded: the contract, and one file per kind of culture; what drives hardware is in
-`devices`."""
+"""Cultures: the contract, and one file per kind; drivers of hardware are in `devices`."""

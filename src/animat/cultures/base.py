@@ -6,15 +6,16 @@ import abc
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from inspect import getattr_static
+from itertools import chain
 from types import FunctionType
 from typing import Any, ClassVar, final
 
 import numpy as np
 from jaxtyping import Int64
 
-from animat.cultures.failing import as_device_failure
-from animat.cultures.observed import Observed, Spikes, assembled, more_left_out, with_rests
-from animat.cultures.opening import Openable
+from animat.cultures.failures import as_device_failure
+from animat.cultures.observed import Observed, Spikes, assemble, more_left_out, with_rests
+from animat.cultures.openable import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import AnimatError, InvalidArgument, shown, some_of
@@ -32,10 +33,10 @@ from animat.tables import UNKNOWN
 class Culture(Openable):
     """A culture on an array: open it, stimulate it, record it, let time pass, close it.
 
-    What a user calls is final; it checks, asks the guard, and then calls what a backend implements, whose names begin
-    with an underscore. Nothing is delivered but what the guard admitted: `_deliver` takes `Admitted` stimuli, which
-    nothing else can make. A culture has a state and a clock of its own; everything takes time on it. Threads may share
-    one: their calls wait for each other, but for `stop`. It cannot be copied.
+    Users call final methods, which check their arguments, consult the guard, and then call the backend's methods, whose
+    names begin with an underscore. Only what the guard admitted is delivered: `_deliver` takes `Admitted` stimuli, and
+    only a guard makes them. A culture has its own state and clock; everything takes time on it. Threads may share one:
+    their calls wait for each other, except for `stop`. It cannot be copied.
 
     A backend implements `name`, the data (`channels`, `stimulation_electrodes`, `patterns`, `device_limits`, `now_s`,
     `sampling_rate_hz`, `provenance`) and `_open`, `_deliver`, `_rest`, `_halt` and `_close`; it passes
@@ -49,7 +50,7 @@ class Culture(Openable):
         super().__init_subclass__(**keywords)
         _refuse_overrides(cls)
 
-    # What a backend is: data. Valid once it is open.
+    # A backend's data, valid once it is open.
 
     @property
     @abc.abstractmethod
@@ -64,12 +65,12 @@ class Culture(Openable):
     @property
     @abc.abstractmethod
     def sampling_rate_hz(self) -> float:
-        """Of the raw signal that spikes are detected in."""
+        """Sampling rate of the raw signal in which spikes are detected."""
 
     @property
     @abc.abstractmethod
     def provenance(self) -> dict[str, str]:
-        """What a recording says about where it came from."""
+        """The origin of recordings of this culture, by key."""
 
     @property
     def recorded_as(self) -> RecordedCulture | None:
@@ -78,42 +79,42 @@ class Culture(Openable):
 
     @property
     def left_out(self) -> dict[str, int]:
-        """What the device reported, or should have, and no recording has, counted since `open`, by what it is."""
+        """Counts since `open` of what the device reported, or should have, and recordings lack, by description."""
         return {}
 
     @property
     def stretch_s(self) -> float | None:
-        """How much of a block `record` asks for at once; None: all of it, where the clock goes on between two calls."""
+        """How much of a block `record` requests at a time; None: all of it, as the clock runs between calls."""
         return None
 
-    # What a backend does.
+    # A backend's methods.
 
     @abc.abstractmethod
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
-        """Deliver stimuli at their times after `admitted.now_s`, let `duration_s` pass, and say what was seen."""
+        """Deliver stimuli at their times after `admitted.now_s`, let `duration_s` pass, and return the observation."""
 
-    # What a user calls.
+    # The user's methods.
 
     @final
     def deliver(self, stimuli: Iterable[Stimulus], duration_s: float, *, since_s: float | None = None) -> Observed:
         """Deliver stimuli within the next `duration_s` and observe all channels meanwhile.
 
-        A living culture's clock goes on while a program decides what to ask for. Who counted times from a reading of it
-        hands that over as `since_s`: what has passed since then is taken off, and stimuli come when they are due and
-        not later by that. Where the first one's time is past, it comes now and the others as long after it as asked.
+        A living culture's clock runs on while a program decides what to request. A caller that counted times from a
+        reading of that clock passes it as `since_s`: the time that has passed since is subtracted, so that stimuli come
+        when they are due. If the first one is overdue, it comes now and the others keep their intervals after it.
 
         Args:
-            stimuli: in the order of time, counted from now, or from `since_s`. Of one that is a rest
-                (`Stimulus.is_rest`) nothing is delivered.
-            duration_s: how long, zero or more; all stimuli begin within. All times are float64.
+            stimuli: in order of time, counted from now, or from `since_s`. For a rest (`Stimulus.is_rest`) nothing is
+                delivered.
+            duration_s: how long, zero or more; all stimuli begin within it. All times are float64.
             since_s: a reading of `now_s`; None: now.
 
         Raises:
             UnsafeStimulus: naming the limit that one of them exceeds; nothing is then delivered, and no time passes.
-            InvalidArgument: for a culture that is not open, stimuli outside this stretch of time, a time that is less
-                precise than float64, or a `since_s` that the clock has not come to.
-            DeviceFailed: if the device fails meanwhile; whether what was asked for was delivered is then not known
-                where the error's `is_admitted` is true.
+            InvalidArgument: for a culture that is not open, stimuli outside this stretch of time, a time less precise
+                than float64, or a `since_s` that the clock has not reached.
+            DeviceFailed: if the device fails meanwhile; if the error's `is_admitted` is true, it is not known whether
+                the request was delivered.
         """
         turns, request, admitted = self._opened(), Request.of(stimuli, duration_s), None
         try:
@@ -121,8 +122,8 @@ class Culture(Openable):
                 now_s = seconds("now_s", self.now_s)
                 if since_s is not None and since_s != now_s:
                     request = request.counted_from(seconds("since_s", since_s), now_s)
-                # What is no pulse is nobody's to deliver: it comes neither to the guard nor to the backend.
-                pulses = [each for each in request.stimuli if not each.is_rest]
+                # Rests go neither to the guard nor to the backend.
+                pulses = [stimulus for stimulus in request.stimuli if not stimulus.is_rest]
                 if request.stimuli and not pulses:
                     guard.expect_not_stopped()
                 admitted = guard.admit(pulses, now_s)
@@ -133,7 +134,7 @@ class Culture(Openable):
 
     @final
     def advance(self, duration_s: float) -> Spikes:
-        """Let time pass without a stimulus; spikes are counted from its start."""
+        """Let time pass without stimuli; spike times are counted from its start."""
         return self.deliver((), duration_s).spikes
 
     @final
@@ -155,8 +156,8 @@ class Culture(Openable):
         """Deliver one pulse now and return the spikes of a window after it; time passes to the window's end.
 
         Args:
-            electrodes: that are pulsed together.
-            pulse: what each delivers.
+            electrodes: pulsed together.
+            pulse: that each delivers.
             window_ms: start and end of the window after the pulse.
 
         Returns:
@@ -165,12 +166,12 @@ class Culture(Openable):
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
-        start_ms, end_ms = (number("window_ms", each) for each in window_ms)
+        start_ms, end_ms = (number("window_ms", edge_ms) for edge_ms in window_ms)
         if not 0 <= start_ms < end_ms < float("inf"):
             raise InvalidArgument(f"window_ms: expected a start from 0 and an end after it, got {window_ms}")
         observed = self.deliver([Stimulus(0.0, tuple(electrodes), pulse)], end_ms * 1e-3)
         since_s = observed.spikes.time_s - observed.stimulus_time_s[0]
-        # Spikes lie on samples: half a nanosecond off an edge is on it.
+        # Spikes lie on samples: one within half a nanosecond of an edge is on it.
         inside = (since_s >= start_ms * 1e-3 - 5e-10) & (since_s < end_ms * 1e-3 - 5e-10)
         return Spikes(since_s[inside], observed.spikes.channel[inside])
 
@@ -179,20 +180,18 @@ class Culture(Openable):
         """The stimuli that `record` would deliver.
 
         Raises:
-            InvalidArgument: for what is no protocol, places with electrodes that do not stimulate it, or more patterns
-                than it has.
+            InvalidArgument: for anything that is not a protocol, places with electrodes that do not stimulate the
+                culture, or more patterns than it has.
         """
         if not isinstance(protocol, Protocol):
-            raise InvalidArgument(
-                f"protocol: expected a Protocol, as Protocol(trials=5) makes one, got {shown(protocol)}"
-            )
+            raise InvalidArgument(f"protocol: expected a Protocol, such as Protocol(trials=5), got {shown(protocol)}")
         table, electrodes = self.channels, np.array(self.stimulation_electrodes, np.int64)
         row_of = {electrode: row for row, electrode in enumerate(table.electrode.tolist())}
         rows = [row_of.get(electrode, UNKNOWN) for electrode in electrodes.tolist()]
-        # One that is not recorded has no position here.
-        x_um, y_um = (np.append(each, np.nan)[rows] for each in (table.x_um, table.y_um))
+        # An electrode that is not recorded has no known position.
+        x_um, y_um = (np.append(positions, np.nan)[rows] for positions in (table.x_um, table.y_um))
         places = electrodes_of(protocol.places, electrodes, x_um, y_um)
-        if strange := sorted({each for place in places for each in place} - {*electrodes.tolist()}):
+        if strange := sorted({*chain(*places)} - {*electrodes.tolist()}):
             raise InvalidArgument(
                 f"places: expected electrodes among the {len(electrodes)} that stimulate this culture "
                 f"({some_of(sorted(electrodes.tolist()))}), got {some_of(strange)}"
@@ -210,14 +209,14 @@ class Culture(Openable):
         """Stimulate by a protocol and record.
 
         The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
-        recording's clock, block following block.
+        recording's clock, on which blocks follow one another directly.
 
         Args:
             protocol: what to do; it is kept with the recording.
             seed: decides the order of conditions and patterns.
-            progress: told after each block, or stretch of one (`stretch_s`).
-            follow: then called with what gives the recording so far, but for the last time, when it is whole. What it
-                takes comes off the next set-up time.
+            progress: updated after each block, or stretch of one (`stretch_s`).
+            follow: then called, except at the end, with a function that returns the recording so far. The time it takes
+                is subtracted from the next set-up time.
 
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
@@ -232,7 +231,7 @@ class Culture(Openable):
         observed: list[Observed] = []
 
         def so_far() -> Recording:
-            return assembled(
+            return assemble(
                 replace(schedule, blocks=tuple(parts)),
                 observed,
                 channels=self.channels,
@@ -259,7 +258,7 @@ class Culture(Openable):
         return so_far()
 
     def _rehearse(self, schedule: Schedule) -> None:
-        """Put the whole schedule before the guard, blocks at their times, delivering nothing."""
+        """Have the guard check the whole schedule, each block at its time, and deliver nothing."""
         turns, offset_s, stimuli = self._opened(), 0.0, list[Stimulus]()
         for block in schedule.blocks:
             offset_s += block.setup_s
@@ -272,15 +271,15 @@ class Culture(Openable):
 
 
 _BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
-"""They are called before whatever the base class has, or in its place."""
+"""Python calls these before, or instead of, the base class's attributes."""
 _REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
-"""What a backend may have of its own though it is not abstract."""
+"""What a backend may override although it is not abstract."""
 
 
 def _refuse_overrides(cls: type[Culture]) -> None:
-    """Refuse a subclass in which anything else of `Culture` is replaced, private or not (TypeError).
+    """Raise TypeError for a subclass that replaces anything else of `Culture`, private or not.
 
-    Wherever it has a name from, what stands before `Culture` among its bases counts.
+    Names inherited from a base class that precedes `Culture` count too.
     """
     own = {
         name: member
@@ -293,14 +292,13 @@ def _refuse_overrides(cls: type[Culture]) -> None:
     } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
     for name, member in own.items():
         if getattr_static(cls, name, None) is not member:
-            expected = "implement the methods that its description names"
-            raise TypeError(f"{cls.__name__}.{name}: final in Culture; {expected}")
+            raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement the methods that its docstring names")
 
 
 class ComputedCulture(Culture):
     """A culture that a program computes: a delivery ends within its call, and there is nothing to release.
 
-    Closed and opened again it is where it was. Arguments as of `Culture`.
+    Reopened, it continues where it was. Its arguments are those of `Culture`.
     """
 
     ends_within_s: ClassVar[float] = -1
@@ -314,4 +312,4 @@ class ComputedCulture(Culture):
         """Do nothing: the guard refuses the next delivery."""
 
     def _close(self) -> None:
-        """Do nothing: it lives on in memory, and is where it was when it is opened again."""
+        """Do nothing: it stays in memory, and continues where it was when it is reopened."""

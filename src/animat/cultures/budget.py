@@ -1,4 +1,4 @@
-"""How many pulses a culture may be given over all that is done with it, and how many it was given."""
+"""How many pulses a culture may receive in total, and how many it has received."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from animat.stimulation.stimulus import Stimulus
 
 @dataclass(frozen=True)
 class Budget:
-    """An allowance of stimulation; None is no end. It comes on top of the culture's limits and replaces none of them.
+    """An allowance of stimulation, in addition to the culture's limits; None: unlimited.
 
     Attributes:
-        pulses: in all, a pattern of electrodes that are pulsed together counting once.
+        pulses: in total; electrodes pulsed together count once.
         pulses_per_electrode: on any one electrode.
 
     Raises:
-        InvalidArgument: for a number below 0, or one that is not whole.
+        InvalidArgument: for a number that is below 0 or not whole.
     """
 
     pulses: int | None = None
@@ -34,15 +34,14 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("pulses", "pulses_per_electrode"):
-            if (given := getattr(self, name)) is not None:
-                value = whole_number(f"budget.{name}", given)
-                if value < 0:
+            if (value := getattr(self, name)) is not None:
+                if (value := whole_number(f"budget.{name}", value)) < 0:
                     raise InvalidArgument(f"budget.{name}: expected 0 or more, got {value}")
                 object.__setattr__(self, name, value)
 
 
 class Account:
-    """What was spent of a budget, through recordings and closed loops alike.
+    """What was spent of a budget, in recordings and closed loops alike.
 
     Args:
         budget: the allowance.
@@ -55,14 +54,14 @@ class Account:
 
     @property
     def most_on_an_electrode(self) -> int:
-        """Pulses on the electrode that had most."""
+        """Pulses on the electrode that had the most."""
         return max(self._on.values(), default=0)
 
     def check(self, stimuli: Sequence[Stimulus]) -> None:
-        """Raise unless the budget holds these stimuli too.
+        """Raise unless the budget covers these stimuli too.
 
         Raises:
-            BudgetSpent: naming what would be exceeded; nothing is written down.
+            BudgetSpent: naming what would be exceeded; nothing is entered.
         """
         self.check_number(_pulses(stimuli))
         most = self.budget.pulses_per_electrode
@@ -76,26 +75,26 @@ class Account:
                 )
 
     def check_number(self, wanted: int) -> None:
-        """Raise `BudgetSpent` unless the budget holds so many pulses more, on whatever electrodes."""
+        """Raise `BudgetSpent` unless the budget covers this many more pulses, on any electrodes."""
         most = self.budget.pulses
         if most is not None and self.pulses + wanted > most:
             raise BudgetSpent(f"budget.pulses: {self.pulses} of {most} pulses are spent, and {wanted} more were wanted")
 
     def spend(self, stimuli: Sequence[Stimulus]) -> None:
-        """Write stimuli down as delivered."""
+        """Enter stimuli as delivered."""
         self.pulses += _pulses(stimuli)
-        # One by one: a counter of its own took five times as long, before every pulse of a closed loop.
+        # One by one: building a Counter first took five times as long, before every pulse of a closed loop.
         for stimulus in stimuli:
             for electrode in stimulus.electrodes:
                 self._on[electrode] += 1
 
     def take_back(self, stimuli: Sequence[Stimulus]) -> None:
-        """Write stimuli down as not delivered after all: the culture refused them."""
+        """Enter stimuli as not delivered after all: the culture refused them."""
         self.pulses -= _pulses(stimuli)
         self._on -= _counted(stimuli)
 
     def to_dict(self) -> dict[str, Any]:
-        """What was spent of what, as plain data."""
+        """What was spent, and the budget, as plain data."""
         return {
             "pulses": self.pulses,
             "of": self.budget.pulses,
@@ -119,13 +118,13 @@ def record_within(
     progress: Progress | None = None,
     follow: Callable[[Callable[[], Recording]], None] | None = None,
 ) -> Recording:
-    """Record by a protocol if the budget holds all of it.
+    """Record by a protocol if the budget covers all of it.
 
-    Of a recording that fails half way, what it handed to the culture until then is spent, and nothing that others did.
-    Other arguments are those of `Culture.record`.
+    If a recording fails half way, only what it had handed to the culture is spent. Other arguments are those of
+    `Culture.record`.
 
     Raises:
-        BudgetSpent: if it does not; nothing is delivered then.
+        BudgetSpent: if the budget does not cover it; nothing is then delivered.
         UnsafeStimulus, InvalidArgument: as `Culture.record` does.
     """
     schedule = culture.schedule(protocol, seed)
@@ -135,7 +134,7 @@ def record_within(
     try:
         return culture.record(protocol, seed, blocks, follow)
     except BaseException as error:
-        # Of the block under way only an error of the culture tells that it was refused; not if some of it was over.
+        # Only an error of the culture shows that the current block was refused; not once part of it was delivered.
         if not blocks.is_within_one:
             blocks.handed_over += not isinstance(error, AnimatError) or error.is_admitted
         raise
@@ -144,7 +143,7 @@ def record_within(
 
 
 class _Blocks:
-    """Counts the blocks of this recording alone that began: the culture's own count has those of every thread."""
+    """Counts the blocks that this recording began: the culture's own count covers every thread."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress, self.handed_over, self.is_within_one = progress, 0, False
@@ -156,7 +155,7 @@ class _Blocks:
 
 
 def _pulses(stimuli: Sequence[Stimulus]) -> int:
-    """How many of them are delivered."""
+    """How many of the stimuli are delivered, rests aside."""
     return sum(not stimulus.is_rest for stimulus in stimuli)
 
 

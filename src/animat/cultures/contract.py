@@ -1,11 +1,11 @@
-"""The contract of a culture as tests, for whoever implements one.
+"""The contract of a culture as tests, for authors of cultures.
 
     class TestMine(CultureContract):
         def make_culture(self) -> Culture:
             return MyCulture(...)
 
-makes pytest run them all. `make_culture` gives a new, closed culture each time; simulated ones with the same seed.
-They take some seconds of the culture's time and deliver a few dozen stimuli, all within its limits.
+makes pytest run them all. `make_culture` returns a new, closed culture each time; simulated ones have the same seed.
+The tests take a few seconds of the culture's time and deliver a few dozen stimuli, all within its limits.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class CultureContract(abc.ABC):
     """What every culture must do. Override `pulse`, `frequencies_hz` and `is_repeatable` where they do not fit."""
 
     pulse: Pulse = PUBLISHED_PULSE
-    """One that the culture's limits allow."""
+    """A pulse that the culture's limits allow."""
     frequencies_hz: tuple[float, ...] = (10.0, 40.0)
-    """That it can be stimulated at."""
+    """Frequencies at which it can be stimulated."""
     is_repeatable: bool = True
     """Whether two new cultures answer the same requests with the same spikes."""
 
@@ -42,7 +42,7 @@ class CultureContract(abc.ABC):
         """A new culture, closed."""
 
     def lose(self, culture: Culture) -> bool:
-        """Have the device of a culture be gone from now on, and say whether there is one; open or closed."""
+        """Make the device of an open or closed culture unreachable from now on; returns whether there is a device."""
         return False
 
     @property
@@ -53,11 +53,11 @@ class CultureContract(abc.ABC):
         )
 
     def stimulus(self, culture: Culture, time_s: float = 0.0) -> Stimulus:
-        """One that is allowed."""
+        """A stimulus within the limits."""
         electrodes = tuple(int(e) for e in culture.patterns[0] if e != UNKNOWN)
         return Stimulus(time_s, electrodes, self.pulse, self.frequencies_hz[0], 0)
 
-    def test_what_it_says_of_itself_fits_together(self) -> None:
+    def test_its_data_are_consistent(self) -> None:
         with self.make_culture() as culture:
             assert len(culture.channels) >= 1
             sites = set(culture.stimulation_electrodes)
@@ -82,7 +82,7 @@ class CultureContract(abc.ABC):
         _expect(InvalidArgument, lambda: culture.deliver([stimulus], 0.1))
         culture.close()
 
-    def test_its_clock_runs_forward_by_at_least_what_was_asked(self) -> None:
+    def test_its_clock_advances_by_at_least_the_requested_time(self) -> None:
         with self.make_culture() as culture:
             for duration_s in (0.05, 0.0125, 0.0, 0.0003):
                 before_s = culture.now_s
@@ -100,7 +100,7 @@ class CultureContract(abc.ABC):
             _expect(InvalidArgument, lambda: culture.advance(-1.0))
             _expect(InvalidArgument, lambda: culture.advance(float("nan")))
 
-    def test_a_stimulus_is_delivered_when_it_was_asked_for(self) -> None:
+    def test_a_stimulus_is_delivered_at_its_requested_time_or_later(self) -> None:
         with self.make_culture() as culture:
             stimuli = [self.stimulus(culture, 0.01), self.stimulus(culture, 0.11)]
             before_s = culture.now_s
@@ -121,9 +121,9 @@ class CultureContract(abc.ABC):
             assert np.all(late_s >= -1e-9)
             assert observed.start_s + observed.duration_s >= since_s + 0.3 - 1e-9
             if self.is_repeatable:
-                # Other programs do not make its time pass: no more is late than a sample's rounding.
+                # Its time passes only in calls: delays are within a sample's rounding.
                 assert np.all(late_s <= 1 / culture.sampling_rate_hz + 1e-9)
-            # The first one's time is past, and the other's too: it comes as long after the first as was asked for.
+            # Both are overdue: the second comes after the first at the requested interval.
             again = culture.deliver([self.stimulus(culture, t) for t in times_s.tolist()], 0.3, since_s=since_s)
             assert again.start_s >= observed.start_s + observed.duration_s - 1e-9
             assert again.stimulus_time_s[1] - again.stimulus_time_s[0] >= 0.1 - 1e-9
@@ -151,7 +151,7 @@ class CultureContract(abc.ABC):
                 assert isinstance(error, UnsafeStimulus)
                 assert error.limit == limit
                 assert culture.delivered == 0
-                # A simulated culture's time stands still; a living one's goes on whatever is refused.
+                # A simulated culture's time stands still; a living one's runs on.
                 assert culture.now_s == before_s or not self.is_repeatable
             _expect(InvalidArgument, lambda: culture.deliver([replace(good, time_s=0.2)], 0.1))
             assert culture.delivered == 0
@@ -171,32 +171,32 @@ class CultureContract(abc.ABC):
             culture.deliver([stimulus], 0.1)
             assert culture.delivered == 1
 
-    def test_a_stop_from_another_thread_while_it_delivers_ends_in_a_culture_that_can_be_opened_again(self) -> None:
+    def test_it_can_be_reopened_after_a_stop_from_another_thread_during_a_delivery(self) -> None:
         culture = self.make_culture()
         begun, ended = threading.Event(), list[Exception | None]()
         with culture:
             stimulus, deliver = self.stimulus(culture), culture._deliver
             stimuli = [self.stimulus(culture, 0.1 * number) for number in range(20)]
 
-            def noticed(admitted: Admitted, duration_s: float) -> Observed:
+            def signalling(admitted: Admitted, duration_s: float) -> Observed:
                 begun.set()
                 return deliver(admitted, duration_s)
 
-            def ask() -> None:
+            def request() -> None:
                 try:
                     culture.deliver(stimuli, 2.0)
                 except (DeviceFailed, UnsafeStimulus) as error:
                     ended.append(error)
                 else:
-                    # A simulation delivers all at once, and may have done so before.
+                    # A simulation delivers everything in one go, and may have finished before.
                     ended.append(None)
 
-            culture._deliver = noticed  # type: ignore[method-assign]
-            asking = threading.Thread(target=ask, daemon=True)
-            asking.start()
+            culture._deliver = signalling  # type: ignore[method-assign]
+            requesting = threading.Thread(target=request, daemon=True)
+            requesting.start()
             assert begun.wait(60)
             culture.stop("from another thread")
-            asking.join(60)
+            requesting.join(60)
             assert len(ended) == 1
             assert culture.is_stopped
             delivered = culture.delivered
@@ -204,12 +204,12 @@ class CultureContract(abc.ABC):
             assert culture.delivered == delivered
             culture._deliver = deliver  # type: ignore[method-assign]
         with culture:
-            # How much of it came is not known: all counts as if it had been just now.
+            # How much was delivered is unknown: all of it counts as delivered just now.
             culture.rest(1.0)
             culture.deliver([stimulus], 0.1)
             assert culture.delivered == 1
 
-    def test_a_device_that_is_gone_is_told_as_one_that_failed(self) -> None:
+    def test_an_unreachable_device_is_reported_as_failed(self) -> None:
         culture = self.make_culture()
         if not self.lose(culture):
             return
@@ -231,14 +231,14 @@ class CultureContract(abc.ABC):
             _expect(DeviceFailed, culture.close)
             assert not culture.is_open
 
-    def test_a_rate_is_not_passed_by_closing_and_opening_again(self) -> None:
+    def test_reopening_does_not_circumvent_a_rate_limit(self) -> None:
         culture = self.make_culture()
         with culture:
             culture._asked_limits = replace(culture.device_limits, stimuli_per_s=1)
         with culture:
             culture.deliver([self.stimulus(culture)], 0.1)
         with culture:
-            # Where time is the world's, opening may take longer than a second.
+            # On a device, opening may take longer than a second.
             if self.is_repeatable:
                 error = _expect(UnsafeStimulus, lambda: culture.deliver([self.stimulus(culture)], 0.1))
                 assert isinstance(error, UnsafeStimulus)
@@ -248,7 +248,7 @@ class CultureContract(abc.ABC):
             culture.deliver([self.stimulus(culture)], 0.1)
             assert culture.delivered == 1
 
-    def test_a_recording_is_what_the_protocol_says(self) -> None:
+    def test_a_recording_follows_the_protocol(self) -> None:
         protocol = self.protocol
         with self.make_culture() as culture:
             schedule = culture.schedule(protocol, seed=3)
@@ -258,8 +258,8 @@ class CultureContract(abc.ABC):
             assert culture.now_s / 60 >= before_min + schedule.duration_s / 60 - 1e-6
             expected = [block.stimuli for block in schedule.blocks]
             for name in ("frequency_hz", "pattern", "presentation", "electrodes"):
-                asked = np.concatenate([getattr(table, name) for table in expected])
-                np.testing.assert_array_equal(getattr(recording.stimuli, name), asked)
+                requested = np.concatenate([getattr(table, name) for table in expected])
+                np.testing.assert_array_equal(getattr(recording.stimuli, name), requested)
             assert recording.duration_s >= schedule.recorded_s - 1e-6
             assert recording.presentation == protocol.presentation
             assert recording.protocol == protocol
@@ -284,7 +284,7 @@ class CultureContract(abc.ABC):
 
 
 def _expect(kind: type[Exception], act: Callable[[], object]) -> Exception:
-    """The error of this kind that an act raises."""
+    """The error of this kind that `act` raises."""
     try:
         act()
     except kind as error:

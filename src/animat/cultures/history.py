@@ -1,4 +1,4 @@
-"""When a culture was stimulated, as far back as limits on pace look: it outlives the sessions."""
+"""When a culture was stimulated, as far back as the limits on pace look; kept from session to session."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Event(NamedTuple):
 class History:
     """The stimuli of the last second, and the last one on each electrode, in whole nanoseconds of the culture's clock.
 
-    Starts are in the order of time. A guard looks it up and adds what it admits; opening a culture anew goes on with
-    the same history, because a living culture does not forget what it was given when a program closes it.
+    Starts are in order of time. A guard consults it and adds what it admits. Reopening a culture continues the same
+    history, because a living culture does not forget its stimuli when a program closes it.
     """
 
     def __init__(self) -> None:
@@ -32,17 +32,17 @@ class History:
         """When the last stimulus ends."""
 
     def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
-        """Stimuli, on one electrode or on any, that began less than a second before a time no earlier than the last."""
+        """Stimuli, on one electrode or on any, that began less than a second before a time, the last start or later."""
         starts = self._starts if electrode is None else self._starts_on.get(electrode, ())
         return len(starts) - bisect_right(starts, time_ns - NS)
 
     def last_on(self, electrode: int) -> int | None:
-        """When the last stimulus on an electrode began, however long ago."""
+        """When the last stimulus on an electrode began, however long ago; None: there was none."""
         starts = self._starts_on.get(electrode)
         return starts[-1] if starts else None
 
     def add(self, events: Sequence[Event], now_ns: int) -> None:
-        """Remember stimuli in the order of time, and forget what is over a second old."""
+        """Add stimuli in order of time, and forget those more than a second old."""
         self._seen_ns = now_ns
         _forget(self._starts, now_ns)
         for start_ns, end_ns, electrodes in events:
@@ -53,12 +53,12 @@ class History:
                 starts.append(start_ns)
             self.busy_until_ns = end_ns
 
-    def go_on(self, now_ns: int) -> None:
-        """Go on in a new session whose clock is at `now_ns`.
+    def resume(self, now_ns: int) -> None:
+        """Continue in a new session whose clock is at `now_ns`.
 
-        A clock that is behind where it was last seen began anew: no time is taken to have passed since. Stimuli that
-        were admitted for later than now were broken off; how many were delivered is not known, and all count as if they
-        had begun just now. Either way what was given may seem more recent than it was, never less.
+        A clock behind its last reading was restarted: no time is assumed to have passed. Stimuli admitted for later
+        than now were interrupted; it is not known how many were delivered, so all count as if they had begun just now.
+        Either way stimuli may seem more recent than they were, never less recent.
         """
         behind_ns = max(0, self._seen_ns - now_ns)
         self._seen_ns = now_ns
@@ -70,5 +70,5 @@ class History:
 
 
 def _forget(starts: list[int], now_ns: int) -> None:
-    """Drop what began a second or more ago, but for the last: a limit on intervals may be longer than a second."""
+    """Drop starts a second or more ago, except the last: a limit on intervals may be longer than a second."""
     del starts[: min(bisect_right(starts, now_ns - NS), len(starts) - 1)]

@@ -1,4 +1,4 @@
-"""The kinds of cultures by name: to run on another one is to change one word."""
+"""The kinds of cultures by name."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def culture_of(
 
     Args:
         kind: `"virtual"`, `"replay"`, `"cl1"` or `"maxone"`.
-        seed: which virtual culture; of the draws of a replay; of a CL1's patterns. 0 or more.
-        state: of a virtual culture, to go on from (`VirtualCulture.save_state`).
-        recordings: that a replay answers from.
-        selection: file of the electrodes of a MaxOne (`Selection.save`).
-        progress: told about a virtual culture's scan.
+        seed: selects a virtual culture, the draws of a replay, or a CL1's patterns. 0 or more.
+        state: of a virtual culture, from which to continue (`VirtualCulture.save_state`).
+        recordings: from which a replay answers.
+        selection: file with the electrodes of a MaxOne (`Selection.save`).
+        progress: updated during a virtual culture's scan.
 
     Raises:
-        InvalidArgument: for another kind, a seed below 0, a state or a selection for one that has none, or a MaxOne
-            without one.
+        InvalidArgument: for an unknown kind, a seed below 0, a state or a selection for a kind that takes none, or a
+            MaxOne without a selection.
         InvalidFile, Mismatch: if the state is damaged, or another culture's.
         DeviceFailed: for a device whose package is not installed.
     """
@@ -73,30 +73,30 @@ def culture_of(
 
 
 def pulse_for(kind: CultureKind) -> Pulse:
-    """The pulse that a kind of culture is given where none is asked for."""
+    """The default pulse of a kind of culture."""
     if kind == "cl1":
         from animat.cultures.devices.cl1 import CL1_PULSE
 
         return CL1_PULSE
-    # The published pulse as printed is not balanced: a living culture is given one that is.
+    # The published pulse as printed is not balanced: a living culture gets one that is.
     return BALANCED_PULSE if kind == "maxone" else PUBLISHED_PULSE
 
 
 def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
-    """What is known of the culture that recordings are of, as arguments of `culture_of`.
+    """Arguments of `culture_of` that recreate the recorded culture, as far as they are known.
 
-    Of a virtual culture its seed, and the state that was written after them; of a CL1 the seed of its patterns, so that
-    it is stimulated through the electrodes that it was recorded with.
+    For a virtual culture these are its seed, and the state that was written after the recordings; for a CL1 the seed of
+    its patterns, so that it is stimulated through the same electrodes as in the recordings.
     """
     culture = recordings[0].culture if recordings else None
     if culture is None or culture.kind != kind or culture.seed is None:
         return {}
-    found: dict[str, Any] = {"seed": culture.seed}
+    arguments: dict[str, Any] = {"seed": culture.seed}
     if kind == "virtual":
         from animat.cultures.series import STATE_FILE
 
         folders = {file if file.is_dir() else file.parent for file in files}
         states = [folder / STATE_FILE for folder in folders if (folder / STATE_FILE).is_file()]
         if len(states) == 1:
-            found["state"] = states[0]
-    return found
+            arguments["state"] = states[0]
+    return arguments

@@ -1,47 +1,45 @@
-"""Limits on stimulation, as data: what a culture and its device stand."""
+"""Limits on stimulation, as data: what a culture and its device tolerate."""
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import floor, isfinite
 from typing import Any
 
 from animat.errors import InvalidArgument
 from animat.stimulation.plain import number, whole_number
-from animat.stimulation.pulse import Kind, Phase, Pulse
+from animat.stimulation.pulse import Kind, Pulse
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a culture and its device stand. Amplitudes are in mV and charges in mV ms where `kind` is `"voltage"`, in uA
-    and nC where it is `"current"` (see `Phase.charge`).
+    """What a culture and its device tolerate. Amplitudes are in mV and charges in mV ms where `kind` is `"voltage"`, in
+    uA and nC where it is `"current"` (see `Phase.charge`). Numbers of any type are converted to Python's own.
 
     Attributes:
-        kind: what the device holds during a phase.
+        kind: what the device controls during a phase.
         amplitude: largest magnitude of a phase.
         phase_us: shortest and longest phase.
         charge_per_phase: largest magnitude of a phase's charge.
-        net_charge: largest magnitude of the sum of a pulse's charges: what balance leaves over.
-        net_charge_per_session: largest magnitude of the sum of what pulses leave on any one electrode from `open` to
-            `close`.
+        net_charge: largest magnitude of the sum of a pulse's charges: its imbalance.
+        net_charge_per_session: largest magnitude of the net charge on any one electrode, summed over pulses from `open`
+            to `close`.
         electrodes_at_once: most electrodes of one stimulus.
         stimuli_per_electrode_s: most stimuli on one electrode in any second.
-        stimuli_per_s: most stimuli, on whatever electrodes, in any second.
+        stimuli_per_s: most stimuli on all electrodes in any second.
         stimuli_per_session: most stimuli from `open` to `close`.
         phases_per_pulse: most phases of a pulse.
-        alternates: whether phases that follow each other must differ in sign.
-        phase_step_us: phases last whole multiples of it; 0: any time.
-        amplitude_step: what the device rounds amplitudes to, 0 where it does not: limits on amplitudes and charges hold
-            for the *rounded* phases. It is the device's; who asks for limits gives that or 0.
-        interval_us: least time from the start of a stimulus to the start of the next one on the same electrode.
-        gap_us: least time from the end of a stimulus to the start of the next one, on whatever electrodes.
-
-    Numbers of any type are copied as Python's own.
+        alternates: whether successive phases must differ in sign.
+        phase_step_us: phases last whole multiples of it; 0: any duration.
+        amplitude_step: the step to which the device rounds amplitudes, 0 if it does not: limits on amplitudes and
+            charges apply to the *rounded* phases. It belongs to the device; limits that a user sets have the same or 0.
+        interval_us: shortest time from the start of a stimulus to the start of the next on the same electrode.
+        gap_us: shortest time from the end of a stimulus to the start of the next on any electrodes.
 
     Raises:
-        InvalidArgument: for a limit that is no number, not finite or below 0, or a count that is not whole.
+        InvalidArgument: for a limit that is not a number, not finite or below 0, or a count that is not whole.
     """
 
     kind: Kind
@@ -75,47 +73,47 @@ class Limits:
         if type(alternates) is not bool:
             raise InvalidArgument(f"alternates: expected True or False, got {self.alternates!r}")
         object.__setattr__(self, "alternates", alternates)
-        for each in fields(Limits):
-            if each.type in ("float", "int"):
-                given = getattr(self, each.name)
-                value = number(each.name, given) if each.type == "float" else whole_number(each.name, given)
+        for field in fields(Limits):
+            if field.type in ("float", "int"):
+                convert = number if field.type == "float" else whole_number
+                value = convert(field.name, getattr(self, field.name))
                 if not (isfinite(value) and value >= 0):
-                    raise InvalidArgument(f"{each.name}: expected a finite number from 0, got {value}")
-                object.__setattr__(self, each.name, value)
+                    raise InvalidArgument(f"{field.name}: expected a finite number from 0, got {value}")
+                object.__setattr__(self, field.name, value)
 
     @property
     def units(self) -> tuple[str, str]:
-        """Of amplitude and of charge."""
+        """The units of amplitude and of charge."""
         return ("mV", "mV ms") if self.kind == "voltage" else ("uA", "nC")
 
     def check_within(self, device: Limits) -> None:
-        """Raise unless these limits are as tight as the device's or tighter.
+        """Raise unless these limits are at least as tight as the device's.
 
         Raises:
             InvalidArgument: naming the limit that is looser.
         """
-        for each in fields(Limits):
-            ours, theirs = getattr(self, each.name), getattr(device, each.name)
-            if not _IS_AS_TIGHT[each.name](ours, theirs):
+        for field in fields(Limits):
+            ours, theirs = getattr(self, field.name), getattr(device, field.name)
+            if not _IS_AS_TIGHT[field.name](ours, theirs):
                 raise InvalidArgument(
-                    f"limits.{each.name}: expected no looser than the device's {theirs}, got {ours}: limits can be "
+                    f"limits.{field.name}: expected no looser than the device's {theirs}, got {ours}: limits can be "
                     "tightened, never loosened"
                 )
 
 
 def plain_limits(limits: Limits) -> Limits:
-    """A copy of limits, those of a subclass as the `Limits` that their attributes make.
+    """A copy of limits as plain `Limits`, even from a subclass.
 
     Raises:
-        InvalidArgument: for what is none.
+        InvalidArgument: for anything that is not `Limits`.
     """
     if not isinstance(limits, Limits):
         raise InvalidArgument(f"limits: expected Limits, got {type(limits).__name__}")
-    return Limits(**{each.name: getattr(limits, each.name) for each in fields(Limits)})
+    return Limits(**{field.name: getattr(limits, field.name) for field in fields(Limits)})
 
 
 def is_multiple(value: float, step: float) -> bool:
-    """Whether a value is a whole multiple of a step, above 0; of step 0 everything is."""
+    """Whether a value is a positive whole multiple of a step; any value is for step 0."""
     return step == 0 or (value > 0 and abs(value / step - round(value / step)) < 1e-9)
 
 
@@ -127,12 +125,12 @@ _IS_AS_TIGHT: dict[str, Callable[[Any, Any], bool]] = {
     **dict.fromkeys(("electrodes_at_once", "phases_per_pulse"), operator.le),
     "alternates": operator.ge,
     "phase_step_us": is_multiple,
-    # The device's own, for which 0 stands: another one would have the guard judge a pulse that nobody delivers.
+    # The device's own step or 0, which stands for it: with any other, the guard would check a pulse never delivered.
     "amplitude_step": lambda ours, device: ours in (0.0, device),
     "interval_us": operator.ge,
     "gap_us": operator.ge,
 }
-"""Whether a value asked for is as tight as the device's, limit by limit; a limit that is missing here fails."""
+"""For each limit, whether a requested value is at least as tight as the device's; a limit missing here is an error."""
 
 
 SIMULATED_LIMITS = Limits(
@@ -147,22 +145,21 @@ SIMULATED_LIMITS = Limits(
     stimuli_per_s=200,
     stimuli_per_session=10_000_000,
 )
-"""A simulation comes to no harm, so these are wide. `net_charge` lets even the paper's pulse pass, which as printed
-leaves 20 mV ms over, 500,000 times on one electrode in a session; the limits of a living culture must not."""
+"""A simulation cannot be harmed, so these are wide. Even the paper's pulse passes, whose net charge as printed is
+-20 mV ms, 500,000 times on one electrode in a session; the limits of a living culture must not allow that."""
 
 
 def delivered_pulse(pulse: Pulse, amplitude_step: float) -> Pulse:
-    """A pulse as a device delivers it that rounds amplitudes to whole steps, half away from 0; step 0: as it is."""
+    """The pulse that a device delivers, with amplitudes rounded to whole steps, half away from 0; step 0: unchanged."""
     if amplitude_step == 0:
         return pulse
-    rounded = [steps_of(phase.amplitude, amplitude_step) * amplitude_step for phase in pulse.phases]
-    if pulse.kind == "voltage":
-        return Pulse(tuple(Phase(p.duration_us, amplitude_mv=a) for p, a in zip(pulse.phases, rounded, strict=True)))
-    return Pulse(tuple(Phase(p.duration_us, amplitude_ua=a) for p, a in zip(pulse.phases, rounded, strict=True)))
+    unit = "amplitude_mv" if pulse.kind == "voltage" else "amplitude_ua"
+    steps = [steps_of(phase.amplitude, amplitude_step) for phase in pulse.phases]
+    return Pulse(tuple(replace(p, **{unit: n * amplitude_step}) for p, n in zip(pulse.phases, steps, strict=True)))
 
 
 def steps_of(amplitude: float, amplitude_step: float) -> int:
-    """An amplitude in whole steps, half away from 0: opposite amplitudes stay opposite."""
+    """An amplitude in whole steps, rounded half away from 0: opposite amplitudes stay opposite."""
     return sign_of(amplitude) * floor(abs(amplitude) / amplitude_step + 0.5)
 
 

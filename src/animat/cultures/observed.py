@@ -1,4 +1,4 @@
-"""What was seen while stimuli were delivered, and how it becomes a recording."""
+"""What was observed while stimuli were delivered, and how it becomes a recording."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from animat.stimulation.stimulus import Stimuli, Stimulus
 
 
 class Spikes(NamedTuple):
-    """Spikes in the order of time.
+    """Spikes in order of time.
 
     Attributes:
-        time_s: counted from whatever the method that returned them says, shape (spikes,).
+        time_s: counted from the start that the method returning them documents, shape (spikes,).
         channel: row of the culture's channel table, shape (spikes,).
     """
 
@@ -28,13 +28,13 @@ class Spikes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was seen in a stretch of time.
+    """What was observed in a stretch of time.
 
     Attributes:
         start_s: on the culture's clock.
-        duration_s: how long was observed; at least as long as asked for, as a living culture's data may come late.
+        duration_s: length of the stretch; at least as long as requested, as a living culture's data may come late.
         spikes: times counted from the start.
-        stimulus_time_s: when each stimulus really began, counted from the start, shape (stimuli,).
+        stimulus_time_s: when each stimulus actually began, counted from the start, shape (stimuli,).
     """
 
     start_s: float
@@ -44,29 +44,29 @@ class Observed:
 
 
 def with_rests(observed: Observed, stimuli: Sequence[Stimulus], now_s: float) -> Observed:
-    """What was seen with the times of rests among those of the stimuli that were delivered.
+    """The observation with the times of rests inserted among those of the delivered stimuli.
 
-    A rest comes when it was asked for, as late as what was delivered before it.
+    A rest comes at its requested time, plus the delay of the stimulus delivered before it.
 
     Args:
-        observed: of the delivery, in which rests have no times.
-        stimuli: all that was asked for, in the order of time.
-        now_s: that their times count from, on the culture's clock.
+        observed: of the delivery, without times of rests.
+        stimuli: all that were requested, in order of time.
+        now_s: the zero of their times, on the culture's clock.
     """
     if not any(stimulus.is_rest for stimulus in stimuli):
         return observed
     is_rest = np.array([stimulus.is_rest for stimulus in stimuli])
-    asked_s = np.array([stimulus.time_s for stimulus in stimuli]) + (now_s - observed.start_s)
+    requested_s = np.array([stimulus.time_s for stimulus in stimuli]) + (now_s - observed.start_s)
     late_s = np.zeros(len(stimuli))
-    late_s[~is_rest] = observed.stimulus_time_s - asked_s[~is_rest]
+    late_s[~is_rest] = observed.stimulus_time_s - requested_s[~is_rest]
     before = np.maximum.accumulate(np.where(is_rest, -1, np.arange(len(stimuli))))
     late_s = np.where(before < 0, 0.0, late_s[before])
-    time_s = np.maximum(0.0, asked_s + late_s)
+    time_s = np.maximum(0.0, requested_s + late_s)
     time_s[~is_rest] = observed.stimulus_time_s
     return replace(observed, stimulus_time_s=time_s)
 
 
-def assembled(
+def assemble(
     schedule: Schedule,
     observed: Sequence[Observed],
     *,
@@ -76,25 +76,27 @@ def assembled(
     provenance: Mapping[str, str],
     culture: RecordedCulture | None,
 ) -> Recording:
-    """The blocks of a schedule, one after the other on one clock, as a recording.
+    """The blocks of a schedule, concatenated on one clock, as a recording.
 
     Args:
-        schedule: that was delivered.
-        observed: what was seen, block by block.
+        schedule: as delivered.
+        observed: the observation of each block.
         channels: of the culture.
-        sampling_rate_hz: whose samples the spikes lie on.
+        sampling_rate_hz: of the samples to which times are rounded.
         start_min: of the recording on the culture's clock.
         provenance, culture: of the recording.
 
     Returns:
-        The recording, its times on samples; it ends with the sample that the last block ends in.
+        The recording; it ends with the sample in which the last block ends.
     """
     starts_s = np.cumsum([0.0, *(block.duration_s for block in observed)])
     tables = [block.stimuli for block in schedule.blocks]
-    columns = {each.name: np.concatenate([getattr(table, each.name) for table in tables]) for each in fields(Stimuli)}
+    columns = {
+        column.name: np.concatenate([getattr(table, column.name) for table in tables]) for column in fields(Stimuli)
+    }
 
     def on_samples(parts: Sequence[Float64[np.ndarray, " times"]]) -> Float64[np.ndarray, " times"]:
-        # Adding the blocks' starts leaves rounding errors behind.
+        # Adding the blocks' starts introduces rounding errors.
         times_s = np.concatenate([start_s + part for start_s, part in zip(starts_s, parts, strict=False)])
         return np.asarray(np.rint(times_s * sampling_rate_hz) / sampling_rate_hz)
 
@@ -105,7 +107,7 @@ def assembled(
         stimuli=Stimuli(**columns | {"time_s": on_samples([block.stimulus_time_s for block in observed])}),
         sampling_rate_hz=sampling_rate_hz,
         start_s=0.0,
-        # Blocks may end between two samples: what is moved to the next one is still within. Not for a rounding error.
+        # A block may end between two samples; what is rounded to the later one must be within. Rounding errors aside.
         duration_s=float(np.ceil(starts_s[-1] * sampling_rate_hz - 1e-6) / sampling_rate_hz),
         start_min=start_min,
         presentation=schedule.protocol.presentation,
@@ -116,6 +118,6 @@ def assembled(
 
 
 def more_left_out(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    """What was left out between two times, where it was anything."""
+    """The counts left out between two readings that are not zero."""
     more = {what: count - before.get(what, 0) for what, count in after.items()}
     return {what: count for what, count in more.items() if count}

@@ -1,4 +1,4 @@
-"""A culture that answers from recordings: each stimulus with what was measured after one like it."""
+"""A culture that answers from recordings: each stimulus with the spikes that followed a similar one."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from animat.tables import UNKNOWN
 
 NS = 1_000_000_000
 REACH_S = 1.0
-"""How much of what followed a stimulus is its answer, unless another one came sooner: beyond any response window."""
+"""Length of a response, unless another stimulus came sooner: longer than any response window."""
 
 
 class ReplayCulture(ComputedCulture):
     """A culture made of recordings: a stimulus at f is answered by the spikes that followed a recorded one at f.
 
-    The last pulse of a presentation is answered by one that was the last of a recorded presentation, the others by
-    ones that were not, where there are any; of these by one on the same electrodes, where there are any; a stimulus
-    without a frequency by one of any. The newest recording at the culture's clock answers; the clock starts where the
-    first recording did. There is no memory beyond that and no activity between responses: what a closed loop does has
-    no effect on what comes next, which is just what a loop on living matter is there to test.
+    The last pulse of a trial is answered by a recorded last pulse, the others by other pulses, if there are any; among
+    these by one on the same electrodes, if there are any; a stimulus without a frequency by one of any frequency. The
+    newest recording at the culture's clock answers; the clock starts where the first recording did. There is no other
+    memory and no activity between responses: what a closed loop does has no effect on later responses, and that effect
+    is what a loop on a living culture is meant to test.
 
     Args:
         recordings: of one culture, at least one, with stimuli of known frequencies and electrodes.
@@ -60,8 +60,8 @@ class ReplayCulture(ComputedCulture):
         for recording in self._recordings:
             if recording.channels.label.tolist() != first.channels.label.tolist():
                 raise Mismatch(
-                    f"recordings: expected the same channels in all, but the one at {in_min(recording.start_min)} has "
-                    f"others than the one at {in_min(first.start_min)}"
+                    f"recordings: expected the same channels in all, but those at {in_min(recording.start_min)} differ "
+                    f"from those at {in_min(first.start_min)}"
                 )
             stimuli = recording.stimuli
             if not np.any(np.isfinite(stimuli.frequency_hz)) or not np.any(stimuli.electrodes != UNKNOWN):
@@ -84,22 +84,22 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """Those of the patterns."""
+        """The electrodes of the patterns."""
         return tuple(int(electrode) for electrode in np.unique(self._patterns[self._patterns != UNKNOWN]))
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
-        """The patterns of the first recording, in the order of their numbers."""
+        """The patterns of the first recording, in order of their numbers."""
         return self._patterns
 
     @property
     def now_s(self) -> float:
-        """The culture's clock: begins at the start of the first recording."""
+        """The culture's clock, which begins at the start of the first recording."""
         return self._zero_s + self._now_ns / NS
 
     @property
     def sampling_rate_hz(self) -> float:
-        """That of the recordings; 20 kHz where it is not known."""
+        """That of the recordings; 20 kHz if it is not known."""
         rate_hz = self._recordings[0].sampling_rate_hz
         return rate_hz if np.isfinite(rate_hz) else 20_000.0
 
@@ -109,12 +109,12 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def provenance(self) -> dict[str, str]:
-        """That it is a replay, of what."""
+        """That it is a replay, and of which recordings."""
         first = self._recordings[0]
-        of = {f"replayed {name}": words for name, words in first.provenance.items()}
+        replayed = {f"replayed {name}": text for name, text in first.provenance.items()}
         minutes = ", ".join(f"{recording.start_min:g}" for recording in self._recordings)
-        how = {"source": "replay of recordings by animat.cultures.replay", "replayed minutes": minutes}
-        return {**how, "how": "draw", "seed": str(self._seed), **of}
+        source = {"source": "replay of recordings by animat.cultures.replay", "replayed minutes": minutes}
+        return {**source, "how": "draw", "seed": str(self._seed), **replayed}
 
     def _open(self) -> None:
         pass
@@ -123,7 +123,7 @@ class ReplayCulture(ComputedCulture):
         start_ns = self._now_ns
         end_ns = start_ns + round(duration_s * NS)
         numbers = np.array([stimulus.presentation for stimulus in admitted.stimuli])
-        # All answers are found before anything changes: a condition that was never recorded must leave no trace.
+        # All answers are found before anything changes: a request with an unrecorded condition must leave no trace.
         answers = [
             (start_ns + round(stimulus.time_s * NS), self._pool(stimulus, is_last))
             for stimulus, is_last in zip(admitted.stimuli, is_last_of(numbers), strict=True)
@@ -144,28 +144,27 @@ class ReplayCulture(ComputedCulture):
         )
 
     def _pool(self, stimulus: Stimulus, is_last: bool) -> tuple[Recording, Int64[np.ndarray, " pulses"]]:
-        """The recorded pulses that may answer, and the recording they are in."""
+        """The recorded pulses that may answer, and their recording."""
         minute = (self.now_s + stimulus.time_s) / 60
         row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
         recording = self._recordings[row]
-        frequency_hz = recording.stimuli.frequency_hz
+        stimuli, frequency_hz = recording.stimuli, recording.stimuli.frequency_hz
         same = (frequency_hz == stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
         number_of, set_of_pulse = self._sets[row]
         electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
-        is_rest = recording.stimuli.is_rest == stimulus.is_rest
-        for narrower in (is_rest, recording.stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
+        for narrower in (~stimuli.is_rest, stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
             same = same & narrower if np.any(same & narrower) else same
         pool = np.flatnonzero(same)
         if not len(pool):
             known = ", ".join(f"{f:g}" for f in np.unique(frequency_hz[~np.isnan(frequency_hz)]))
             raise InvalidArgument(
                 f"frequency_hz: expected one that was recorded ({known} Hz), got {stimulus.frequency_hz:g}: a replay "
-                "has answers to nothing else"
+                "cannot answer others"
             )
         return recording, pool
 
     def _answer(self, time_ns: int, recording: Recording, pulse: int) -> None:
-        """Put the spikes that followed a recorded pulse after this one, in place of what was still to come."""
+        """Insert the spikes that followed a recorded pulse after this one, replacing those still pending."""
         times_s = recording.stimuli.time_s
         until_s = times_s[pulse] + REACH_S
         if pulse + 1 < len(times_s):
@@ -183,7 +182,7 @@ class ReplayCulture(ComputedCulture):
 
 
 def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:
-    """Electrodes of each pattern, by its number; where patterns have no numbers, every different set is one."""
+    """Electrodes of each pattern, by number; if patterns have no numbers, each distinct set is a pattern."""
     stimuli = recording.stimuli
     has_electrodes = np.any(stimuli.electrodes != UNKNOWN, axis=1)
     numbered = has_electrodes & (stimuli.pattern != UNKNOWN)
@@ -196,6 +195,6 @@ def _patterns(recording: Recording) -> Int64[np.ndarray, "patterns size"]:
 def _numbered_sets(
     electrodes: Int64[np.ndarray, "pulses size"],
 ) -> tuple[dict[frozenset[int], int], Int64[np.ndarray, " pulses"]]:
-    """A number for every set of electrodes, and the number of each pulse's."""
+    """A number for each set of electrodes, and the number of each pulse's set."""
     rows, number = np.unique(np.sort(electrodes, axis=1), axis=0, return_inverse=True)
     return {frozenset(row) - {UNKNOWN}: i for i, row in enumerate(rows.tolist())}, number.reshape(-1)

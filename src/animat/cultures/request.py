@@ -1,4 +1,4 @@
-"""What is asked of a culture: stimuli and a stretch of time, as plain values that cannot change."""
+"""A request to a culture: stimuli and a stretch of time, as immutable plain values."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Request(NamedTuple):
 
     @staticmethod
     def of(stimuli: Iterable[Stimulus], duration_s: float) -> Request:
-        """What a caller gave, as values that cannot change.
+        """The caller's arguments as immutable values.
 
         Raises:
-            InvalidArgument: for what is no stimulus or no duration, or a stimulus after the end.
+            InvalidArgument: for anything that is not a stimulus or a duration, or a stimulus after the end.
         """
         request = Request(plain_stimuli(stimuli), plain_duration(duration_s))
         for stimulus in request.stimuli:
@@ -38,34 +38,34 @@ class Request(NamedTuple):
                     f"{stimulus.time_s:g} s"
                 )
         if any(stimulus.is_rest for stimulus in request.stimuli):
-            # The guard, who looks at the times of pulses, does not see it.
+            # The guard checks the times of pulses, and does not see rests.
             times_s = [0.0, *(stimulus.time_s for stimulus in request.stimuli)]
             if not all(before <= after for before, after in pairwise(times_s)):
-                raise InvalidArgument(f"stimuli: expected times from 0 s on that do not fall, got {times_s[1:][:5]}")
+                raise InvalidArgument(f"stimuli: expected times from 0 s in ascending order, got {times_s[1:6]}")
         return request
 
     def counted_from(self, since_s: float, now_s: float) -> Request:
-        """The same, counted from a time before, now counted from now; what is past begins now.
+        """The request with times counted from now instead of from `since_s`; what is past begins now.
 
         Raises:
-            InvalidArgument: for a time that is still to come.
+            InvalidArgument: for a `since_s` in the future.
         """
         if not since_s <= now_s:
             raise InvalidArgument(f"since_s: expected a reading of the clock, which is at {now_s:g} s, got {since_s}")
-        # All by as much, so that times between stimuli are as they were asked for. What is before 0 is for the guard.
+        # All are moved equally, so that intervals stay as requested. Times below 0 are left to the guard.
         passed_s = now_s - since_s
         passed_s = min(passed_s, max(0.0, self.stimuli[0].time_s) if self.stimuli else self.duration_s)
-        moved = tuple([replace(each, time_s=each.time_s - passed_s) for each in self.stimuli])
+        moved = tuple(replace(stimulus, time_s=stimulus.time_s - passed_s) for stimulus in self.stimuli)
         return Request(moved, self.duration_s - passed_s)
 
 
 def plain_duration(duration_s: Any) -> float:
-    """A duration as a float.
+    """The duration as a float.
 
     Raises:
         InvalidArgument: for one that is negative, not finite, or less precise than float64.
     """
     duration_s = seconds("duration_s", duration_s)
     if not 0 <= duration_s < float("inf"):
-        raise InvalidArgument(f"duration_s: expected finite seconds from 0, got {duration_s}")
+        raise InvalidArgument(f"duration_s: expected a finite number of seconds from 0, got {duration_s}")
     return float(duration_s)

@@ -21,11 +21,11 @@ _REMEMBERED_PULSES = 1000
 
 
 class Admitted:
-    """Stimuli that passed a guard: the only thing a backend is given to deliver, and only a guard makes them.
+    """Stimuli that passed a guard. A backend delivers nothing else, and only a guard makes them.
 
     Attributes:
-        stimuli: in the order of time, counted from `now_s`.
-        now_s: the culture's clock when they were admitted; a clock that runs is past that when a backend sees them.
+        stimuli: in order of time, counted from `now_s`.
+        now_s: the culture's clock when they were admitted; a running clock is later when the backend gets them.
     """
 
     __slots__ = ("now_s", "stimuli")
@@ -39,23 +39,25 @@ class Admitted:
         object.__setattr__(self, "now_s", now_s)
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise InvalidArgument(f"Admitted.{name}: expected to stay as it was admitted; ask for other stimuli")
+        raise InvalidArgument(f"Admitted.{name}: expected to stay unchanged after admission; request other stimuli")
 
     def __reduce_ex__(self, protocol: object) -> NoReturn:
-        raise InvalidArgument("Admitted: expected to be delivered once, where it was admitted; it cannot be copied")
+        raise InvalidArgument(
+            "Admitted: expected to be delivered once, by the culture that admitted it; it cannot be copied"
+        )
 
 
 class Guard:
-    """Checks every stimulus of one session against limits, remembering what was delivered before.
+    """Checks every stimulus of one session against limits, and remembers what was delivered before.
 
-    A request passes as a whole or not at all. Times are compared in whole nanoseconds, so that pulses exactly a second
-    apart are a second apart. One thread at a time may use it, but for `stop`.
+    A request passes as a whole or not at all. Times are compared in whole nanoseconds, so pulses meant to be exactly a
+    second apart are. Only one thread at a time may use it, except for `stop`.
 
     Args:
-        limits: what may be delivered.
+        limits: in force.
         sites: electrodes that can stimulate.
-        history: of the sessions before on the same culture: limits on pace look back on it too. None: there were none.
-        now_s: the culture's clock, where there is a history.
+        history: of earlier sessions on the same culture, which limits on pace also cover. None: there were none.
+        now_s: the culture's clock, if there is a history.
     """
 
     def __init__(
@@ -70,32 +72,32 @@ class Guard:
         self._history = History()
         if history is not None:
             self._history = history
-            history.go_on(round(now_s * NS))
+            history.resume(round(now_s * NS))
 
     @property
     def delivered(self) -> int:
-        """Stimuli that were admitted in this session."""
+        """Number of stimuli admitted in this session."""
         return self._delivered
 
     @property
     def stopped(self) -> str | None:
-        """Why nothing more may be delivered; None: it may."""
+        """Why nothing more may be delivered; None: delivery is allowed."""
         return self._stopped
 
     def stop(self, reason: str) -> None:
-        """Refuse everything from now on, for the first reason given; a new session has a guard of its own."""
+        """Refuse everything from now on, for the first reason passed; a new session has a new guard."""
         self._stopped = reason if self._stopped is None else self._stopped
 
     def check(self, stimuli: Iterable[Stimulus], now_s: float) -> None:
         """Raise unless the request as a whole is within the limits; nothing is remembered.
 
         Args:
-            stimuli: in the order of time, counted from now.
+            stimuli: in order of time, counted from now.
             now_s: the culture's clock, float64.
 
         Raises:
             UnsafeStimulus: naming the limit, the value, and what to do.
-            InvalidArgument: for what is no stimulus, or a clock that is less precise.
+            InvalidArgument: for anything that is not a stimulus, or a clock less precise than float64.
         """
         self._examine(plain_stimuli(stimuli), seconds("now_s", now_s))
 
@@ -106,7 +108,7 @@ class Guard:
             UnsafeStimulus, InvalidArgument: as `check` does; nothing is then remembered.
         """
         now_s = seconds("now_s", now_s)
-        # What was checked is what is delivered: a tuple of its own, of values that cannot change.
+        # A new tuple of immutable values: what was checked is what is delivered.
         admitted = Admitted(plain_stimuli(stimuli), now_s, by=_MAY_ADMIT)
         events, left_on = self._examine(admitted.stimuli, now_s)
         self._history.add(events, round(now_s * NS))
@@ -115,12 +117,12 @@ class Guard:
         return admitted
 
     def expect_not_stopped(self) -> None:
-        """Refuse what goes on after an emergency stop (UnsafeStimulus)."""
+        """Raise UnsafeStimulus after an emergency stop."""
         if self._stopped is not None:
             raise UnsafeStimulus("stopped", f"an emergency stop is in force ({self._stopped}): close and open again")
 
     def _examine(self, stimuli: Sequence[Stimulus], now_s: float) -> tuple[list[Event], dict[int, float]]:
-        """What the stimuli are on the culture's clock, and the charge that is left on electrodes after them."""
+        """The stimuli on the culture's clock, and the net charge on each electrode after them."""
         limits = self.limits
         if not stimuli:
             return [], {}
@@ -131,12 +133,12 @@ class Guard:
             raise UnsafeStimulus(
                 "stimuli_per_session",
                 f"expected at most {limits.stimuli_per_session} stimuli in a session, got {len(stimuli)} more after "
-                f"{self._delivered}: ask for fewer, or begin a new session after a rest",
+                f"{self._delivered}: request fewer, or begin a new session after a rest",
             )
         events: list[Event] = []
         left_on: dict[int, float] = {}
-        # What was asked for so far goes into a history of its own: a request that fails must leave no trace.
-        asked, busy_until_ns = History(), self._history.busy_until_ns
+        # Stimuli requested so far go into a separate history: a request that fails must leave no trace.
+        requested, busy_until_ns = History(), self._history.busy_until_ns
         for stimulus in stimuli:
             if net_charge := self._check_one(stimulus):
                 self._add_charge(left_on, stimulus.electrodes, net_charge)
@@ -146,8 +148,8 @@ class Guard:
             if start_ns < busy_until_ns:
                 raise UnsafeStimulus(
                     "overlap",
-                    f"expected each stimulus to begin after the one before has ended, got one {stimulus.time_s:g} s "
-                    f"from now, {(busy_until_ns - start_ns) / 1000:g} us too early: put them in the order of time, "
+                    f"expected each stimulus to begin after the previous one ends, got one {stimulus.time_s:g} s "
+                    f"from now, {(busy_until_ns - start_ns) / 1000:g} us too early: put them in order of time, "
                     "further apart",
                 )
             if start_ns < busy_until_ns + round(limits.gap_us * 1000):
@@ -157,14 +159,14 @@ class Guard:
                     f"{(start_ns - busy_until_ns) / 1000:g}: put them further apart",
                 )
             event = Event(start_ns, start_ns + round(stimulus.pulse.duration_us * 1000), stimulus.electrodes)
-            self._check_pace(event, asked)
-            asked.add([event], start_ns)
+            self._check_pace(event, requested)
+            requested.add([event], start_ns)
             busy_until_ns = event.end_ns
             events.append(event)
         return events, left_on
 
     def _check_one(self, stimulus: Stimulus) -> float:
-        """The limits that hold for a stimulus by itself; returns what its pulse leaves on an electrode."""
+        """Check the limits on a single stimulus; returns the net charge that its pulse leaves on an electrode."""
         limits, electrodes = self.limits, stimulus.electrodes
         if not 1 <= len(electrodes) <= limits.electrodes_at_once:
             raise UnsafeStimulus(
@@ -187,11 +189,11 @@ class Guard:
         return net_charge
 
     def _add_charge(self, left_on: dict[int, float], electrodes: Sequence[int], net_charge: float) -> None:
-        """Add what a pulse leaves to what all before it left, on each electrode."""
+        """Add the net charge of a pulse to that of all before it, on each electrode."""
         most = self.limits.net_charge_per_session
         for electrode in electrodes:
-            left = left_on.get(electrode)
-            left_on[electrode] = left = (self._left_on.get(electrode, 0.0) if left is None else left) + net_charge
+            left = left_on.get(electrode, self._left_on.get(electrode, 0.0)) + net_charge
+            left_on[electrode] = left
             if not abs(left) <= most:
                 raise UnsafeStimulus(
                     "net_charge_per_session",
@@ -201,9 +203,10 @@ class Guard:
                 )
 
     def check_pulse(self, pulse: Pulse) -> float:
-        """The charge that a pulse leaves over; raises UnsafeStimulus unless it is within the limits.
+        """The net charge of a pulse as the device rounds it.
 
-        Both as it is asked for and as the device rounds it.
+        Raises:
+            UnsafeStimulus: unless the pulse is within the limits, both as requested and as rounded.
         """
         limits = self.limits
         if pulse.kind != limits.kind:
@@ -226,65 +229,64 @@ class Guard:
                 )
         self._check_shape(pulse, "")
         made = delivered_pulse(pulse, limits.amplitude_step)
-        is_rounded = "" if made == pulse else f", which the device makes of {pulse}"
-        if is_rounded:
-            self._check_shape(made, is_rounded)
-        self._check_charge(made, is_rounded)
+        rounding = "" if made == pulse else f", which the device makes of {pulse}"
+        self._check_shape(made, rounding)
+        self._check_charge(made, rounding)
         return made.net_charge
 
-    def _check_shape(self, pulse: Pulse, is_rounded: str) -> None:
-        """The limits on amplitudes and signs."""
+    def _check_shape(self, pulse: Pulse, rounding: str) -> None:
+        """Check the limits on amplitudes and signs."""
         limits = self.limits
         for phase in pulse.phases:
             if not abs(phase.amplitude) <= limits.amplitude:
                 raise UnsafeStimulus(
                     "amplitude",
                     f"expected -{limits.amplitude:g} to {limits.amplitude:g} {limits.units[0]}, got {phase.amplitude:g}"
-                    f"{is_rounded}: lower it",
+                    f"{rounding}: lower it",
                 )
         if limits.alternates:
             for before, after in pairwise(pulse.phases):
                 if sign_of(before.amplitude) == sign_of(after.amplitude):
                     raise UnsafeStimulus(
-                        "alternates", f"expected neighbouring phases of different signs, got {pulse}{is_rounded}"
+                        "alternates", f"expected successive phases of different signs, got {pulse}{rounding}"
                     )
 
-    def _check_charge(self, pulse: Pulse, is_rounded: str) -> None:
-        """The limits on charge."""
+    def _check_charge(self, pulse: Pulse, rounding: str) -> None:
+        """Check the limits on charge."""
         limits, charge_unit = self.limits, self.limits.units[1]
         for phase in pulse.phases:
             if not abs(phase.charge) <= limits.charge_per_phase:
                 raise UnsafeStimulus(
                     "charge_per_phase",
                     f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} a phase, got "
-                    f"{phase.charge:g}{is_rounded}: lower the amplitude or shorten the phase",
+                    f"{phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
                 )
         if not abs(pulse.net_charge) <= limits.net_charge:
             raise UnsafeStimulus(
                 "net_charge",
                 f"expected phases that balance to within {limits.net_charge:g} {charge_unit}, got {pulse.net_charge:g} "
-                f"({pulse}{is_rounded}): give the phases equal and opposite charge",
+                f"({pulse}{rounding}): give the phases equal and opposite charge",
             )
 
-    def _check_pace(self, event: Event, asked: History) -> None:
-        """The limits that hold for a stimulus after those delivered and those `asked` for before it."""
+    def _check_pace(self, event: Event, requested: History) -> None:
+        """Check the limits on pace, after stimuli delivered and those `requested` before it."""
         limits, start_ns = self.limits, event.start_ns
-        count = 1 + self._history.in_second_to(start_ns) + asked.in_second_to(start_ns)
+        count = 1 + self._history.in_second_to(start_ns) + requested.in_second_to(start_ns)
         if count > limits.stimuli_per_s:
             raise UnsafeStimulus(
                 "stimuli_per_s",
                 f"expected at most {limits.stimuli_per_s} stimuli in any second, got {count}: slow down",
             )
         for electrode in event.electrodes:
-            last_ns = asked.last_on(electrode)
+            last_ns = requested.last_on(electrode)
             last_ns = self._history.last_on(electrode) if last_ns is None else last_ns
             if last_ns is not None and start_ns - last_ns < round(limits.interval_us * 1000):
                 raise UnsafeStimulus(
                     "interval_us",
-                    f"expected {limits.interval_us:g} us or more from stimulus to stimulus on an electrode, got "
+                    f"expected {limits.interval_us:g} us or more between stimulus starts on an electrode, got "
                     f"{(start_ns - last_ns) / 1000:g} on electrode {electrode}: slow down",
                 )
-            count = 1 + self._history.in_second_to(start_ns, electrode) + asked.in_second_to(start_ns, electrode)
+            count = 1 + sum(history.in_second_to(start_ns, electrode) for history in (self._history, requested))
             if count > limits.stimuli_per_electrode_s:
                 raise UnsafeStimulus(
                     "stimuli_per_electrode_s",

@@ -1,4 +1,4 @@
-"""A series of recordings of one culture over time, one NWB file each, that goes on where it stopped."""
+"""A series of recordings of one culture over time, one NWB file each, which resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from animat.cultures.base import Culture
 from animat.cultures.safety import Guard
 from animat.cultures.same_culture import other_patterns
-from animat.cultures.under_way import UnderWay
+from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
 from animat.errors import InvalidArgument, Mismatch, shown
@@ -29,19 +29,19 @@ from animat.writing import clear_away, exclusive_lock, expect_writable
 STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
 LONGEST_MIN = 365 * 24 * 60.0
-"""From the first recording to the last: a virtual culture's clock goes no further."""
+"""Longest series: a virtual culture's clock goes no further."""
 BYTES_PER_MIN = 2e6
-"""What 1,024 channels fill of the disk in a minute; a disk without that much room is as good as full for fewer too."""
+"""Disk space that 1,024 channels fill in a minute; required for fewer channels too."""
 _MAY_DIFFER = ("stimulation_units",)
-"""What a device tells of itself that can be otherwise when it is opened anew, and makes no other culture of it."""
+"""Entries of a device's provenance that may change when it is reopened with the same culture."""
 
 
 class Series(NamedTuple):
-    """What a series has in the end.
+    """The result of a series.
 
     Attributes:
-        files: the recordings, in the order of time.
-        missed_min: minutes of the series at which none was made: the next was due when the culture was there again.
+        files: the recordings, in order of time.
+        missed_min: minutes of the series without a recording, as the next one was already due.
     """
 
     files: list[Path]
@@ -60,34 +60,34 @@ def record_series(
 ) -> Series:
     """Record a culture every `interval_min`, into files `recording_0000_min.nwb` and so on.
 
-    The names count from the first recording; `start_min` within is on the culture's own clock. Every file is complete
-    or absent, and none is written over. Called again it goes on with what is due next, as long as the culture's clock
-    went on; a recording whose successor is due is missed.
+    The names count from the first recording; `start_min` in the file is on the culture's own clock. Every file is
+    complete or absent, and none is overwritten. A repeated call continues with the next recording due, if the culture's
+    clock has kept running; a recording whose successor is already due is missed.
 
-    A closed `VirtualCulture` misses none: its state is written after each recording (`culture.state`), and whatever
-    interrupts it, calling again gives the very recordings, and state, that an undisturbed run gives. What lies between
-    the state and the recordings that are there is recorded again and compared; where there is no state, that is all.
-    The electrodes in use are written to `selection.json`.
+    A closed `VirtualCulture` misses none: its state is written after each recording (`culture.state`), and after any
+    interruption, a repeated call makes exactly the recordings, and state, of an undisturbed run. Existing recordings
+    that the state does not cover are recorded again and compared; without a state, all of them are. The electrodes in
+    use are written to `selection.json`.
 
     Args:
-        make_culture: makes the culture, closed, to be opened and closed here; or gives an open one, which stays so. To
-            open a device is to do something to it: the folder is held before (`animat.writing.exclusive_lock`).
-        protocol: of every recording, or what gives it for the culture, which is not opened yet; the order of stimuli
-            differs from one recording to the next.
-        folder: where the files go; made if it is missing.
+        make_culture: returns the culture, either closed, to be opened and closed here, or open, to stay open. Opening a
+            device acts on it, so the folder is locked first (`animat.writing.exclusive_lock`).
+        protocol: of every recording, or a function that returns it for the culture, which is not yet open; the order of
+            stimuli differs from recording to recording.
+        folder: where the files go; created if it is missing.
         sessions: number of recordings.
         interval_min: minutes between the starts of two recordings.
         seed: of the orders of stimuli; zero or more. None: a virtual culture's own, 1 for any other.
-        progress: told after each block.
+        progress: updated after each block.
 
     Raises:
-        InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or more patterns or
-            other electrodes than the culture has.
-        Mismatch: if recordings are there that another culture, protocol or version made, or that lie ahead of the
+        InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or a protocol with
+            patterns or electrodes that the culture lacks.
+        Mismatch: if the folder has recordings that another culture, protocol or version made, or that lie ahead of the
             culture's clock, or another run is at work in the folder.
         InvalidFile: if the folder cannot be written to or the disk lacks room for a recording, before it is made; if a
-            file cannot be written, or the state or a recording that is there is damaged.
-        UnsafeStimulus, DeviceFailed: as the culture has it; what was recorded before is kept.
+            file cannot be written, or the state or an existing recording is damaged.
+        UnsafeStimulus, DeviceFailed: as the culture raises them; earlier recordings are kept.
     """
     if seed is not None and seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
@@ -104,8 +104,8 @@ def record_series(
         files, interval_s = series_files(folder, sessions, interval_min), 60 * interval_min
         if virtual is not None:
             Guard(virtual.limits, ()).check_pulse(protocol.pulse)
-            _expect_lived(files, virtual, protocol, interval_s, seed)
-            virtual, recorded = _resumed(make_culture, virtual, files)
+            _check_recordings(files, virtual, protocol, interval_s, seed)
+            virtual, recorded = _resume(make_culture, virtual, files)
             culture = virtual
         room_bytes = BYTES_PER_MIN * minutes_of(protocol, n_patterns)
         if not all(file.exists() for file in files):
@@ -113,26 +113,26 @@ def record_series(
         if not culture.is_open and recorded < sessions:
             opened.enter_context(culture)
         if culture.is_open:
-            # What this culture cannot be given is refused before anything is written.
+            # An impossible protocol is refused before anything is written.
             culture.schedule(protocol, seed)
         if virtual is None:
-            zero_s = _beginning_s(files, culture, protocol, interval_s)
-        # No reader takes what a killed run was just writing for whole files.
+            zero_s = _start_s(files, culture, protocol, interval_s)
+        # Partial files of a killed run; no reader takes them for complete ones.
         for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
             for leftover in folder.glob(f"{name}.*.partial*"):
                 clear_away(leftover)
-        follow = opened.enter_context(UnderWay(folder))
+        follow = opened.enter_context(PartialRecording(folder))
         if virtual is not None and not (recorded and (folder / SELECTION_FILE).exists()):
             virtual.selection.save(folder / SELECTION_FILE)
         if virtual is not None and not recorded:
-            # Whatever is killed in the first recording needs no second scan.
+            # A run killed during the first recording needs no second scan.
             virtual.save_state(folder / STATE_FILE, sessions=0)
         for session, file in enumerate(files[recorded:], recorded):
             due_s = zero_s + session * interval_s
             if (virtual is None and file.exists()) or culture.now_s >= due_s + interval_s:
                 continue
             culture.rest(max(0.0, due_s - culture.now_s))
-            # Again before each: what cannot be written is not recorded.
+            # Checked again before each recording, which is not made if it cannot be written.
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
@@ -140,54 +140,54 @@ def record_series(
                 write_nwb(recording, file)
             elif not read_recording(file).equals(recording):
                 raise Mismatch(
-                    f"{file}: expected what recording it again gives, got another culture's, protocol's or version's "
-                    "recording: remove it, or choose another folder"
+                    f"{file}: expected the same as when recorded again, got a recording of another culture, protocol "
+                    "or version: remove it, or choose another folder"
                 )
             if virtual is not None:
-                # The recording comes first: were it the other way round, a state could be ahead of a missing recording.
+                # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)
             follow.remove()
             progress.update(session + 1, sessions, file.name)
-    made = [file for file in files if file.exists()]
-    progress.update(sessions, sessions, made[-1].name if made else "")
-    return Series(made, [session * interval_min for session, file in enumerate(files) if not file.exists()])
+    existing = [file for file in files if file.exists()]
+    progress.update(sessions, sessions, existing[-1].name if existing else "")
+    return Series(existing, [session * interval_min for session, file in enumerate(files) if not file.exists()])
 
 
 def order_seed(seed: int, session: int) -> int:
-    """The seed of a session's schedule: other cultures and other sessions have other orders."""
+    """The seed of a session's schedule: orders differ between cultures and between sessions."""
     return seed * 10_000 + session
 
 
-def _resumed(
+def _resume(
     make_culture: Callable[[], Culture], culture: VirtualCulture, files: list[Path]
 ) -> tuple[VirtualCulture, int]:
-    """The culture after the recordings that are there, or as near before that as is known; and after how many."""
+    """The culture as it was after the existing recordings, or at the last known state before; and after how many."""
     state = files[0].with_name(STATE_FILE)
     if not state.exists():
         return culture, 0
     recorded = culture.restore_state(state).get("sessions")
     if recorded is None:
         raise Mismatch(
-            f"{state}: expected the state of a series of recordings, got one after something else (animat live): "
+            f"{state}: expected the state of a series of recordings, got one after other use (animat live): "
             "choose another folder"
         )
     if all(file.exists() for file in files[:recorded]):
         return culture, recorded
-    # Recordings were taken away that came before the state: only the beginning is before them.
+    # Recordings before the state were removed: start from the beginning.
     new = make_culture()
     assert isinstance(new, VirtualCulture)
     return new, 0
 
 
 def series_files(folder: Path, sessions: int, interval_min: float) -> list[Path]:
-    """Where the recordings of a series lie."""
+    """Paths of the recordings of a series."""
     return [folder / recording_name(session * interval_min) for session in range(sessions)]
 
 
 def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_patterns: int | None = None) -> None:
-    """Raise unless there are sessions, each is over when the next one is due, and there are patterns enough.
+    """Raise InvalidArgument for no sessions, sessions that overlap or go beyond a year, or too few patterns.
 
-    How many patterns a culture has is None where there is no culture yet.
+    `n_patterns` is None if there is no culture yet.
     """
     if sessions < 1:
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
@@ -206,80 +206,82 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
 
 
 def minutes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
-    """How long a recording takes, set-up included; InvalidArgument where that many patterns are too few."""
-    # On whatever electrodes it takes as long: no culture need be opened.
+    """How long a recording takes, including set-up; InvalidArgument for too few patterns."""
+    # It takes as long on any electrodes: no culture need be opened.
     patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
     return make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
 
 
-def _expect_lived(files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_s: float, seed: int) -> None:
-    """Raise unless the recordings that are there are of a culture of these settings, each at its minute."""
+def _check_recordings(
+    files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_s: float, seed: int
+) -> None:
+    """Raise unless the existing recordings are of a culture of these settings, each at its minute."""
     for session, file in enumerate(files):
         if not file.exists():
             continue
-        told = culture.settings | {"protocol_seed": str(order_seed(seed, session))}
-        there = _read_of(file, told, protocol)
-        if abs(there.start_min * 60 - session * interval_s) > 1e-6:
+        provenance = culture.settings | {"protocol_seed": str(order_seed(seed, session))}
+        start_min = _read_expected(file, provenance, protocol).start_min
+        if abs(start_min * 60 - session * interval_s) > 1e-6:
             raise Mismatch(
-                f"{file}: expected a recording at {session * interval_s / 60:g} min, got one at "
-                f"{there.start_min:g} min: choose another folder"
+                f"{file}: expected a recording at {session * interval_s / 60:g} min, got one at {start_min:g} min: "
+                "choose another folder"
             )
 
 
-def _beginning_s(files: list[Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
-    """When the series began or begins, on the clock of an open culture; raises where recordings are not of it."""
+def _start_s(files: list[Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
+    """When the series began or begins, on the clock of an open culture; raises if recordings are of another one."""
     zero_s = None
-    told = {name: words for name, words in culture.provenance.items() if name not in _MAY_DIFFER}
+    provenance = {name: text for name, text in culture.provenance.items() if name not in _MAY_DIFFER}
     for session, file in enumerate(files):
         if not file.exists():
             continue
-        there = _read_of(file, told, protocol)
+        recording = _read_expected(file, provenance, protocol)
         for name in ("label", "electrode"):
-            if getattr(there.channels, name).tolist() != getattr(culture.channels, name).tolist():
+            if getattr(recording.channels, name).tolist() != getattr(culture.channels, name).tolist():
                 raise Mismatch(
                     f"{file}: expected a recording of this culture's channels, got others ({name}s differ): choose "
                     "another folder"
                 )
-        # Places are told by the protocol, and are no patterns.
-        if not protocol.places and (strange := other_patterns(there, culture)) is not None:
+        # Places come from the protocol, and are not patterns.
+        if not protocol.places and (strange := other_patterns(recording, culture)) is not None:
             raise Mismatch(
-                f"{file}: expected a recording by this culture's patterns, got others ({strange.value:g} of them): "
+                f"{file}: expected a recording with this culture's patterns, got others ({strange.value:g} of them): "
                 "choose another folder"
             )
         if zero_s is None:
-            zero_s = 60 * there.start_min - session * interval_s
-        if culture.now_s < 60 * there.start_min + there.duration_s:
+            zero_s = 60 * recording.start_min - session * interval_s
+        if culture.now_s < 60 * recording.start_min + recording.duration_s:
             raise Mismatch(
                 f"{file}: expected a recording before the culture's clock, which is at {culture.now_s / 60:.2f} min, "
-                f"got one at {there.start_min:.2f} min: the clock began anew, or it is another culture: choose another "
-                "folder"
+                f"got one at {recording.start_min:.2f} min: the clock was restarted, or it is another culture: choose "
+                "another folder"
             )
     return culture.now_s if zero_s is None else zero_s
 
 
-def _read_of(file: Path, told: Mapping[str, str], protocol: Protocol) -> Recording:
-    """A recording that is there; raises unless it was made by this protocol of a culture that tells this of itself."""
-    there = read_recording(file)
-    if difference := _difference(told, protocol, there):
+def _read_expected(file: Path, provenance: Mapping[str, str], protocol: Protocol) -> Recording:
+    """Read an existing recording; raises unless it was made by this protocol of a culture with this provenance."""
+    recording = read_recording(file)
+    if difference := _difference(provenance, protocol, recording):
         raise Mismatch(
             f"{file}: expected a recording of the same culture and protocol, got another ({difference}): choose "
             "another folder"
         )
-    return there
+    return recording
 
 
 def _difference(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:
-    """The first setting that a recording was not made with; nothing where there is none."""
-    for name, words in expected.items():
-        there = {name: _parsed(recording.provenance[name])} if name in recording.provenance else {}
-        if difference := first_difference(there, {name: _parsed(words)}):
+    """The first setting in which a recording differs; empty if there is none."""
+    for name, text in expected.items():
+        recorded = {name: _parsed(recording.provenance[name])} if name in recording.provenance else {}
+        if difference := first_difference(recorded, {name: _parsed(text)}):
             return difference
-    by = None if recording.protocol is None else json.loads(recording.protocol.to_json())
-    return first_difference({"protocol": by}, {"protocol": json.loads(protocol.to_json())})
+    used = None if recording.protocol is None else json.loads(recording.protocol.to_json())
+    return first_difference({"protocol": used}, {"protocol": json.loads(protocol.to_json())})
 
 
-def _parsed(words: str) -> Any:
+def _parsed(text: str) -> Any:
     try:
-        return json.loads(words)
+        return json.loads(text)
     except (ValueError, RecursionError):
-        return words
+        return text

@@ -1,4 +1,4 @@
-"""Raw traces of a short stretch of a virtual culture, whose spikes are known: to test spike detection against."""
+"""Raw traces of a short stretch of a virtual culture, whose true spikes are known, for tests of spike detection."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from animat.stimulation.stimulus import Stimulus
 
 BAND_HZ = (100.0, 3000.0)
 SHAPE_MS = (1.0, 2.5)
-"""A spike's waveform before and after its trough."""
+"""Length of a spike's waveform before and after its trough."""
 SATURATION_UV = 3200.0
-"""The amplifier's range: a stimulus artefact does not go beyond."""
+"""The amplifier's range, at which stimulus artefacts are cut."""
 ARTEFACT_UV = 200_000.0
 ARTEFACT_REACH_UM = 40.0
 ARTEFACT_MS = 1.0
 """The artefact at distance d from a site, t after its pulse, is 200 mV / (1 + (d / 40 um)^3) exp(-t / 1 ms), cut at the
-range: at the site it saturates for 4 ms, at 500 um it is down to 14 uV after 2 ms (assumed, after reports)."""
+range: at the site it saturates for 4 ms, at 500 um it has fallen to 14 uV after 2 ms (assumed, based on reports)."""
 LARGEST_SAMPLES = 2**28
 
 
@@ -33,10 +33,10 @@ class Traces:
 
     Attributes:
         voltage_uv: shape (samples, channels).
-        channels: rows of the culture's channel table that the columns are.
+        channels: row of the culture's channel table for each column.
         sampling_rate_hz: of the samples.
-        spikes: the true spikes at their troughs, counted from the first sample; `channel` is a column of `voltage_uv`.
-        amplitude_uv: size of each spike on its channel, shape (spikes,).
+        spikes: times of the true spikes' troughs from the first sample; `channel` is a column of `voltage_uv`.
+        amplitude_uv: amplitude of each spike on its channel, shape (spikes,).
         stimulus_time_s: starts of the pulses.
     """
 
@@ -57,13 +57,13 @@ def record_traces(
     noise_uv: float = NOISE_UV,
     seed: int = 0,
 ) -> Traces:
-    """Advance an open virtual culture and make the raw signal that its electrodes would have given.
+    """Advance an open virtual culture and synthesise the raw signal of its electrodes.
 
-    Every neuron within reach of an electrode adds its waveform to it, scaled by distance (`Visibility`); on top come
-    Gaussian noise in 100-3000 Hz and, after a pulse, its artefact. Spikes closer together than their waveforms overlap.
+    Every neuron within reach of an electrode adds its waveform, scaled by distance (`Visibility`), to Gaussian noise in
+    100-3000 Hz and the artefact of each pulse. Spikes closer together than their waveforms overlap.
 
     Args:
-        culture: open; its clock moves on.
+        culture: open; its clock advances.
         duration_s: of the stretch.
         channels: rows of its channel table; None: all.
         stimuli: to deliver meanwhile.
@@ -71,7 +71,7 @@ def record_traces(
         seed: of the noise.
 
     Raises:
-        InvalidArgument: for a channel that is not there, or more than a gigabyte of samples.
+        InvalidArgument: for a channel that does not exist, or more than a gigabyte of samples.
         UnsafeStimulus: as `Culture.deliver` does.
     """
     rows = np.arange(len(culture.channels)) if channels is None else np.asarray(channels, dtype=np.int64)
@@ -123,7 +123,7 @@ def record_traces(
 def waveform(
     trough_to_peak_ms: float, recovery_ms: float, rate_hz: float
 ) -> tuple[Float64[np.ndarray, " samples"], int]:
-    """A spike of size 1: a trough of -1 and a smaller, slower peak after it; and the sample that the trough is at.
+    """A spike of unit amplitude, a trough followed by a smaller, slower peak; and the sample of the trough.
 
         v(t) = -exp(-(t / w)^2 / 2) + 0.3 exp(-((t - p) / r)^2 / 2),   w = 0.09 ms, p trough to peak, r recovery / 1.18
 
@@ -131,7 +131,7 @@ def waveform(
     """
     before, after = round(SHAPE_MS[0] * 1e-3 * rate_hz), round(SHAPE_MS[1] * 1e-3 * rate_hz)
     t_ms = np.arange(-before, after + 1) / rate_hz * 1e3
-    # The peak begins at the trough: what lies before it is cut off smoothly.
+    # The peak begins at the trough: before it, it is faded in smoothly.
     peak = 0.3 * np.exp(-(((t_ms - trough_to_peak_ms) * 1.18 / recovery_ms) ** 2) / 2)
     peak *= 1 / (1 + np.exp(-np.clip((t_ms - trough_to_peak_ms / 2) / 0.05, -50, 50)))
     shape = -np.exp(-((t_ms / 0.09) ** 2) / 2) + peak
@@ -141,11 +141,11 @@ def waveform(
 def _band_limited_noise(
     rng: np.random.Generator, samples: int, channels: int, rate_hz: float, noise_uv: float
 ) -> Float32[np.ndarray, "samples channels"]:
-    """White noise cut to the band in the frequency domain, channel by channel to save memory."""
+    """White noise, band-limited in the frequency domain, channel by channel to save memory."""
     voltage_uv = np.empty((samples, channels), np.float32)
     frequency_hz = np.fft.rfftfreq(samples, 1 / rate_hz)
     inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
-    # The share of the power that passes, so that what is left has the power asked for.
+    # The share of the power that passes, so that the result has the requested power.
     passed = max(np.count_nonzero(inside) * 2 / samples, 1 / samples)
     for column in range(channels):
         spectrum = np.fft.rfft(rng.standard_normal(samples)) * inside

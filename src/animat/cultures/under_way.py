@@ -1,4 +1,4 @@
-"""The recording that is being made, as far as it is: a file beside the series, for whoever looks meanwhile."""
+"""The recording in progress, as a file next to the series for those who watch it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away
 
 UNDER_WAY = ".under-way.npz"
-"""Its name in the folder of the recordings; hidden, so that no reader of a folder takes it for one of them."""
+"""Its name in the folder of the recordings; hidden, so that no reader takes it for one of them."""
 EVERY_S = 3.0
-"""Seconds between two times that it is written."""
+"""Shortest time between two writes, in seconds."""
 
 
-class UnderWay:
-    """What `Culture.record` is followed by; use it as a context manager, which removes the file in the end.
+class PartialRecording:
+    """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
 
     Args:
         folder: of the recordings.
@@ -36,10 +36,10 @@ class UnderWay:
         return self
 
     def __call__(self, so_far: Callable[[], Recording]) -> None:
-        """Write what was recorded so far, unless that was done just before."""
+        """Write the recording so far, unless it was written less than `EVERY_S` ago."""
         if time.monotonic() - self._written_s < EVERY_S:
             return
-        # A recording is not ended for the sake of a look; what is wrong with it, it says itself.
+        # A failed write must not end the recording, which reports its own errors.
         with suppress(Exception), atomic_write(self._path) as beside, beside.open("wb") as file:
             np.savez(file, **_columns(so_far()))
         self._written_s = time.monotonic()
@@ -48,13 +48,13 @@ class UnderWay:
         self.remove()
 
     def remove(self) -> None:
-        """Remove the file, and what a killed run left of it."""
+        """Remove the file, and the remains of killed runs."""
         for file in (self._path, *self._path.parent.glob(f".{UNDER_WAY}.*.partial*")):
             clear_away(file)
 
 
 def _columns(recording: Recording) -> dict[str, Any]:
-    """A recording as `animat.recordings.columns.PlainColumns` names its parts."""
+    """A recording with the keys of `animat.recordings.columns.PlainColumns`."""
     channels, stimuli, presentation = recording.channels, recording.stimuli, recording.presentation
     return {
         "spike_time_s": recording.spike_times_s,

@@ -32,31 +32,30 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 _STRETCH_S = 10.0
 WARM_UP_S = 5.0
-"""Passes before anything is measured: a fresh tissue is not in its stride."""
+"""Passes before anything is measured, as a new tissue is not yet in its steady state."""
 
 
 class VirtualCulture(ComputedCulture):
-    """A simulated culture; `docs/virtual-culture.md` says what of.
+    """A simulated culture on a simulated MaxOne; `docs/virtual-culture.md` describes its tissue.
 
-    When it is first opened the array is scanned and electrodes are chosen; then the tissue is put back to where it was,
-    so that the scan does not age it, and a culture with given electrodes is, spike for spike, the one that was scanned.
-    The clock starts at 0 there. Time is exact to the nanosecond, however it is cut: the same requests give the same
+    On first opening the array is scanned and electrodes are chosen. The tissue is then restored to its state before, so
+    that the scan does not age it: spike for spike, a culture with those electrodes as `selection` is the same. The
+    clock starts at 0 there. Time is exact to the nanosecond, however it is divided: the same requests give the same
     spikes. A pulse acts with a strength in proportion to the charge of its largest cathodic (negative) phase, the
-    published pulse being 1; nothing blinds the electrodes after a pulse (for the artefact of a real one see
-    `animat.cultures.traces`).
+    published pulse being 1. No artefact blinds the electrodes after a pulse (`animat.cultures.traces` adds it).
 
     Args:
-        seed: which culture: decides the tissue, the spike shapes, and the patterns; zero or more.
+        seed: decides the tissue, the spike shapes, and the patterns; zero or more.
         parameters: of the tissue.
         selection: electrodes to use; None: scan and choose, which takes some seconds.
         rule: by which they are chosen.
-        scan_s: how long the array is scanned, all blocks of 1,024 electrodes at once; in less, more neurons stay
-            unseen, as they are silent meanwhile.
+        scan_s: how long the array is scanned, all blocks of 1,024 electrodes at once; in a shorter scan more neurons
+            stay silent, and unseen.
         limits: tighter limits than `SIMULATED_LIMITS`.
-        progress: told about the scan.
+        progress: updated during the scan.
 
     Raises:
-        InvalidArgument: for a setting that cannot be.
+        InvalidArgument: for an invalid setting.
     """
 
     name: ClassVar[str] = "virtual"
@@ -85,13 +84,13 @@ class VirtualCulture(ComputedCulture):
         self._tissue: Tissue | None = None
         self._zero_ns = 0
         self._now_ns = 0
-        # Spikes of the step that the clock is in the middle of, on the tissue's clock.
+        # Spikes later in the step that contains the clock's time, on the tissue's clock.
         self._held_ns, self._held_neuron = np.empty(0, np.int64), np.empty(0, np.int64)
         self._fired = np.empty(0), np.empty(0, np.int64)
 
     @property
     def tissue(self) -> Tissue:
-        """The tissue itself, for looking into; advancing it behind the culture's back breaks the culture's clock.
+        """The tissue itself, for inspection; advancing it directly breaks the culture's clock.
 
         Raises:
             InvalidArgument: for a culture that was never opened.
@@ -109,7 +108,7 @@ class VirtualCulture(ComputedCulture):
 
     @property
     def scan(self) -> ScannedActivity | None:
-        """What the scan found; None where electrodes were given or restored."""
+        """Results of the scan; None if the electrodes were passed or restored."""
         return self._scan
 
     @property
@@ -120,7 +119,7 @@ class VirtualCulture(ComputedCulture):
 
     @property
     def fired(self) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-        """Time and neuron of every spike of the last delivery, seen by an electrode or not; times from its start."""
+        """Time from the start and neuron of every spike of the last delivery, whether or not an electrode sees it."""
         return self._fired
 
     @property
@@ -141,7 +140,7 @@ class VirtualCulture(ComputedCulture):
 
     @property
     def n_patterns(self) -> int:
-        """How many patterns it has, known before it is opened."""
+        """Number of patterns, known before opening."""
         return self._rule.patterns if self._selection is None else len(self._selection.patterns)
 
     @property
@@ -151,7 +150,7 @@ class VirtualCulture(ComputedCulture):
 
     @property
     def sampling_rate_hz(self) -> float:
-        """As a MaxOne's; spikes fall on the tissue's steps, which are four of these samples long."""
+        """That of a MaxOne; spikes fall on the tissue's steps, which are four of its samples long."""
         return 20_000.0
 
     @property
@@ -171,7 +170,7 @@ class VirtualCulture(ComputedCulture):
 
     @property
     def settings(self) -> dict[str, str]:
-        """What decides everything that the culture does, known before it is opened."""
+        """Everything that determines the culture's behaviour, known before opening."""
         from animat.cultures.tissue.parameters import REVISION, TissueParameters
 
         return {
@@ -184,11 +183,11 @@ class VirtualCulture(ComputedCulture):
         }
 
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write all that decides what comes next, to go on from bit for bit; the file is complete or absent.
+        """Write the complete state, to continue from bit for bit; the file is complete or absent.
 
         Args:
             path: the file.
-            remarks: whole numbers to keep with it.
+            remarks: whole numbers to store with it.
 
         Raises:
             InvalidFile: if it cannot be written.
@@ -200,7 +199,7 @@ class VirtualCulture(ComputedCulture):
         write_state(path, self.settings, state)
 
     def restore_state(self, path: str | os.PathLike[str]) -> dict[str, int]:
-        """Make this culture, not yet opened, what another of the same seed and settings was; returns the remarks.
+        """Restore the state of a culture of the same seed and settings, and return the remarks.
 
         Raises:
             InvalidFile: if the file is missing or damaged.
@@ -214,8 +213,8 @@ class VirtualCulture(ComputedCulture):
         path = expect_plain_file(path)
         tissue, visibility = self._grown()
         state = read_state(path, self.settings, tissue)
-        # Only now: a culture that could not be restored is what it was.
-        self._have(tissue, visibility)
+        # Only now: a failed restore leaves the culture unchanged.
+        self._adopt(tissue, visibility)
         self._selection = state.selection
         self._zero_ns, self._now_ns = state.zero_ns, state.now_ns
         self._held_ns, self._held_neuron = state.held_ns, state.held_neuron
@@ -232,49 +231,49 @@ class VirtualCulture(ComputedCulture):
                 tissue.restore(before)
                 self._scan, self._selection = scan, selection
             self._zero_ns = self._now_ns = round(tissue.now_s * NS)
-            # Only now: a culture whose opening was broken off before is new, and can be opened again.
-            self._have(tissue, visibility)
+            # Only now: a culture whose opening was interrupted is still new, and can be opened again.
+            self._adopt(tissue, visibility)
         else:
-            # Compiled here, and not while a loop waits: where compiled programs cannot be kept it takes seconds.
+            # Compile here, and not while a loop waits: without a compilation cache it takes seconds.
             before = self._tissue.snapshot()
             self._tissue.advance(self._step_ns / NS)
             self._tissue.restore(before)
-        self._look()
+        self._map_channels()
 
     def _grown(self) -> tuple[Tissue, Visibility]:
-        """A new tissue, and what electrodes see of it."""
+        """A new tissue, and its visibility to the electrodes."""
         from animat.cultures.tissue import Tissue
 
         tissue = Tissue(self.seed, self._parameters)
         return tissue, Visibility(self.seed, MAXONE, tissue.x_um, tissue.y_um, tissue.is_excitatory)
 
-    def _have(self, tissue: Tissue, visibility: Visibility) -> None:
+    def _adopt(self, tissue: Tissue, visibility: Visibility) -> None:
         self._step_ns = round(tissue.parameters.step_ms * 1e6)
         self._tissue, self._visibility = tissue, visibility
 
     def _scan_array(self, tissue: Tissue, visibility: Visibility) -> ScannedActivity:
-        """Spontaneous activity of the whole array at once; a real one sees its blocks one after the other."""
+        """Spontaneous activity of the whole array at once; a real array scans its blocks one after the other."""
         rng = np.random.default_rng([self.seed, 12])
         self._progress.update(0, 1, f"scanning the array for {self._scan_s:g} s")
         spikes_of = np.bincount(tissue.advance(self._scan_s).neuron, minlength=len(tissue.x_um))
-        found = [visibility.measure(block, spikes_of, self._scan_s, rng) for block in MAXONE.scan_blocks()]
-        return ScannedActivity.of_blocks(found)
+        blocks = [visibility.measure(block, spikes_of, self._scan_s, rng) for block in MAXONE.scan_blocks()]
+        return ScannedActivity.of_blocks(blocks)
 
-    def _look(self) -> None:
-        """Which channels see each neuron, neuron by neuron."""
+    def _map_channels(self) -> None:
+        """Look up the channels that see each neuron."""
         selection = self.selection
         self._channels = Channels.on(selection.array, selection.recording)
         pairs = self._visibility.pairs_of(selection.recording)
         order = np.lexsort((pairs.electrode, pairs.neuron))
         self._n_seen_by = np.bincount(pairs.neuron, minlength=len(self.tissue.x_um))
-        # One row a neuron, filled from the left: a delivery of 12.5 ms has time for few array operations.
+        # One row per neuron, filled from the left: a delivery of 12.5 ms has time for few array operations.
         self._is_seen = np.arange(self._n_seen_by.max(initial=0)) < self._n_seen_by[:, None]
         self._seen_by = np.zeros(self._is_seen.shape, dtype=np.int64)
         self._seen_by[self._is_seen] = pairs.electrode[order]
 
     @property
     def stretch_s(self) -> float:
-        """Its clock stands between two calls, and stretches of a block are the block."""
+        """Its clock stands still between calls, and a block is the same in stretches."""
         return _STRETCH_S
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
@@ -287,7 +286,7 @@ class VirtualCulture(ComputedCulture):
             self._pulse(stimulus, max(start_ns + since_ns, tissue_ns))
             for stimulus, since_ns in zip(admitted.stimuli, stimulus_ns, strict=True)
         ]
-        # To the end of the step that the end lies in, so that every spike before the end is known.
+        # To the end of the step that contains the end, so that every spike before the end is known.
         target_ns = -(-end_ns // self._step_ns) * self._step_ns
         if pulses and target_ns <= tissue_ns:
             target_ns = tissue_ns + self._step_ns
@@ -310,18 +309,18 @@ class VirtualCulture(ComputedCulture):
 
     @staticmethod
     def _pulse(stimulus: Stimulus, time_ns: int) -> TissuePulse:
-        """A stimulus as the tissue takes it."""
+        """A stimulus as a pulse of the tissue."""
         from animat.cultures.tissue import Pulse as TissuePulse
 
         x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
         half_um = MAXONE.pitch_um / 2
-        # The charge of the largest cathodic phase, in those of the published pulse.
+        # The charge of the largest cathodic phase, relative to the published pulse.
         cathodic = max(-phase.charge for phase in stimulus.pulse.phases)
         strength = max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)
         return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, strength)
 
     def _on_channels(self, time_s: Float64[np.ndarray, " spikes"], neuron: Int64[np.ndarray, " spikes"]) -> Spikes:
-        """Every spike once on each channel that sees its neuron."""
+        """Each spike, repeated on every channel that sees its neuron."""
         return Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]])
 
     def _rest(self, duration_s: float) -> None:
@@ -330,7 +329,7 @@ class VirtualCulture(ComputedCulture):
         try:
             self.tissue.rest(max(0, target_ns - round(self.tissue.now_s * NS)) / NS)
         finally:
-            # A rest takes long to compute: broken off (Ctrl-C), it was as long as the tissue has rested.
+            # A rest takes long to compute: if interrupted (Ctrl-C), the clock shows how far the tissue has come.
             self._now_ns = min(now_ns, round(self.tissue.now_s * NS))
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]

@@ -1,4 +1,4 @@
-"""The state of a virtual culture as a file, so that a series of recordings goes on bit for bit when interrupted."""
+"""The state of a virtual culture as a file, so that an interrupted series of recordings continues bit for bit."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from animat.writing import atomic_write
 FORMAT = "animat virtual culture state 1"
 _HELD = ("held_ns", "held_neuron")
 _MOST_BYTES, _HEADER_BYTES = 2**24, 2**10
-"""Of an array whose length is not the tissue's; and of what numpy writes before each."""
+"""Largest size of an array whose length the tissue does not determine, and of the header that numpy writes."""
 _AHEAD_NS = 1_000_000_000
-"""The tissue is ahead of the culture's clock by a step for each pulse that came in the middle of one."""
+"""Limit on how far the tissue is ahead of the culture's clock: a step for each pulse within a step."""
 
 
 @dataclass(frozen=True, eq=False)
 class VirtualState:
-    """All that decides what a virtual culture of known settings does next.
+    """The complete state of a virtual culture of known settings.
 
     Attributes:
         selection: the electrodes in use.
-        zero_ns, now_ns: on the tissue's clock, when the culture's clock was 0 and where it is.
-        held_ns, held_neuron: spikes of the step that the clock is in the middle of, on the tissue's clock.
+        zero_ns, now_ns: the zero and the present time of the culture's clock, on the tissue's clock.
+        held_ns, held_neuron: spikes later in the step that contains the present time, on the tissue's clock.
         snapshot: of the tissue.
-        remarks: whole numbers kept with it.
+        remarks: whole numbers stored with it.
     """
 
     selection: Selection
@@ -78,18 +78,18 @@ def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state
 
 
 def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> VirtualState:
-    """Read the state of a culture of these settings into its fresh tissue; see `VirtualCulture.restore_state`."""
+    """Read the state of a culture of these settings into its new tissue; see `VirtualCulture.restore_state`."""
     fresh = tissue.snapshot()
     lengths = {f"state_{name}": values.nbytes for name, values in fresh.state._asdict().items()}
     lengths |= dict.fromkeys((*(f"kicks_{name}" for name in Kicks._fields), *_HELD, "head"), _MOST_BYTES)
     head, arrays = _read(path, lengths)
     for name, value in settings.items():
         if head["culture"].get(name) != value:
-            again = "remove it to begin anew, or use the same settings"
+            remedy = "remove it to start again, or use the same settings"
             if name == "tissue_revision":
-                again = "that version of animat goes on with it, this one from the beginning (remove it)"
+                remedy = "continue with the version of animat that wrote it, or remove it to start again"
             raise Mismatch(
-                f"{path}: expected the state of this culture, got another's, which differs in {name}: {again}"
+                f"{path}: expected the state of this culture, got another's, which differs in {name}: {remedy}"
             )
     try:
         snapshot = Snapshot(
@@ -100,7 +100,7 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
             kicks=Kicks(*(arrays[f"kicks_{name}"] for name in Kicks._fields)),
             state=fresh.state._replace(**{name: arrays[f"state_{name}"] for name in fresh.state._fields}),
         )
-        # Before the other clocks, which are measured by the tissue's.
+        # First, because the other clocks are checked against the tissue's.
         tissue.restore(snapshot)
         zero_ns, now_ns, remarks = head["zero_ns"], head["now_ns"], head["remarks"]
         expect_whole("now_ns", now_ns, max(0, snapshot.now_ns - _AHEAD_NS), snapshot.now_ns)
@@ -120,14 +120,14 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
             raise InvalidArgument(f"selection.array: expected the {MAXONE.name}'s, got {shown(selection.array)}")
     except (KeyError, TypeError, InvalidArgument) as error:
         raise InvalidFile(
-            f"{path}: expected the state of a virtual culture of this version, got one that cannot be ({error}): "
-            "remove it to begin anew"
+            f"{path}: expected the state of a virtual culture of this version, got an invalid one ({error}): "
+            "remove it to start again"
         ) from error
     return VirtualState(selection, zero_ns, now_ns, held_ns, held_neuron, snapshot, remarks)
 
 
 def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
-    """The state's description and its arrays; nothing of a file with others than of these most bytes by name."""
+    """The state's header and its arrays; refuses a file with other arrays, or with more bytes than in `lengths`."""
     try:
         # Opened here, because numpy leaves a damaged file open.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -138,8 +138,8 @@ def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[
             raise ValueError(f"format {shown(head['format'])}")
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
         raise InvalidFile(
-            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else; "
-            "give another, or move it away to begin anew"
+            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else: "
+            "choose another, or move it away to start again"
         ) from error
     return head, arrays
 
@@ -147,7 +147,7 @@ def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[
 def _expect_members(archive: zipfile.ZipFile, lengths: Mapping[str, int]) -> None:
     sizes = [(member.filename, member.file_size) for member in archive.infolist()]
     if sorted(name for name, _ in sizes) != sorted(f"{name}.npy" for name in lengths):
-        raise ValueError("other arrays than a state's")
+        raise ValueError("the arrays are not those of a state")
     for name, size in sizes:
         if size > lengths[name.removesuffix(".npy")] + _HEADER_BYTES:
-            raise ValueError(f"{name} is of {size:,} bytes")
+            raise ValueError(f"{name} has {size:,} bytes")

@@ -1,4 +1,4 @@
-"""How electrodes see the neurons of a virtual tissue: which, how large, and with what shape."""
+"""How electrodes see the neurons of a virtual tissue: which ones, with what amplitude, and with what shape."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ REACH_UM = 25.0
 HALF_UM = 15.0
 """Spikes are half as large at this distance from the soma."""
 NOISE_UV = 2.4
-"""Root mean square of the chip's noise in 100-3000 Hz (unsure; see the reference page on the virtual culture)."""
+"""Root mean square of the chip's noise in 100-3000 Hz (uncertain; see the reference page on the virtual culture)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Which electrode sees which neuron, in the order of electrodes, then neurons; arrays of shape (pairs,)."""
+    """Which electrode sees which neuron, sorted by electrode, then neuron; arrays of shape (pairs,)."""
 
     electrode: Int64[np.ndarray, " pairs"]
     neuron: Int64[np.ndarray, " pairs"]
@@ -34,13 +34,13 @@ class Visibility:
 
     At the soma amplitudes are log-normal about 110 uV, between 60 and 300 uV, so that at 25 um the smallest is 16 uV,
     above five standard deviations of the noise: within its reach an electrode misses no spike. Trough-to-peak times
-    are 0.45 +- 0.06 ms for excitatory and 0.25 +- 0.05 ms for inhibitory neurons, the recovery 0.45 +- 0.1 and
-    0.25 +- 0.06 ms: they overlap, as in life.
+    are 0.45 +- 0.06 ms for excitatory and 0.25 +- 0.05 ms for inhibitory neurons, recovery times 0.45 +- 0.1 and
+    0.25 +- 0.06 ms: they overlap, as in real cultures.
 
     Args:
         seed: decides the shapes.
         array: the electrodes; its electrode 0 is half a pitch from the corner of the tissue.
-        x_um, y_um: of the neurons, from the tissue's corner.
+        x_um, y_um: positions of the neurons, from the tissue's corner.
         is_excitatory: their types.
     """
 
@@ -62,10 +62,10 @@ class Visibility:
         )
         self.recovery_ms = np.clip(np.where(is_excitatory, 0.45 + 0.1 * draw[1], 0.25 + 0.06 * draw[1]), 0.1, 0.9)
         self._x_um, self._y_um = x_um, y_um
-        self.pairs = self._see()
+        self.pairs = self._find_pairs()
 
     def pairs_of(self, electrodes: Int64[np.ndarray, " electrodes"]) -> Pairs:
-        """The pairs of some electrodes, in their order; `electrode` becomes the row in the list given."""
+        """The pairs of some electrodes, in their order; `electrode` becomes the row in `electrodes`."""
         first = np.searchsorted(self.pairs.electrode, electrodes, side="left")
         counts = np.searchsorted(self.pairs.electrode, electrodes, side="right") - first
         row = np.repeat(np.arange(len(electrodes)), counts)
@@ -75,7 +75,7 @@ class Visibility:
     def amplitude_at(
         self, neuron: Int64[np.ndarray, " pairs"], distance_um: Float64[np.ndarray, " pairs"]
     ) -> Float64[np.ndarray, " pairs"]:
-        """Size of a neuron's spike at a distance, uV."""
+        """Amplitude of a neuron's spike at a distance, in uV."""
         return np.asarray(self.amplitude_uv[neuron] / (1 + (distance_um / HALF_UM) ** 2))
 
     def measure(
@@ -85,7 +85,7 @@ class Visibility:
         duration_s: float,
         rng: np.random.Generator,
     ) -> ScannedActivity:
-        """What electrodes measure of the spikes that each neuron fired: means over spikes, blurred by the noise."""
+        """What electrodes measure of each neuron's spikes: means over spikes, blurred by the noise."""
         pairs = self.pairs_of(electrodes)
         rows = len(electrodes)
         weight = spikes_of[pairs.neuron].astype(np.float64)
@@ -98,7 +98,7 @@ class Visibility:
 
         blur = rng.standard_normal((3, rows)) / np.sqrt(np.maximum(count, 1))
         size_uv = mean(amplitude_uv)
-        # A time is read off a waveform the worse, the smaller that is.
+        # The smaller a waveform, the less precise the times read from it.
         jitter_ms = 0.5 * NOISE_UV / size_uv
         return ScannedActivity(
             electrode=electrodes,
@@ -109,7 +109,7 @@ class Visibility:
             recovery_ms=mean(self.recovery_ms[pairs.neuron]) + jitter_ms * blur[2],
         )
 
-    def _see(self) -> Pairs:
+    def _find_pairs(self) -> Pairs:
         pitch_um = self.array.pitch_um
         # Positions relative to electrode 0.
         x_um, y_um = self._x_um - pitch_um / 2, self._y_um - pitch_um / 2
@@ -128,5 +128,5 @@ class Visibility:
 
 
 def amplitudes_at_soma_uv(rng: np.random.Generator, neurons: int) -> Float64[np.ndarray, " neurons"]:
-    """Size of each neuron's spikes on an electrode at its soma: log-normal about 110 uV, between 60 and 300 uV."""
+    """Amplitude of each neuron's spikes at its soma: log-normal about 110 uV, between 60 and 300 uV."""
     return np.clip(110.0 * rng.lognormal(0.0, 0.4, neurons), 60.0, 300.0)

@@ -19,7 +19,7 @@ import jax
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
 from animat.cultures.series import BYTES_PER_MIN, STATE_FILE, minutes_of, order_seed
-from animat.cultures.under_way import UnderWay
+from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
 from animat.live.plan import (
@@ -287,7 +287,7 @@ class _Run:
         began_s = time.monotonic()
         folder = self.folder / RECORDINGS
         # Held as by `animat record`: whoever looks knows that it goes on.
-        with exclusive_lock(folder), UnderWay(folder) as follow:
+        with exclusive_lock(folder), PartialRecording(folder) as follow:
             # What cannot be written is not recorded.
             expect_writable(folder, room_bytes=BYTES_PER_MIN * minutes_of(self._protocol))
             seed = order_seed(self._training.seed, number)

@@ -17,7 +17,7 @@ from animat.closed_loop.session import Session
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.cultures.virtual import VirtualCulture
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
@@ -189,7 +189,7 @@ def run_policies(
         try:
             best = optimum.value(progress)
         except Exception as error:
-            findings += (Finding("no-optimum", "note", f"no optimal return: {in_words(error)}"),)
+            findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
     rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:

@@ -1,4 +1,4 @@
-"""A culture on a Cortical Labs CL1, through the vendor's package cl-sdk (the extra `cl1`), or in its simulator."""
+"""A culture on a Cortical Labs CL1 or in its simulator, through the vendor's package cl-sdk (the extra `cl1`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxtyping import Int64
 
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Delivery
-from animat.cultures.failing import as_device_failure, in_words
+from animat.cultures.failures import as_device_failure, describe_error
 from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine, of_the_program
 from animat.cultures.observed import Observed, Spikes
@@ -30,15 +30,15 @@ from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import Phase, Pulse
 from animat.tables import UNKNOWN, padded
 
-HAND_OVER_S = 0.5
-"""How long a stop waits for a pulse that is being handed over."""
+QUEUEING_S = 0.5
+"""How long a stop waits while a pulse is being queued."""
 
 CL1_LIMITS = Limits(
     kind="current",
     amplitude=3.0,
     phase_us=(20.0, 10_000.0),
     charge_per_phase=3.0,
-    # The SDK does not look at balance; a culture does. What is left is rounding: a femtocoulomb.
+    # The SDK does not check balance, which matters to a culture. The tolerance is for rounding: a femtocoulomb.
     net_charge=1e-6,
     net_charge_per_session=1e-3,
     electrodes_at_once=len(SITES),
@@ -51,37 +51,36 @@ CL1_LIMITS = Limits(
     interval_us=5_000.0,
     gap_us=float(LEAD_US),
 )
-"""The SDK's own limits (3 uA, 3 nC a phase, 20 us steps, alternating signs, 200 Hz, 80 us lead), and balance."""
+"""The SDK's own limits (3 uA, 3 nC per phase, 20 us steps, alternating signs, 200 Hz, 80 us lead), and balance."""
 
 CL1_PULSE = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)))
-"""Balanced, cathodic first, 0.16 nC a phase: what the SDK makes of a bare current of 1 uA."""
+"""Balanced, cathodic first, 0.16 nC per phase: the SDK's default pulse for a current of 1 uA."""
 
 
 class CL1Culture(Culture):
-    """A culture on a CL1, or on the SDK's simulator of one where that is what is installed.
+    """A culture on a CL1, or on the SDK's simulator if that is installed.
 
-    Its clock is the device's, which runs whether it is looked at or not: between two calls time passes unobserved.
-    Stimuli are run at frames of that clock, so the times between those of one delivery are exact to a frame (40 us); a
-    delivery as a whole can begin late, by a tick, a lead time and what the computer needs, and says so in
-    `stimulus_time_s`. Every pulse that was asked for is looked for among the pulses that the device reports.
+    Its clock is the device's, which runs on between calls, when nothing is observed. Stimuli run at frames of that
+    clock, so intervals within a delivery are exact to a frame (40 us). A delivery as a whole can begin late, by a tick,
+    a lead time and the computer's delay, as its `stimulus_time_s` shows. Every requested pulse is looked up among those
+    that the device reports.
 
     Args:
         patterns: channels that are pulsed together, rows padded with -1; None: 100 sets of five, no two of a set
             neighbours, drawn with `seed`.
         seed: decides the patterns.
-        ticks_per_s: of the loop that spikes are read in; a delivery lasts whole ticks.
-        margin_ms: between a tick and the first pulse that can follow it, the lead time aside.
-        jitter_tolerance_ms: how late the loop may fall before the device gives up; None: any, as nothing is decided
-            within the loop.
+        ticks_per_s: of the loop that reads the spikes; a delivery lasts whole ticks.
+        margin_ms: from a tick to the first pulse that can follow it, in addition to the lead time.
+        jitter_tolerance_ms: how late the loop may run before the device gives up; None: without limit, as nothing is
+            decided within the loop.
         pitch_um: between electrodes, for positions; None: unknown.
         record_to: a folder for the SDK's own recording of each session (H5), with the parameters of each stimulus in
-            the data stream `animat_stimuli`; None: none is made.
+            the data stream `animat_stimuli`; None: no such recording.
         raw: whether that recording keeps raw samples.
         limits: tighter limits than `CL1_LIMITS`.
 
     Raises:
-        InvalidArgument: for a pattern with a channel that cannot stimulate, by its number and what it is, or another
-            setting that cannot be.
+        InvalidArgument: for a pattern with a channel that cannot stimulate, or another invalid setting.
     """
 
     name: ClassVar[str] = "cl1"
@@ -106,7 +105,7 @@ class CL1Culture(Culture):
             raise InvalidArgument(f"margin_ms: expected 0 to 1000 ms, got {margin_ms}")
         if jitter_tolerance_ms is not None and not jitter_tolerance_ms >= 0:
             raise InvalidArgument(f"jitter_tolerance_ms: expected 0 ms or more, or None, got {jitter_tolerance_ms}")
-        self._patterns = _drawn(seed) if patterns is None else _checked(patterns)
+        self._patterns = _draw_patterns(seed) if patterns is None else _check_patterns(patterns)
         self._seed = seed if patterns is None else None
         self._ticks_per_s = ticks_per_s
         self._margin_frames = round(margin_ms * 1e-3 * FRAMES_PER_S)
@@ -124,16 +123,16 @@ class CL1Culture(Culture):
         self._halted = threading.Event()
         self._lock = threading.RLock()
         self.spikes_not_on_electrodes = 0
-        """Spikes that the device reported on ground or reference, which are no recording electrodes; left out."""
+        """Spikes that the device reported on ground or reference, which are not recording electrodes; left out."""
 
     @property
     def channels(self) -> Channels:
-        """The 59 electrodes; ground and reference are none."""
+        """The 59 electrodes, without ground and reference."""
         return self._channels
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """All of them: a channel's number stands for its electrode."""
+        """All of them, by channel number."""
         return SITES
 
     @property
@@ -142,7 +141,7 @@ class CL1Culture(Culture):
 
     @property
     def device(self) -> Path:
-        """The CL1 that this runs on; of the SDK's simulator each program has its own."""
+        """The CL1 on this machine; each program has its own SDK simulator."""
         return of_the_program("cl1-simulator") if _sdk().is_simulator() else of_the_machine("cl1")
 
     @property
@@ -151,9 +150,9 @@ class CL1Culture(Culture):
 
     @property
     def now_s(self) -> float:
-        """The device's clock: begins when the device is started, not when it is opened."""
+        """The device's clock, which starts with the device, not when it is opened."""
         neurons = self._opened_neurons()
-        with as_device_failure("CL1", "tell its time"):
+        with as_device_failure("CL1", "report its time"):
             return float(neurons.timestamp() / FRAMES_PER_S)
 
     @property
@@ -162,29 +161,27 @@ class CL1Culture(Culture):
 
     @property
     def recorded_as(self) -> RecordedCulture:
-        """With the seed of its patterns, where they were drawn."""
+        """The kind, with the seed of its patterns if they were drawn."""
         self._opened_neurons()
         assert self._cl is not None
-        with as_device_failure("CL1", "say what it is"):
+        with as_device_failure("CL1", "report what it is"):
             return RecordedCulture("cl1", self._seed, bool(self._cl.is_simulator()))
 
     @property
     def provenance(self) -> dict[str, str]:
-        """The device by its own names, the SDK's version, and whether it is a simulator."""
+        """The device's own identifiers, and whether it is a simulator."""
         self._opened_neurons()
         assert self._cl is not None
-        with as_device_failure("CL1", "say what it is"):
-            told = self._cl.get_system_attributes()
+        with as_device_failure("CL1", "identify itself"):
+            attributes = self._cl.get_system_attributes()
             kind = "the SDK's simulator" if self._cl.is_simulator() else "device"
-        named = {
-            name: str(told[name]) for name in ("system_id", "chip_id", "cell_batch_id", "project_id") if name in told
-        }
+        names = ("system_id", "chip_id", "cell_batch_id", "project_id")
         return {
-            # The words that recordings have: a series goes on only where they stay, whatever the module's name.
+            # As in existing recordings, though the module has moved: a series continues only if this text stays.
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
             "pattern_seed": "none: they were given" if self._seed is None else str(self._seed),
-            **named,
+            **{name: str(attributes[name]) for name in names if name in attributes},
         }
 
     @property
@@ -193,7 +190,7 @@ class CL1Culture(Culture):
 
     def _open(self) -> None:
         self._cl = _sdk()
-        # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.
+        # New for each session: a delivery of an earlier one that hung and resumes sees its own event, which stays set.
         self._halted = threading.Event()
         self.spikes_not_on_electrodes = 0
         try:
@@ -212,7 +209,7 @@ class CL1Culture(Culture):
             raise
         except Exception as error:
             raise DeviceFailed(
-                f"CL1: expected a device to open, got {in_words(error)}: is another program using it?"
+                f"CL1: expected a device to open, got {describe_error(error)}: is another program using it?"
             ) from error
         self._delivery = Delivery(
             self._cl,
@@ -221,7 +218,7 @@ class CL1Culture(Culture):
             ticks_per_s=self._ticks_per_s,
             margin_frames=self._margin_frames,
             jitter=self._jitter,
-            keep=self._keep,
+            log=self._log,
             lock=self._lock,
         )
 
@@ -237,16 +234,19 @@ class CL1Culture(Culture):
                 is_halted=self._halted.is_set,
             )
         except BaseException as error:
-            told = "what had not begun was interrupted"
+            outcome = "what had not begun was interrupted"
             try:
                 self._interrupt()
             except Exception as failed:
-                told = f"and it could not be interrupted ({in_words(failed)}): see to it that it gives no more pulses"
-                error.add_note(told)
+                outcome = (
+                    f"and it could not be interrupted ({describe_error(failed)}): make sure it gives no more pulses"
+                )
+                error.add_note(outcome)
             if isinstance(error, AnimatError) or not isinstance(error, Exception):
                 raise
             raise DeviceFailed(
-                f"CL1: expected a loop over {duration_s:g} s, got {in_words(error)}: {told}{self._remedy(error)}"
+                f"CL1: expected a loop over {duration_s:g} s, got {describe_error(error)}: "
+                f"{outcome}{self._remedy(error)}"
             ) from error
         row = _ROW_OF[channel]
         self.spikes_not_on_electrodes += int(np.count_nonzero(row == UNKNOWN))
@@ -263,28 +263,28 @@ class CL1Culture(Culture):
         neurons = self._opened_neurons()
         now = int(neurons.timestamp())
         until = now + int(np.ceil(duration_s * FRAMES_PER_S))
-        # In pieces of a second, well under the five that the SDK holds.
+        # In pieces of a second, well under the five seconds that the SDK buffers.
         while now < until:
             piece = min(FRAMES_PER_S, until - now)
             try:
                 neurons.read(piece, now)
             except TimeoutError as error:
                 raise DeviceFailed(
-                    f"CL1: expected to rest {duration_s:g} s, got {in_words(error)}{self._remedy(error)}"
+                    f"CL1: expected to rest {duration_s:g} s, got {describe_error(error)}{self._remedy(error)}"
                 ) from error
             now += piece
 
     def _remedy(self, error: Exception) -> str:
-        """What helps where the SDK's simulator was too slow; nothing for other errors, and on a device."""
+        """What to do if the SDK's simulator was too slow; empty for other errors, and on a device."""
         if self._cl is None or "Timeout waiting for timestamp" not in str(error) or not self._cl.is_simulator():
             return ""
         return "; the simulator did not keep up: run without CL_SDK_ACCELERATED_TIME, or with nothing else running"
 
     def _halt(self) -> None:
-        # First of all: whoever is about to hand over a pulse looks at it with the lock held.
+        # First of all: a delivery checks it, with the lock held, before it queues a pulse.
         self._halted.set()
-        # A hand-over that is under way comes before; one that hangs must not keep what is queued from being taken back.
-        is_held = self._lock.acquire(timeout=HAND_OVER_S)
+        # Wait while a pulse is being queued, but not for ever: the queue must be cleared even if that hangs.
+        is_held = self._lock.acquire(timeout=QUEUEING_S)
         try:
             self._interrupt()
         finally:
@@ -300,14 +300,14 @@ class CL1Culture(Culture):
             self._stack.close()
 
     def _interrupt(self) -> None:
-        """Stop what is under way on every channel, and forget what was still to come."""
+        """Stop pulses in progress on every channel, and clear the queue."""
         cl, neurons = self._cl, self._neurons
         if cl is not None and neurons is not None:
             neurons.interrupt(cl.ChannelSet(*SITES))
 
-    def _keep(self, frame: int, words: dict[str, Any]) -> None:
+    def _log(self, frame: int, parameters: dict[str, Any]) -> None:
         if self._stream is not None:
-            self._stream.append(frame, json.dumps(words))
+            self._stream.append(frame, json.dumps(parameters))
 
     def _opened_neurons(self) -> Any:
         if self._neurons is None:
@@ -325,24 +325,24 @@ def _sdk() -> ModuleType:
     except ImportError as error:
         raise DeviceFailed(
             "cl: expected the vendor's package cl-sdk, got none: on Python 3.12 or later `pip install cl-sdk` "
-            "(its licence is CC BY-NC 4.0); on a CL1 it is there"
+            "(its licence is CC BY-NC 4.0); on a CL1 it is preinstalled"
         ) from error
-    found: ModuleType = cl
-    return found
+    sdk: ModuleType = cl
+    return sdk
 
 
-def _checked(
+def _check_patterns(
     patterns: Sequence[Sequence[int]] | Int64[np.ndarray, "patterns size"],
 ) -> Int64[np.ndarray, "patterns size"]:
     rows = [[int(channel) for channel in row if channel != UNKNOWN] for row in patterns]
     for number, row in enumerate(rows):
         if not row or len(set(row)) < len(row):
-            raise InvalidArgument(f"patterns: expected different channels in each, got {row} as number {number}")
+            raise InvalidArgument(f"patterns: expected distinct channels in each, got {row} as number {number}")
         for channel in row:
             if channel in NO_STIMULATION:
                 raise InvalidArgument(
                     f"patterns: expected channels that can stimulate, got channel {channel} in number {number}, which "
-                    f"is {NO_STIMULATION[channel]}: the SDK would say nothing of it; choose another"
+                    f"is {NO_STIMULATION[channel]}: the SDK would not report it; choose another"
                 )
             if not 0 <= channel < CHANNELS:
                 raise InvalidArgument(f"patterns: expected channels from 0 to 63, got {channel} in number {number}")
@@ -353,11 +353,11 @@ def _checked(
     return table
 
 
-def _drawn(seed: int) -> Int64[np.ndarray, "patterns size"]:
-    """100 patterns of five, every two channels of one further apart than neighbours in a row or column are."""
-    # Channels are numbered down the columns; distances are the same as if it were along the rows.
+def _draw_patterns(seed: int) -> Int64[np.ndarray, "patterns size"]:
+    """100 patterns of five channels, no two of which are neighbours in a row or column."""
+    # Channels are numbered down the columns; distances are the same as along the rows.
     grid = ElectrodeArray("CL1", columns=8, rows=8, pitch_um=1.0, channels=CHANNELS, stimulation_units=len(SITES))
-    return _checked(draw_patterns(grid, np.array(SITES), seed=seed, spacing_um=1.0))
+    return _check_patterns(draw_patterns(grid, np.array(SITES), seed=seed, spacing_um=1.0))
 
 
 def _channel_table(pitch_um: float | None) -> Channels:

@@ -21,27 +21,27 @@ LEAD_US = 80
 """The shortest time from a command to its pulse."""
 LEAD_FRAMES = LEAD_US * FRAMES_PER_S // 1_000_000
 AHEAD_FRAMES = 2_500
-"""Pulses are handed to the device up to 100 ms before their time: the computer may fall behind by as much, and no
-more than that has to be taken back when all is stopped."""
+"""Pulses are queued on the device up to 100 ms ahead: the computer may fall behind by as much, and a stop has to remove
+no more than that from the queue."""
 
-Ran = tuple[int, int, Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], Float64[np.ndarray, " stimuli"]]
+Result = tuple[int, int, Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], Float64[np.ndarray, " stimuli"]]
 
 
 class Delivery:
     """Delivers stimuli through `Neurons.loop` and stim plans.
 
-    A plan runs at a frame, and its pulse comes one lead time later. Each is handed over within the loop, in the order
-    of time. When one cannot be in time, it and all after it are moved back together: times between pulses only grow.
+    A plan runs at a frame, and its pulse comes one lead time later. Pulses are queued within the loop, in order of
+    time. If one is late, all after it are delayed equally, so that intervals between pulses can only grow.
 
     Args:
         cl: the SDK.
         neurons: of the SDK, open.
         pace: the limits on the device's clock.
         ticks_per_s: of the loop.
-        margin_frames: least time from now to the run of a plan.
-        jitter: what the loop is told of jitter.
-        keep: called with frame and parameters of each pulse handed over.
-        lock: held while a pulse is handed over.
+        margin_frames: shortest time from now to the run of a plan.
+        jitter: arguments of the loop on jitter.
+        log: called with frame and parameters of each queued pulse.
+        lock: held while a pulse is queued.
     """
 
     def __init__(
@@ -53,76 +53,78 @@ class Delivery:
         ticks_per_s: int,
         margin_frames: int,
         jitter: dict[str, Any],
-        keep: Callable[[int, dict[str, Any]], None],
+        log: Callable[[int, dict[str, Any]], None],
         lock: AbstractContextManager[Any],
     ) -> None:
         self._cl, self._neurons, self._pace = cl, neurons, pace
         self._ticks_per_s, self._margin_frames, self._jitter = ticks_per_s, margin_frames, jitter
-        self._keep, self._lock = keep, lock
+        self._log, self._lock = log, lock
         self._designs: dict[Pulse, Any] = {}
 
-    def run(self, stimuli: Sequence[Stimulus], duration_s: float, *, since: int, is_halted: Callable[[], bool]) -> Ran:
-        """Deliver, and read until `duration_s` after the start, and as much longer as the stimuli began late.
+    def run(
+        self, stimuli: Sequence[Stimulus], duration_s: float, *, since: int, is_halted: Callable[[], bool]
+    ) -> Result:
+        """Deliver, and read until `duration_s` after the start, extended by the delay of the stimuli.
 
         Args:
-            stimuli: in the order of time.
+            stimuli: in order of time.
             duration_s: of reading, which starts when the loop does.
-            since: frame that times of stimuli count from: no later than the start.
-            is_halted: whether to hand over nothing more.
+            since: frame from which times of stimuli count: no later than the start.
+            is_halted: whether to queue nothing more.
 
         Returns:
-            First frame, frame after the last, frames and channels of the spikes, and the frame each stimulus began at.
+            First frame, frame after the last, frames and channels of the spikes, and the frame of each stimulus start.
 
         Raises:
             DeviceFailed: if it was stopped half way, or a pulse never came.
         """
-        waiting, asked = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
-        handed: list[int] = []
+        waiting, requested = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
+        queued: list[int] = []
         frames, channels, reported = [], [], defaultdict[int, deque[int]](deque)
         late, start, stop = 0, None, 0
         for tick in self._neurons.loop(self._ticks_per_s, **self._jitter):
-            found = tick.analysis
+            analysis = tick.analysis
             if start is None:
-                start = int(found.start_timestamp)
-            stop = int(found.stop_timestamp)
-            frames += [spike.timestamp for spike in found.spikes]
-            channels += [spike.channel for spike in found.spikes]
-            for pulse in sorted(found.stims, key=lambda pulse: pulse.timestamp):
+                start = int(analysis.start_timestamp)
+            stop = int(analysis.stop_timestamp)
+            frames += [spike.timestamp for spike in analysis.spikes]
+            channels += [spike.channel for spike in analysis.spikes]
+            for pulse in sorted(analysis.stims, key=lambda pulse: pulse.timestamp):
                 reported[pulse.channel].append(pulse.timestamp)
-            self._check_going(is_halted, len(handed), len(stimuli))
-            while waiting and asked[len(handed)] + late < stop + AHEAD_FRAMES:
-                # A stop from another thread comes before a hand-over, which then is none, or after, and takes it back.
+            self._check_going(is_halted, len(queued), len(stimuli))
+            while waiting and requested[len(queued)] + late < stop + AHEAD_FRAMES:
+                # A stop from another thread comes either before the pulse is queued, or after, and then removes it.
                 with self._lock:
-                    self._check_going(is_halted, len(handed), len(stimuli))
-                    frame = self._hand_over(waiting.popleft(), asked[len(handed)] + late)
-                late = frame - asked[len(handed)]
-                handed.append(frame)
+                    self._check_going(is_halted, len(queued), len(stimuli))
+                    frame = self._queue(waiting.popleft(), requested[len(queued)] + late)
+                late = frame - requested[len(queued)]
+                queued.append(frame)
             end = start + int(np.ceil(duration_s * FRAMES_PER_S)) + late
-            if not waiting and stop >= max(end, handed[-1] + 1 if handed else 0):
+            if not waiting and stop >= max(end, queued[-1] + 1 if queued else 0):
                 tick.loop.stop()
         if start is None or waiting:
-            raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended before")
-        begun = [self._began(stimulus, frame, reported, start) for stimulus, frame in zip(stimuli, handed, strict=True)]
+            raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended early")
+        begun = [self._began(stimulus, frame, reported, start) for stimulus, frame in zip(stimuli, queued, strict=True)]
         return start, stop, np.array(frames, np.int64), np.array(channels, np.int64), np.array(begun, np.float64)
 
     @staticmethod
-    def _check_going(is_halted: Callable[[], bool], handed: int, of: int) -> None:
-        if of and is_halted():
+    def _check_going(is_halted: Callable[[], bool], queued: int, total: int) -> None:
+        if total and is_halted():
             raise DeviceFailed(
-                f"CL1: stopped while delivering: {handed} of {of} stimuli had been handed to the device, and what had "
+                f"CL1: stopped while delivering: {queued} of {total} stimuli had been sent to the device, and what had "
                 "not begun was interrupted"
             )
 
-    def _hand_over(self, stimulus: Stimulus, frame: int) -> int:
-        """Give one stimulus to the device, at a frame or as soon after it as can be; returns the frame."""
-        soonest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
+    def _queue(self, stimulus: Stimulus, frame: int) -> int:
+        """Queue one stimulus on the device, at a frame or as soon as possible after it; returns the frame."""
+        earliest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
         alone = [replace(stimulus, time_s=0.0)]
-        frame = round(self._pace.soonest(alone, max(frame, soonest) / FRAMES_PER_S) * FRAMES_PER_S)
+        frame = round(self._pace.earliest(alone, max(frame, earliest) / FRAMES_PER_S) * FRAMES_PER_S)
         self._pace.count(alone, frame / FRAMES_PER_S)
         plan = self._neurons.create_stim_plan()
         plan.stim(self._cl.ChannelSet(*stimulus.electrodes), self._design(stimulus.pulse), lead_time_us=LEAD_US)
         plan.run(at_timestamp=frame - LEAD_FRAMES)
-        self._keep(frame, _parameters(stimulus))
+        self._log(frame, _parameters(stimulus))
         return frame
 
     def _design(self, pulse: Pulse) -> Any:
@@ -136,7 +138,7 @@ class Delivery:
 
     @staticmethod
     def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], start: int) -> int:
-        """The frame at which the device says that a stimulus began on its first electrode; it must name all of them."""
+        """The frame at which the device reports the first pulse of a stimulus; it must report all its electrodes."""
         began = []
         for electrode in stimulus.electrodes:
             while reported[electrode] and reported[electrode][0] < frame:
@@ -151,10 +153,10 @@ class Delivery:
 
 
 def _parameters(stimulus: Stimulus) -> dict[str, Any]:
-    """What the rig's own file does not keep of a stimulus."""
-    words: dict[str, Any] = {"electrodes": list(stimulus.electrodes), "presentation": stimulus.presentation}
+    """Parameters of a stimulus that the device's own file lacks."""
+    parameters: dict[str, Any] = {"electrodes": list(stimulus.electrodes), "presentation": stimulus.presentation}
     if np.isfinite(stimulus.frequency_hz):
-        words["frequency_hz"] = stimulus.frequency_hz
+        parameters["frequency_hz"] = stimulus.frequency_hz
     if stimulus.pattern >= 0:
-        words["pattern"] = stimulus.pattern
-    return {**words, "phases": stimulus.pulse.to_list()}
+        parameters["pattern"] = stimulus.pattern
+    return {**parameters, "phases": stimulus.pulse.to_list()}

@@ -1,4 +1,4 @@
-"""The simulated tissue offered to the CL1's SDK as a source of data: any CL application runs on it as on a device.
+"""The simulated tissue as a data source of the CL1's SDK: any CL application runs on it as on a device.
 
 from animat.cultures.devices.cl1_source import use_simulated_culture
 use_simulated_culture(seed=1)          # before `cl.open()`; the SDK's simulator then reacts to stimuli
@@ -27,18 +27,18 @@ FACTORY = "animat.cultures.devices.cl1_source:simulated_culture"
 UV_PER_UNIT = 0.195
 BLOCK_FRAMES = 1024
 REAL_TIME_NEURONS = 200
-"""With as many, an application that stimulates on every spike at 1,000 ticks a second leaves 30 % of two cores free."""
+"""With these, an application that stimulates on every spike at 1,000 ticks a second leaves 30 % of two cores free."""
 REAL_TIME_SHARE = 0.7
-"""Of real time, what computing may take."""
-TRIED_FRAMES, FRAMES_AT_ONCE = 2_500, 5
-"""How much is tried at opening, and in what pieces: as the SDK reads in real time."""
+"""Largest share of real time that computing may take."""
+TIMED_FRAMES, FRAMES_PER_READ = 2_500, 5
+"""Length of the timing at opening, and its pieces, in which the SDK reads in real time."""
 SAMPLES = 75
 BEFORE = 25
-"""Samples of a spike that the SDK shows, and how many of them lie before its time."""
+"""Samples of a spike in the SDK, and how many of them precede its time."""
 
 
 class StimulusEvent(Protocol):
-    """What the SDK says of one pulse on one channel (`cl.sim.DataSourceStim`)."""
+    """The SDK's description of one pulse on one channel (`cl.sim.DataSourceStim`)."""
 
     timestamp: int
     channel: int
@@ -47,24 +47,24 @@ class StimulusEvent(Protocol):
 
 
 class SimulatedCL1:
-    """A tissue under the CL1's 8 x 8 electrodes, read in frames; knows nothing of the SDK.
+    """A tissue under the CL1's 8 x 8 electrodes, read in frames; independent of the SDK.
 
-    A pulse acts with strength q / `charge_nc`, q being its largest cathodic charge, up to the 2 that the tissue
-    knows, at the first step of the tissue (0.2 ms, five frames) that does not begin before it. A channel sees every
-    neuron within `reach_um`. Frames hold noise and every spike from its trough on. All depends on seed, parameters and
-    pulses only, not on the pieces in which it is read: noise is drawn for whole blocks of frames.
+    A pulse acts with strength q / `charge_nc`, where q is its largest cathodic charge, up to the tissue's limit of 2,
+    at the first step of the tissue (0.2 ms, five frames) that does not begin before it. A channel sees every neuron
+    within `reach_um`. Frames hold noise and every spike from its trough on. Everything depends only on seed, parameters
+    and pulses, not on the pieces in which it is read: noise is drawn for whole blocks of frames.
 
     Args:
-        seed: which culture.
-        neurons: of the tissue; with fewer than 1,200, each has fewer partners in proportion. More than the default may
-            be too many for real time, which opening says: the application then falls behind the SDK's buffer.
-        pitch_um: between electrodes, in the middle of the tissue. Assumed: the SDK does not say.
+        seed: of the culture.
+        neurons: of the tissue; with fewer than 1,200, each has proportionally fewer partners. More than the default may
+            be too many for real time, as a warning at opening says: the application then falls behind the SDK's buffer.
+        pitch_um: between electrodes, in the middle of the tissue. Assumed: the SDK does not specify it.
         reach_um: of an electrode; assumed, and wider than a CMOS array's, as its electrodes are larger.
-        charge_nc: that makes a pulse of strength 1; assumed: what a bare current of 1 uA has in the SDK (160 us).
+        charge_nc: of a pulse of strength 1; assumed: that of the SDK's default pulse for 1 uA (160 us).
         noise_uv: root mean square of the noise.
 
     Raises:
-        InvalidArgument: for a setting that cannot be.
+        InvalidArgument: for an invalid setting.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class SimulatedCL1:
         amplitude_uv = amplitudes_at_soma_uv(np.random.default_rng([seed, 11]), len(self._tissue.x_um))
         self._shapes = _waveform()[None, :] * amplitude_uv[:, None].astype(np.float32)
         self._tissue.advance(WARM_UP_S)
-        # The first pulse on an electrode finds what it reaches, and compiles: the SDK waits for 100 ms and no longer.
+        # The first pulse on an electrode looks up what it reaches, and compiles: the SDK waits no longer than 100 ms.
         before = self._tissue.snapshot()
         self._tissue.advance(
             0.01, [Pulse(self._tissue.now_s, self.x_um[c : c + 1], self.y_um[c : c + 1]) for c in channel.tolist()]
@@ -110,72 +110,74 @@ class SimulatedCL1:
         self._next = 0
         self._pulses: list[Pulse] = []
         self._held: list[tuple[int, int, int]] = []
-        self._sounding: list[tuple[int, int, int]] = []
+        self._unfinished: list[tuple[int, int, int]] = []
         self._block: tuple[int, Int16[np.ndarray, "frames channels"]] | None = None
 
     def stimulate(self, events: Sequence[StimulusEvent]) -> None:
-        """Take note of pulses; those of one frame on several channels are one stimulus. What is late acts at once."""
-        strength: dict[tuple[int, float], list[int]] = {}
+        """Schedule pulses; those of one frame on several channels are one stimulus. Late ones act immediately."""
+        channels_of: dict[tuple[int, float], list[int]] = {}
         for event in events:
             if 0 <= event.channel < CHANNELS and self._is_electrode[event.channel]:
                 charges = zip(event.phase_durations_us, event.phase_currents_uA, strict=True)
                 cathodic_nc = max([0.0, *(-us * ua / 1000 for us, ua in charges)])
                 if cathodic_nc > 0:
                     key = (event.timestamp, min(2.0, cathodic_nc / self._charge_nc))
-                    strength.setdefault(key, []).append(event.channel)
-        for (frame, how), channels in sorted(strength.items()):
+                    channels_of.setdefault(key, []).append(event.channel)
+        for (frame, strength), channels in sorted(channels_of.items()):
             at_s = (self._zero_frames + max(0, frame)) / FRAMES_PER_S
-            self._pulses.append(Pulse(at_s, self.x_um[sorted(channels)], self.y_um[sorted(channels)], how))
+            self._pulses.append(Pulse(at_s, self.x_um[sorted(channels)], self.y_um[sorted(channels)], strength))
 
     def read(
         self, from_frame: int, frame_count: int
     ) -> tuple[Int16[np.ndarray, "frames channels"], list[tuple[int, int, Float32[np.ndarray, " samples"]]]]:
-        """Frames from `from_frame` on, and the spikes within, in the order of time: frame, channel, waveform.
+        """Frames from `from_frame` on, and their spikes in order of time: frame, channel, waveform.
 
         Raises:
-            InvalidArgument: for frames that were read before.
+            InvalidArgument: for frames that were already read.
         """
         if from_frame < self._next:
-            raise InvalidArgument(f"from_frame: expected {self._next} or later, as time only goes on, got {from_frame}")
+            raise InvalidArgument(
+                f"from_frame: expected {self._next} or later, as time only moves forward, got {from_frame}"
+            )
         to_frame = from_frame + frame_count
         self._advance(to_frame)
-        # What was skipped was not looked at.
+        # Spikes in skipped frames are dropped.
         due = [spike for spike in self._held if from_frame <= spike[0] < to_frame]
         self._held = [spike for spike in self._held if spike[0] >= to_frame]
-        sounding = [*(self._sounding if from_frame == self._next else ()), *due]
+        unfinished = [*(self._unfinished if from_frame == self._next else ()), *due]
         frames = self._noise(from_frame, frame_count)
-        if sounding:
+        if unfinished:
             signal = frames.astype(np.float32)
-            for frame, channel, neuron in sounding:
+            for frame, channel, neuron in unfinished:
                 shape = self._shapes[neuron, BEFORE:] / np.float32(UV_PER_UNIT)
-                here = shape[max(0, from_frame - frame) : to_frame - frame]
+                part = shape[max(0, from_frame - frame) : to_frame - frame]
                 first = max(0, frame - from_frame)
-                signal[first : first + len(here), channel] += here
+                signal[first : first + len(part), channel] += part
             frames = np.clip(np.rint(signal), -32768, 32767).astype(np.int16)
-        self._sounding = [spike for spike in sounding if spike[0] + SAMPLES - BEFORE > to_frame]
+        self._unfinished = [spike for spike in unfinished if spike[0] + SAMPLES - BEFORE > to_frame]
         self._next = to_frame
         return frames, [(frame, channel, self._shapes[neuron]) for frame, channel, neuron in due]
 
     def share_of_real_time(self) -> float:
-        """What computing takes of real time, timed on a tenth of a second in pieces as the SDK reads them.
+        """Share of real time that computing takes, timed on a tenth of a second in the pieces that the SDK reads.
 
-        Afterwards the culture is where it was. Stimuli come on top, and what the application computes in its process.
+        The culture's state is then restored. Stimuli and the application's own computing take additional time.
 
         Raises:
-            InvalidArgument: for a culture that was read.
+            InvalidArgument: for a culture that was already read.
         """
         if self._next:
-            raise InvalidArgument(f"expected a culture that was not read, got one that was read to frame {self._next}")
+            raise InvalidArgument(f"culture: expected one not yet read, got one that was read to frame {self._next}")
         before, begun_s = self._tissue.snapshot(), time.perf_counter()
-        for frame in range(0, TRIED_FRAMES, FRAMES_AT_ONCE):
-            self.read(frame, FRAMES_AT_ONCE)
+        for frame in range(0, TIMED_FRAMES, FRAMES_PER_READ):
+            self.read(frame, FRAMES_PER_READ)
         took_s = time.perf_counter() - begun_s
         self._tissue.restore(before)
-        self._next, self._held, self._sounding = 0, [], []
-        return took_s / (TRIED_FRAMES / FRAMES_PER_S)
+        self._next, self._held, self._unfinished = 0, [], []
+        return took_s / (TIMED_FRAMES / FRAMES_PER_S)
 
-    def too_large(self) -> str | None:
-        """What there is to say of a culture that real time may not carry; None of one that it does."""
+    def real_time_warning(self) -> str | None:
+        """A warning if the culture may be too large for real time; None if it is not."""
         neurons, share = len(self._sees), self.share_of_real_time()
         if neurons <= REAL_TIME_NEURONS and share <= REAL_TIME_SHARE:
             return None
@@ -186,7 +188,7 @@ class SimulatedCL1:
         )
 
     def _advance(self, to_frame: int) -> None:
-        """Step the tissue to the end of the step that the frames end within."""
+        """Advance the tissue to the end of the step in which the frames end."""
         target = -(-(self._zero_frames + to_frame) // self._step_frames) * self._step_frames
         now = round(self._tissue.now_s * FRAMES_PER_S)
         if target <= now:
@@ -208,7 +210,7 @@ class SimulatedCL1:
         return [np.flatnonzero(row).tolist() for row in near]
 
     def _noise(self, from_frame: int, count: int) -> Int16[np.ndarray, "frames channels"]:
-        """Noise of these frames, drawn block by block so that it does not depend on how it is read."""
+        """Noise of these frames, drawn block by block so that it does not depend on the pieces read."""
         pieces, frame = [], from_frame
         while frame < from_frame + count:
             number, first = divmod(frame, BLOCK_FRAMES)
@@ -224,7 +226,7 @@ class SimulatedCL1:
 
 
 def _waveform() -> Float64[np.ndarray, " samples"]:
-    """A spike of size 1, its trough at sample 25: a narrow trough and a wide peak half a millisecond after it."""
+    """A spike of unit amplitude: a narrow trough at sample 25 and a wide peak half a millisecond later."""
     t_ms = (np.arange(SAMPLES) - BEFORE) / FRAMES_PER_S * 1e3
     shape = -np.exp(-((t_ms / 0.09) ** 2) / 2) + 0.3 * np.exp(-(((t_ms - 0.45) / 0.35) ** 2) / 2) * (t_ms > 0)
     return np.asarray(shape / -shape[BEFORE], dtype=np.float32)
@@ -241,7 +243,7 @@ def simulated_culture(**settings: Any) -> Any:
     from cl.sim import DataSourceBatch, DataSourceSpike, SimulatorDataSource
 
     class Source(SimulatorDataSource):  # type: ignore[misc]
-        """Opens a tissue in the simulator's process; it is made anew whenever the SDK opens it."""
+        """Opens a tissue in the simulator's process, a new one whenever the SDK opens it."""
 
         def __init__(self) -> None:
             self._culture: SimulatedCL1 | None = None
@@ -253,8 +255,8 @@ def simulated_culture(**settings: Any) -> Any:
         def open(self) -> None:
             self._culture = SimulatedCL1(**settings)
             is_real_time = os.environ.get("CL_SDK_ACCELERATED_TIME") != "1"
-            if is_real_time and (told := self._culture.too_large()) is not None:
-                print(told, file=sys.stderr, flush=True)
+            if is_real_time and (warning := self._culture.real_time_warning()) is not None:
+                print(warning, file=sys.stderr, flush=True)
 
         def close(self) -> None:
             self._culture = None
@@ -272,10 +274,10 @@ def simulated_culture(**settings: Any) -> Any:
 
 
 def use_simulated_culture(**settings: Any) -> None:
-    """Let the SDK's simulator read from a simulated culture, from the next `cl.open()` on.
+    """Make the SDK's simulator read from a simulated culture, from the next `cl.open()` on.
 
     Args:
-        settings: of `SimulatedCL1`, as data for JSON.
+        settings: of `SimulatedCL1`, serialisable as JSON.
     """
     import cl.sim
 

@@ -19,7 +19,7 @@ from animat.cultures.base import Culture
 from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
 from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
 from animat.cultures.devices.maxone_wiring import Wiring, wire
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine
 from animat.cultures.observed import Observed, Spikes
@@ -32,14 +32,14 @@ from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN
 
 DAC_STEPS = 511
-"""Codes on either side of 0 V."""
+"""Converter codes on either side of 0 V."""
 
 MAXONE_LIMITS = Limits(
     kind="voltage",
     amplitude=400.0,
     phase_us=(SAMPLE_US, 1000.0),
     charge_per_phase=200.0,
-    # In what the converter makes of it; what is left is rounding.
+    # After rounding by the converter; the tolerance is for floating-point errors.
     net_charge=1e-6,
     net_charge_per_session=1e-3,
     electrodes_at_once=32,
@@ -52,33 +52,33 @@ MAXONE_LIMITS = Limits(
     interval_us=10_000.0,
     gap_us=1_000.0,
 )
-"""Ours, not the vendor's, whose converter would give 1.5 V: for a living culture, up to twice the paper's pulse.
-`amplitude_step` is the converter's, asked from the device when it is opened."""
+"""Ours, not the vendor's, whose converter reaches 1.5 V: for a living culture, up to twice the paper's pulse.
+`amplitude_step` is the converter's, queried from the device at opening."""
 
 
 class MaxOneCulture(Culture):
-    """A culture on a MaxOne: electrodes as selected, one stimulation unit each, all driven by one converter.
+    """A culture on a MaxOne: the selected electrodes, with one stimulation unit per site, all driven by one converter.
 
-    Opening routes the array and refuses, by name, every stimulation electrode that was not routed, got no unit, or
-    shares one with another. Recording electrodes that were not routed are left out and counted. All units in use are
-    powered from opening to closing; a stimulus connects those of its electrodes, for as long as its pulse lasts.
+    Opening routes the array, and fails with the names of stimulation electrodes that were not routed, have no unit, or
+    share one. Recording electrodes that were not routed are left out and counted. All units in use are powered from
+    opening to closing; a stimulus connects those of its electrodes for the duration of its pulse.
 
-    Stimuli that follow each other within `sequence_s` are one sequence, in which times are exact (50 us), made anew
-    each time; one that is alone is kept on the device as a sequence of its pattern and pulse, and sent again. When a
-    sequence starts is the computer's doing: `stimulus_time_s` is estimated from the newest frame when the server had
-    taken it. `stop` takes the power from all units.
+    Stimuli within `sequence_s` form one sequence, in which times are exact (50 us) and which is rebuilt each time. A
+    single stimulus is kept on the device as a sequence of its pattern and pulse, and reused. The computer determines
+    when a sequence starts: `stimulus_time_s` is estimated from the newest frame when the server had accepted it. `stop`
+    cuts the power of all units.
 
-    Never run on a device: `docs/hardware.md` says what was tested against what.
+    Never run on a device: `docs/hardware.md` lists what was tested, and against what.
 
     Args:
         selection: electrodes to record, to stimulate, and the patterns.
-        stream: where spikes come from; None: the vendor's server, through ZeroMQ.
-        sequence_s: the longest time that one sequence spans.
-        settle: whether to wait as long as the vendor says after each step of opening.
+        stream: source of the spikes; None: the vendor's server, through ZeroMQ.
+        sequence_s: the longest span of one sequence.
+        settle: whether to wait as long as the vendor specifies after each step of opening.
         limits: tighter limits than `MAXONE_LIMITS`.
 
     Raises:
-        InvalidArgument: for a selection on another array, or without sites.
+        InvalidArgument: for a selection on another array, or without sites, or an invalid `sequence_s`.
     """
 
     name: ClassVar[str] = "maxone"
@@ -112,25 +112,25 @@ class MaxOneCulture(Culture):
         self._pace: Pace | None = None
         self._begun = History()
         self._lsb_mv = 0.0
-        # The first frame, and the last one before it was closed.
+        # The first frame, and the last one before closing.
         self._zero_frame, self._last_frame = 0, -1
         self._halted = threading.Event()
         self.spikes_not_recorded = 0
-        """Spikes that the device reported on amplifiers that no recording electrode is routed to; left out."""
+        """Spikes that the device reported on amplifiers without a recording electrode; left out."""
 
     @property
     def channels(self) -> Channels:
-        """The recording electrodes that were routed; a label is the amplifier's number."""
+        """The recording electrodes that were routed, labelled by amplifier number."""
         return self._wired().channels
 
     @property
     def not_routed(self) -> tuple[int, ...]:
-        """Recording electrodes that were asked for and not routed."""
+        """Recording electrodes that were selected but not routed."""
         return self._wired().not_routed
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """Those of the selection: all of them are connected, or the culture does not open."""
+        """Those of the selection: all are connected, or the culture does not open."""
         return tuple(self.selection.stimulation.tolist())
 
     @property
@@ -140,18 +140,18 @@ class MaxOneCulture(Culture):
 
     @property
     def device(self) -> Path:
-        """The one that MaxLab Live's server on this machine has."""
+        """The device of MaxLab Live's server on this machine."""
         return of_the_machine("maxone")
 
     @property
     def device_limits(self) -> Limits:
-        """`MAXONE_LIMITS` with the device's own step of voltage, once it is open."""
+        """`MAXONE_LIMITS` with the device's own voltage step, once it is open."""
         reach_mv = DAC_STEPS * self._lsb_mv or MAXONE_LIMITS.amplitude
         return replace(MAXONE_LIMITS, amplitude=min(MAXONE_LIMITS.amplitude, reach_mv), amplitude_step=self._lsb_mv)
 
     @property
     def now_s(self) -> float:
-        """Time since it was first opened, by the newest frame that came."""
+        """Time since it was first opened, by the newest frame received."""
         return (self._streaming().frame() - self._zero_frame) / FRAMES_PER_S
 
     @property
@@ -167,7 +167,7 @@ class MaxOneCulture(Culture):
         wiring = self._wired()
         units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
         return {
-            # The words that recordings have: a series goes on only where they stay, whatever the module's name.
+            # As in existing recordings, though the module has moved: a series continues only if this text stays.
             "source": "MaxOne by animat.cultures.maxone",
             "dac_lsb_mv": str(self._lsb_mv),
             "stimulation_units": units,
@@ -177,13 +177,13 @@ class MaxOneCulture(Culture):
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Spikes on amplifiers that read no electrode of the selection, and frames that were lost on the way here."""
+        """Spikes on amplifiers that read no electrode of the selection, and frames lost in transmission."""
         lost = int(getattr(self._stream, "lost_frames", 0))
         return {"spikes on amplifiers without an electrode": self.spikes_not_recorded, "frames lost on the way": lost}
 
     def _open(self) -> None:
         self._mx = mx = _vendor()
-        # One a session: a delivery of an earlier one that hung and goes on after all finds its own, which stays set.
+        # New for each session: a delivery of an earlier one that hung and resumes sees its own event, which stays set.
         self._halted = threading.Event()
         self.spikes_not_recorded = 0
         try:
@@ -199,56 +199,56 @@ class MaxOneCulture(Culture):
             raise
         except Exception as error:
             raise DeviceFailed(
-                f"MaxOne: expected a device to open, got {in_words(error)}: is MaxLab Live's server running?"
+                f"MaxOne: expected a device to open, got {describe_error(error)}: is MaxLab Live's server running?"
             ) from error
         frame = self._stream.frame()
         if self._last_frame < 0:
             self._zero_frame = frame
         elif frame < self._last_frame:
-            # Frames are counted anew: the clock goes on from where it was.
+            # The frame count restarted: the clock continues from where it was.
             self._zero_frame += frame - self._last_frame
         self._pace = Pace(self.limits, self.stimulation_electrodes, self._begun, frame / FRAMES_PER_S)
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         try:
-            return self._sent(admitted, duration_s)
+            return self._send(admitted, duration_s)
         except BaseException as error:
-            # A sequence that is under way goes on by itself: without power nothing comes of it, nor of any later one.
+            # A running sequence continues on the device: without power, neither it nor any later one has an effect.
             try:
-                self.stop(f"a delivery was broken off by {in_words(error)}")
+                self.stop(f"a delivery was interrupted by {describe_error(error)}")
             except DeviceFailed as failed:
-                error.add_note(f"and then: {failed}: see to it that it gives no more pulses")
+                error.add_note(f"and then: {failed}: make sure it gives no more pulses")
             raise
 
-    def _sent(self, admitted: Admitted, duration_s: float) -> Observed:
-        """Send sequences in time, and read the spikes meanwhile."""
+    def _send(self, admitted: Admitted, duration_s: float) -> Observed:
+        """Send sequences on time, and read the spikes meanwhile."""
         stream, sequences, pace = self._streaming(), self._sequences, self._pace
         assert sequences is not None and pace is not None
         halted = self._halted
-        # Spikes are kept by the stream: it starts when stimuli were asked for, however long sequences take to make.
+        # The stream keeps spikes, so observation starts at the request, however long sequences take to build.
         start, late = self._zero_frame + round(admitted.now_s * FRAMES_PER_S), 0
         groups = _groups(admitted.stimuli, self._sequence_s)
-        made = [sequences.of(group) for group in groups]
+        built = [sequences.of(group) for group in groups]
         begun: list[int] = []
-        for group, sequence in zip(groups, made, strict=True):
-            asked = start + round(group[0].time_s * FRAMES_PER_S) + late
+        for group, sequence in zip(groups, built, strict=True):
+            due = start + round(group[0].time_s * FRAMES_PER_S) + late
             relative = from_zero(group)
-            soonest = max(asked, stream.frame() + INITIAL_DELAY)
-            soonest = round(pace.soonest(relative, soonest / FRAMES_PER_S) * FRAMES_PER_S)
-            stream.wait(soonest - INITIAL_DELAY)
+            earliest = max(due, stream.frame() + INITIAL_DELAY)
+            earliest = round(pace.earliest(relative, earliest / FRAMES_PER_S) * FRAMES_PER_S)
+            stream.wait(earliest - INITIAL_DELAY)
             if halted.is_set():
                 raise DeviceFailed(
                     f"MaxOne: stopped while delivering: {len(begun)} of {len(admitted.stimuli)} stimuli had been sent, "
                     "and the units have no power"
                 )
             sequence.send()
-            # The pulse waits for the initial delay from when the server took the command: about now.
+            # The pulse follows the initial delay after the server accepted the command: about now.
             first = stream.frame() + INITIAL_DELAY
             pace.count(relative, first / FRAMES_PER_S)
             offsets = [round(stimulus.time_s * FRAMES_PER_S) for stimulus in relative]
             begun += [first + offset for offset in offsets]
-            late += first - asked
-            # Two sequences at once would drive the same converter.
+            late += first - due
+            # Two simultaneous sequences would drive the same converter.
             stream.wait(begun[-1] + round(group[-1].pulse.duration_us / SAMPLE_US))
         if halted.is_set() and admitted.stimuli:
             raise DeviceFailed("MaxOne: stopped while delivering: the units have no power, so pulses may not have come")
@@ -282,9 +282,9 @@ class MaxOneCulture(Culture):
     def _close(self) -> None:
         self._halted.set()
         mx, wiring = self._mx, self._wiring
-        # Whatever fails, all of the rest is tried; the last one is the first.
+        # Whatever fails, the rest is still tried, in reverse order.
         with ExitStack() as steps:
-            steps.callback(self._let_go)
+            steps.callback(self._release)
             if self._sequences is not None:
                 steps.callback(self._sequences.delete)
             if mx is not None and wiring is not None:
@@ -292,27 +292,27 @@ class MaxOneCulture(Culture):
                     steps.callback(mx.send, mx.StimulationUnit(unit).power_up(False).connect(False))
             steps.callback(self._switch_power, False)
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         stream = self._stream
-        # What it was wired as stays readable; `device_limits` too, for the next opening.
+        # The wiring stays readable; so do `device_limits`, for the next opening.
         self._mx = self._stream = self._sequences = self._pace = None
         if stream is not None:
-            # A stream that heard nothing has none.
+            # -1 if no frame was received.
             self._last_frame = stream.frame() if stream.frame() >= 0 else self._last_frame
             stream.stop()
 
     def _switch_power(self, on: bool) -> None:
-        """Of all stimulation units, where there is a device."""
+        """Switch the power of all stimulation units, if there is a device."""
         mx = self._mx
         if mx is not None and (reply := mx.send(mx.Core().enable_stimulation_power(on))) != "Ok":
             raise DeviceFailed(
                 f"MaxOne: expected stimulation power to be switched {'on' if on else 'off'}, got {reply!r}"
             )
 
-    def _wait(self, what: str) -> None:
-        """As long as the vendor says, by the name it has in `maxlab.Timing`."""
+    def _wait(self, name: str) -> None:
+        """Wait as long as `maxlab.Timing` specifies under a name."""
         if self._settle and self._mx is not None:
-            time.sleep(float(getattr(getattr(self._mx, "Timing", None), what, 5.0)))
+            time.sleep(float(getattr(getattr(self._mx, "Timing", None), name, 5.0)))
 
     def _wired(self) -> Wiring:
         if self._wiring is None:
@@ -335,18 +335,18 @@ def _vendor() -> ModuleType:
         ) from error
 
 
-def _step_mv(told: Any) -> float:
+def _step_mv(reply: Any) -> float:
     try:
-        lsb_mv = float(told)
+        lsb_mv = float(reply)
     except (TypeError, ValueError):
         lsb_mv = np.nan
     if not 0.01 <= lsb_mv <= 100:
-        raise DeviceFailed(f"MaxOne: expected the converter's step in mV, got {told!r}: is the device connected?")
+        raise DeviceFailed(f"MaxOne: expected the converter's step in mV, got {reply!r}: is the device connected?")
     return lsb_mv
 
 
 def _groups(stimuli: Sequence[Stimulus], sequence_s: float) -> list[list[Stimulus]]:
-    """Stimuli that one sequence holds, in the order of time."""
+    """The stimuli of each sequence, in order of time."""
     groups: list[list[Stimulus]] = []
     for stimulus in stimuli:
         if groups and stimulus.time_s - groups[-1][0].time_s < sequence_s:

@@ -15,7 +15,7 @@ from animat.stimulation.stimulus import Stimulus
 FRAMES_PER_S = 20_000
 SAMPLE_US = 50.0
 INITIAL_DELAY = 100
-"""Samples (5 ms) before the first command of a sequence, in which all of it arrives: its times are then exact."""
+"""Samples (5 ms) before the first command of a sequence, in which all of it arrives, so that its times are exact."""
 ZERO_CODE = 512
 WELL = 0
 EVENT_TYPE = 1
@@ -23,7 +23,7 @@ MOST_KEPT = 1000
 
 
 def dac_code(amplitude_mv: float, lsb_mv: float) -> int:
-    """The converter's 10-bit code of a voltage: 512 is 0 V, and less is *positive*, as the units invert.
+    """The converter's 10-bit code of a voltage: 512 is 0 V, and lower codes are *positive*, as the units invert.
 
     code = 512 - round(V / lsb)
     """
@@ -31,9 +31,9 @@ def dac_code(amplitude_mv: float, lsb_mv: float) -> int:
 
 
 class Sequences:
-    """Makes sequences of stimuli, and keeps one on the device for each pattern and pulse that came alone.
+    """Builds sequences of stimuli, and keeps one on the device for each pattern and pulse delivered singly.
 
-    Trains are not put together from kept sequences: times between two sequences are the computer's, and not exact.
+    Trains are not assembled from kept sequences, as intervals between sequences depend on the computer and are inexact.
 
     Args:
         mx: the vendor's module.
@@ -49,9 +49,9 @@ class Sequences:
         self._event = 0
 
     def of(self, stimuli: Sequence[Stimulus]) -> Any:
-        """A sequence that delivers these stimuli, the first one `INITIAL_DELAY` samples after it was sent."""
+        """A sequence that delivers these stimuli, the first `INITIAL_DELAY` samples after sending."""
         if len(stimuli) > 1:
-            # Gone from the device when nothing refers to it any more: one delivery back nothing of it is under way.
+            # A sequence leaves the device with its last reference; those of earlier deliveries are no longer running.
             self._passing = self._passing[-100:]
             sequence = self._new(persistent=False)
             self._append_all(sequence, stimuli)
@@ -67,9 +67,9 @@ class Sequences:
         return self._kept[key]
 
     def delete(self) -> None:
-        """Take all of them off the device."""
+        """Remove all of them from the device."""
         for sequence in self._kept.values():
-            # The vendor's module removes a sequence with its object, unless it was told to keep it.
+            # The vendor's module removes a sequence with its object, unless it is persistent.
             sequence.persistent = False
         self._kept.clear()
         self._passing.clear()
@@ -87,10 +87,10 @@ class Sequences:
             at = begins + self._append(sequence, stimulus, is_kept=len(stimuli) == 1)
 
     def _append(self, sequence: Any, stimulus: Stimulus, *, is_kept: bool) -> int:
-        """One stimulus; returns the samples it lasts."""
+        """Append one stimulus; returns its duration in samples."""
         mx, units = self._mx, [self._unit_of[electrode] for electrode in stimulus.electrodes]
         self._event += 1
-        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_words(stimulus, is_kept=is_kept))))
+        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_event_data(stimulus, is_kept=is_kept))))
         for unit in units:
             sequence.append(mx.StimulationUnit(unit).power_up(True).connect(True).set_voltage_mode().dac_source(0))
         lasted = 0
@@ -106,13 +106,13 @@ class Sequences:
         return lasted
 
 
-def _words(stimulus: Stimulus, *, is_kept: bool) -> dict[str, Any]:
-    """What the device's file is told of a stimulus; a sequence that is kept cannot know when it will be used."""
-    words: dict[str, Any] = {"electrodes": list(stimulus.electrodes)}
+def _event_data(stimulus: Stimulus, *, is_kept: bool) -> dict[str, Any]:
+    """Data of a stimulus for the device's file; a kept sequence has none that differ between its uses."""
+    data: dict[str, Any] = {"electrodes": list(stimulus.electrodes)}
     if stimulus.pattern >= 0:
-        words["pattern"] = stimulus.pattern
+        data["pattern"] = stimulus.pattern
     if not is_kept:
-        words["presentation"] = stimulus.presentation
+        data["presentation"] = stimulus.presentation
         if np.isfinite(stimulus.frequency_hz):
-            words["frequency_hz"] = stimulus.frequency_hz
-    return words
+            data["frequency_hz"] = stimulus.frequency_hz
+    return data

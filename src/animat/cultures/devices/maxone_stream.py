@@ -1,4 +1,4 @@
-"""Spikes of a MaxOne as they come: what the driver needs of a stream, and the stream of the vendor's server."""
+"""Live spikes of a MaxOne: the interface that the driver needs, and the stream of the vendor's server."""
 
 from __future__ import annotations
 
@@ -10,54 +10,54 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Int64
 
-from animat.cultures.failing import in_words
+from animat.cultures.failures import describe_error
 from animat.errors import DeviceFailed
 
 ADDRESS = "tcp://localhost:7205"
-"""The filtered stream, in which the server detects spikes: one message a frame."""
+"""The filtered stream, in which the server detects spikes: one message per frame."""
 PATIENCE_S = 2.0
 KEPT_SPIKES = 5_000_000
 AMPLIFIERS = 1024
 NEAR_FRAMES = 20_000
-"""How far the frame of a spike may be from that of its message, a second: read by a wrong layout it is anywhere."""
+"""Largest distance of a spike's frame from its message's, a second: read with the wrong layout it is anywhere."""
 FRAME = np.dtype("<u8")
 EVENT_24 = np.dtype([("pad", "V7"), ("well", "u1"), ("frame", "<u8"), ("channel", "<i4"), ("amplitude", "<f4")])
 EVENT_16 = np.dtype([("frame", "<u8"), ("amplitude", "<f4"), ("channel", "<u2"), ("well", "u1"), ("pad", "V1")])
-"""A spike in the servers of version 24.1; in others, as far as is known, it is the other one: a message tells which."""
+"""A spike in servers of version 24.1; other versions, as far as known, use the other layout. Messages show which."""
 
 
 class SpikeStream(Protocol):
-    """Frames of 50 us that pass, and the spikes in them; channels are amplifiers."""
+    """Frames of 50 us and their spikes; channels are amplifiers."""
 
     def start(self) -> None:
-        """Begin to listen; returns when the first frame came."""
+        """Begin to listen; returns after the first frame."""
 
     def stop(self) -> None:
-        """Listen no more; also when it was not started."""
+        """Stop listening; may be called without `start`."""
 
     def frame(self) -> int:
-        """The number of the newest frame that came."""
+        """The number of the newest frame received."""
 
     def wait(self, frame: int) -> None:
-        """Return when that frame has come, at once if it is over.
+        """Return when that frame has been received, immediately if it is past.
 
         Raises:
-            DeviceFailed: when no frame comes any more.
+            DeviceFailed: if no more frames come.
         """
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-        """Frames and channels of the spikes with start <= frame < stop; what lies before is forgotten."""
+        """Frames and channels of the spikes with start <= frame < stop; earlier ones are discarded."""
 
     def forget(self, before: int) -> None:
-        """Let go of spikes before a frame."""
+        """Discard spikes before a frame."""
 
 
 class ZmqSpikes:
     """The stream of MaxLab Live's server through ZeroMQ (the package pyzmq), read by a thread.
 
-    A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame. How
-    spikes are laid out depends on the server's version, and is seen from them: their frames are near the message's.
-    Frames that were lost on the way are counted in `lost_frames`.
+    A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame. The
+    layout of spikes depends on the server's version, and is recognised by frames near the message's. Frames lost in
+    transmission are counted in `lost_frames`.
 
     Args:
         address: of the server.
@@ -79,7 +79,7 @@ class ZmqSpikes:
             import zmq
         except ImportError as error:
             raise DeviceFailed(
-                "zmq: expected the package pyzmq to hear a MaxOne, got none: pip install pyzmq"
+                "zmq: expected the package pyzmq to read a MaxOne, got none: pip install pyzmq"
             ) from error
         self._frame, self._failed, self.lost_frames = -1, None, 0
         self._spikes.clear()
@@ -99,24 +99,24 @@ class ZmqSpikes:
         return self._frame
 
     def wait(self, frame: int) -> None:
-        """Sleep until it came, in pieces of a tenth of a millisecond."""
+        """Poll every tenth of a millisecond."""
         while self._frame < frame:
             failed = self._failed
             if isinstance(failed, DeviceFailed):
                 raise DeviceFailed(str(failed)) from failed
             if failed is not None or time.monotonic() - self._came_s > PATIENCE_S:
-                got = "none any more" if failed is None else in_words(failed)
-                # Nobody says that a connection is lost that only listens: it is silent.
+                got = f"none for {PATIENCE_S:g} s" if failed is None else describe_error(failed)
+                # ZeroMQ does not report a lost connection to a subscriber: it just falls silent.
                 raise DeviceFailed(
                     f"MaxOne: expected frames from {self._address}, got {got}: is MaxLab Live's server running?"
                 ) from (failed or ConnectionError(f"nothing came for {PATIENCE_S:g} s"))
             time.sleep(1e-4)
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-        # All that came, as it need not come in order; the listener may add to it meanwhile.
-        came = [self._spikes.popleft() for _ in range(len(self._spikes))]
-        self._spikes.extendleft(spike for spike in reversed(came) if spike[0] >= stop)
-        table = np.array([spike for spike in came if start <= spike[0] < stop], dtype=np.int64).reshape(-1, 2)
+        # Check all spikes, as they may be out of order; the listener may add some meanwhile.
+        spikes = [self._spikes.popleft() for _ in range(len(self._spikes))]
+        self._spikes.extendleft(spike for spike in reversed(spikes) if spike[0] >= stop)
+        table = np.array([spike for spike in spikes if start <= spike[0] < stop], dtype=np.int64).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
     def forget(self, before: int) -> None:
@@ -141,10 +141,10 @@ class ZmqSpikes:
             self._failed = error
 
     def hear(self, parts: list[bytes]) -> None:
-        """Take in one message.
+        """Process one message.
 
         Raises:
-            DeviceFailed: for one that is laid out as in no version that is known.
+            DeviceFailed: for a layout of no known version.
         """
         if len(parts[0]) != FRAME.itemsize:
             raise DeviceFailed(f"MaxOne: expected a frame's number in 8 bytes, got {len(parts[0])}")
@@ -156,18 +156,18 @@ class ZmqSpikes:
         self._frame, self._came_s = number, time.monotonic()
 
     def _read(self, spikes: bytes, number: int) -> list[tuple[int, int]]:
-        """Frames and channels of a message's spikes, by the layout that they have."""
+        """Frames and channels of a message's spikes, by the layout that fits."""
         for place, layout in enumerate(self._layouts):
             if len(spikes) % layout.itemsize:
                 continue
             table = np.frombuffer(spikes, layout)
             read = list(zip(table["frame"].tolist(), table["channel"].tolist(), strict=True))
             if all(abs(frame - number) <= NEAR_FRAMES and 0 <= channel < AMPLIFIERS for frame, channel in read):
-                # The next message is of the same server.
+                # Later messages are from the same server: try this layout first.
                 self._layouts.insert(0, self._layouts.pop(place))
                 return read
         raise DeviceFailed(
             f"MaxOne: expected the spikes of frame {number} on amplifiers 0 to {AMPLIFIERS - 1}, of 24 or 16 bytes "
-            f"each, got {len(spikes)} bytes that are neither: this version of MaxLab Live is not known; hand over a "
-            "stream of your own"
+            f"each, got {len(spikes)} bytes that are neither: this version of MaxLab Live is not known; pass your "
+            "own stream"
         )

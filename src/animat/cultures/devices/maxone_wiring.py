@@ -1,4 +1,4 @@
-"""How electrodes of a MaxOne are wired to amplifiers and stimulation units; checks that the device does not make."""
+"""How electrodes of a MaxOne are wired to amplifiers and stimulation units, with checks that the device omits."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ UNITS = 32
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """What is wired.
+    """The wiring of a selection.
 
     Attributes:
         channels: recording electrodes that were routed.
-        row_of: row of `channels` of each amplifier, -1 where it has none.
-        not_routed: recording electrodes that were asked for and not routed.
+        row_of: row of `channels` for each amplifier, -1 if it has none.
+        not_routed: recording electrodes that were selected but not routed.
         unit_of: stimulation unit of each stimulation electrode.
     """
 
@@ -36,11 +36,11 @@ class Wiring:
 
 
 def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wiring:
-    """Route, connect, check, download, and compensate offsets; the units are left powered and not connected.
+    """Route, connect, check, download, and compensate offsets; the units are left powered but not connected.
 
     Args:
         mx: the vendor's module, initialised.
-        wait: called with the name of the time that the vendor says to wait after a step.
+        wait: called after a step with the vendor's name of the waiting time.
 
     Raises:
         DeviceFailed: naming the stimulation electrodes that were not routed, have no unit, or share one.
@@ -57,7 +57,7 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
     if lost:
         raise DeviceFailed(
             f"MaxOne: expected all {len(stimulation)} stimulation electrodes to be routed, but not {_named(lost)}: "
-            "choose others beside them, or fewer recording electrodes"
+            "choose others nearby, or fewer recording electrodes"
         )
     unit_of = _connect(array, stimulation)
     array.download()
@@ -87,7 +87,7 @@ def _routed(array: Any) -> dict[int, int]:
         amplifier, electrode = int(mapping.channel), int(mapping.electrode)
         if not 0 <= amplifier < AMPLIFIERS:
             raise DeviceFailed(f"MaxOne: expected amplifiers from 0 to {AMPLIFIERS - 1}, got {amplifier}")
-        # Some versions name an amplifier twice: what it then reads is not known.
+        # Some versions list an amplifier twice: which electrode it then reads is unknown.
         if amplifier in taken:
             amplifier_of = {e: a for e, a in amplifier_of.items() if a != amplifier}
         else:
@@ -97,29 +97,29 @@ def _routed(array: Any) -> dict[int, int]:
 
 
 def _connect(array: Any, electrodes: list[int]) -> dict[int, int]:
-    """Give each electrode a unit of its own, or say which have none and which share one."""
+    """Connect each electrode to a separate unit; raises DeviceFailed if some have none or share one."""
     unit_of: dict[int, int] = {}
     without, shared = [], []
     for electrode in electrodes:
         array.connect_electrode_to_stimulation(electrode)
-        told = str(array.query_stimulation_at_electrode(electrode)).strip()
-        if not told.isdigit() or int(told) >= UNITS:
+        reply = str(array.query_stimulation_at_electrode(electrode)).strip()
+        if not reply.isdigit() or int(reply) >= UNITS:
             without.append(electrode)
             continue
-        other = next((e for e, unit in unit_of.items() if unit == int(told)), None)
+        other = next((e for e, unit in unit_of.items() if unit == int(reply)), None)
         if other is None:
-            unit_of[electrode] = int(told)
+            unit_of[electrode] = int(reply)
         else:
-            shared.append(f"electrodes {other} and {electrode} share unit {told}")
+            shared.append(f"electrodes {other} and {electrode} share unit {reply}")
     if without:
         raise DeviceFailed(
             f"MaxOne: expected a stimulation unit for each stimulation electrode, but there is none for "
-            f"{_named(without)}: choose others beside them"
+            f"{_named(without)}: choose others nearby"
         )
     if shared:
         raise DeviceFailed(
-            f"MaxOne: expected a stimulation unit of its own for each stimulation electrode, but {'; '.join(shared)}: "
-            "choose another beside one of each"
+            f"MaxOne: expected a separate stimulation unit for each stimulation electrode, but {'; '.join(shared)}: "
+            "choose another near one of each pair"
         )
     return unit_of
 

@@ -1,4 +1,4 @@
-"""The virtual culture's living matter: a spiking network that can be stimulated and grows tired, in compiled steps."""
+"""The tissue of the virtual culture: a spiking network that can be stimulated and tires, in compiled steps."""
 
 from animat.cultures.tissue.coupling import Pulse
 from animat.cultures.tissue.parameters import ShortTerm, TissueParameters

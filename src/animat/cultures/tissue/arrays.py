@@ -1,4 +1,4 @@
-"""What the stepping loop works on: constants, wiring, state, and what is under way, as plain arrays."""
+"""Data of the stepping loop as plain arrays: constants, wiring, state, and arrivals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
 
 
 class Constants(NamedTuple):
-    """Numbers that hold for all neurons; factors are per time step, conductances in units of the leak."""
+    """Numbers common to all neurons; factors are per time step, conductances in units of the leak."""
 
     block: Float32[np.ndarray, " coefficients"]  # B(V) = b0 + b1 y + ... + b9 y^9
     block_middle_mv: np.float32  # y = (V - middle) / half, between -1 and 1
@@ -24,12 +24,12 @@ class Constants(NamedTuple):
     lose_gaba: np.float32
     lose_potassium: np.float32
     lose_adaptation: np.float32
-    keep_noise: np.float32  # over `NOISE_STEPS`, as the next
+    keep_noise: np.float32  # over `NOISE_STEPS`, like the next
     noise_scale_mv: np.float32
-    keep_shared: np.float32  # over `SHARED_STEPS`, as the next
+    keep_shared: np.float32  # over `SHARED_STEPS`, like the next
     shared_scale_mv: np.float32
     nmda_saturation: np.float32
-    nmda_fill: np.float32  # share of what is missing to saturation that a unit of AMPA adds
+    nmda_fill: np.float32  # share of the gap to saturation that a unit of AMPA fills
     hyperpolarisation: np.float32
     adaptation_mv: np.float32
     step_s: float
@@ -38,7 +38,7 @@ class Constants(NamedTuple):
     facilitation_s: Float64[np.ndarray, "from_type to_type"]
     availability_loss: float
     availability_s: float
-    scaling_loss: float  # of all weights, by one spike of one neuron
+    scaling_loss: float  # share of all weights lost per spike of one neuron
     scaling_rest: float
     scaling_recovery_s: float
     load_gain: float
@@ -49,7 +49,7 @@ class Constants(NamedTuple):
 
 
 class Wiring(NamedTuple):
-    """What each neuron is, and its synapses; see `Network`."""
+    """Properties of each neuron, and its synapses; see `Network`."""
 
     step_over_membrane: Float32[np.ndarray, " neurons"]
     refractory_steps: Int32[np.ndarray, " neurons"]
@@ -66,13 +66,13 @@ class Wiring(NamedTuple):
 
 
 class State(NamedTuple):
-    """All that changes. Columns of `x` and `u` are towards excitatory and towards inhibitory neurons.
+    """Everything that changes. Columns of `x` and `u` are for excitatory and for inhibitory targets.
 
-    `drive` is the noisy drive, `shared` what its mean has from the community, in mV; `refractory` the steps left;
-    `arriving_*` a ring of what is under way, one row a step: for AMPA and GABA conductance, for NMDA the share of what
-    is missing to saturation that will be filled; `x`, `u` and `available` are as they were just after each neuron's
-    last spike, `scaling` just after the last spike of any excitatory neuron, `load` and `missing` (what conduction
-    lacks) after the last that a stimulus brought on the axon.
+    `drive` is the noisy drive, `shared` the community's contribution to its mean, in mV; `refractory` the steps left;
+    `arriving_*` a ring buffer of future arrivals, one row per step: conductance for AMPA and GABA, for NMDA the share
+    of the gap to saturation that will be filled. `x`, `u` and `available` are values just after each neuron's last
+    spike, `scaling` just after the last spike of any excitatory neuron, `load` and `missing` (the share that conduction
+    lacks) just after the last spike that a stimulus started in the axon.
     """
 
     v_mv: Float32[np.ndarray, " neurons"]
@@ -99,10 +99,10 @@ class State(NamedTuple):
 
 
 class Arrivals(NamedTuple):
-    """Which places of the rings are not empty: a step looks at these alone, as most are.
+    """The non-empty places of the rings. Most are empty, so a step looks only at these.
 
-    The first axis is excitation (AMPA and NMDA arrive together) and inhibition; the targets of a row stand in its
-    first `filled`, each once.
+    The first axis is excitation (AMPA and NMDA arrive together) and inhibition; the first `filled` entries of a row are
+    its targets, each once.
     """
 
     filled: Int32[np.ndarray, "2 ring"]
@@ -110,14 +110,14 @@ class Arrivals(NamedTuple):
 
 
 def arrivals_of(state: State) -> Arrivals:
-    """What a state's rings hold."""
+    """The arrivals in a state's rings."""
     is_arriving = np.stack([state.arriving_ampa, state.arriving_gaba]) != 0
     targets_first = np.argsort(~is_arriving, axis=2, kind="stable")
     return Arrivals(is_arriving.sum(2, dtype=np.int32), targets_first.astype(np.int32))
 
 
-def packed(constants: Constants) -> Shaped[np.ndarray, " 1"]:
-    """The constants as one record with the same names: a call takes a tuple of 34 values apart one by one, 3 us."""
+def pack(constants: Constants) -> Shaped[np.ndarray, " 1"]:
+    """The constants as one record with the same names: unpacking a tuple of 34 values takes 3 us in each call."""
     values = {name: np.asarray(value) for name, value in constants._asdict().items()}
     record = np.zeros(1, np.dtype([(name, value.dtype, value.shape) for name, value in values.items()], align=True))
     for name, value in values.items():

@@ -1,4 +1,4 @@
-"""What an electrode's pulse reaches: neurons near it, and neurons whose axons pass by."""
+"""What an electrode's pulse reaches: neurons near it, and neurons whose axons pass it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument
 
 SMALLEST_KICK_MV = 0.5
-"""Kicks below this are left out: they change no spike that noise does not."""
+"""Smaller kicks are left out: they are negligible next to the noise."""
 REMEMBERED_PATTERNS = 10_000
 
 LARGEST_STRENGTH = 2.0
-"""Pulses up to twice the full one are modelled."""
+"""Pulses up to twice the full strength are modelled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Pulse:
             object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=np.float64)))
         if self.x_um.shape != self.y_um.shape or self.x_um.ndim != 1:
             raise InvalidArgument(
-                f"x_um, y_um: expected one position an electrode, got shapes {self.x_um.shape} and {self.y_um.shape}"
+                f"x_um, y_um: expected one position per electrode, got shapes {self.x_um.shape} and {self.y_um.shape}"
             )
         if not 0 <= self.strength <= LARGEST_STRENGTH:
             raise InvalidArgument(
@@ -54,12 +54,12 @@ class Pulse:
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """What a full pulse reaches on its electrodes; a neuron is listed once for each electrode that reaches it.
+    """What a pulse reaches on its electrodes; a neuron is listed once for each electrode that reaches it.
 
     Attributes:
-        near, kick_mv: neurons near an electrode, and the depolarisation of each, shape (near,).
-        axons, axon_rank, axon_latency_ms, axon_key: neurons whose axons may pass an electrode; a pulse of strength s
-            reaches those with rank below s; the latency of each; the key of its random draws; shape (axons,).
+        near, kick_mv: neurons near an electrode, and the depolarisation of each by a full pulse, shape (near,).
+        axons, axon_rank, axon_latency_ms, axon_key: neurons whose axons may pass an electrode, their ranks (a pulse of
+            strength s reaches those below s), latencies, and keys of their random draws, shape (axons,).
     """
 
     near: Int64[np.ndarray, " near"]
@@ -71,7 +71,7 @@ class Reach:
 
 
 class Kicks(NamedTuple):
-    """Kicks to neurons: at which step, which neuron, by how much; shape (kicks,) each."""
+    """Kicks: step, neuron and depolarisation of each; shape (kicks,)."""
 
     step: Int64[np.ndarray, " kicks"]
     neuron: Int64[np.ndarray, " kicks"]
@@ -81,9 +81,9 @@ class Kicks(NamedTuple):
 class Coupling:
     """The coupling of electrodes to a network, fixed by the seed and the electrodes' positions.
 
-    A neuron at distance d is kicked by `kick_mv` f / (1 + (d / `kick_reach_um`)^2), with f its own log-normal factor;
-    its axon passes the electrode with a probability in proportion to exp(-d / `axon_reach_um`), scaled so that an
-    electrode meets `axons_per_electrode` axons on average.
+    A neuron at distance d is kicked by `kick_mv` f / (1 + (d / `kick_reach_um`)^2), with f its own log-normal factor.
+    Its axon passes the electrode with a probability in proportion to exp(-d / `axon_reach_um`), scaled so that an
+    electrode reaches `axons_per_electrode` axons on average.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters, network: Network) -> None:
@@ -95,22 +95,22 @@ class Coupling:
         self._patterns: dict[tuple[tuple[int, int], ...], Reach] = {}
 
     def reach(self, x_um: Float64[np.ndarray, " electrodes"], y_um: Float64[np.ndarray, " electrodes"]) -> Reach:
-        """What a full pulse on the electrodes at (x, y) reaches; positions are told apart to 0.1 micrometres."""
+        """What a pulse on the electrodes at (x, y) reaches; positions are distinguished to 0.1 um."""
         places = tuple((round(10 * x), round(10 * y)) for x, y in zip(x_um.tolist(), y_um.tolist(), strict=True))
         if places not in self._patterns:
-            each = [self._reach_of_one(place) for place in places]
+            reaches = [self._reach_of_one(place) for place in places]
             if len(self._patterns) >= REMEMBERED_PATTERNS:
                 self._patterns.clear()
             self._patterns[places] = Reach(
-                **{f.name: np.concatenate([getattr(reach, f.name) for reach in each]) for f in fields(Reach)}
+                **{f.name: np.concatenate([getattr(reach, f.name) for reach in reaches]) for f in fields(Reach)}
             )
         return self._patterns[places]
 
     def kicks(self, pulse: Pulse, pulse_step: int) -> Kicks:
-        """The kicks that a pulse at `pulse_step` gives, in no order.
+        """The kicks of a pulse at `pulse_step`, in no particular order.
 
-        An axonal spike passes with `axon_reliability` and arrives after its fixed latency and a jitter; both draws are
-        functions of the pulse's step, so they do not depend on how time is cut.
+        An axonal spike occurs with probability `axon_reliability` and arrives after a fixed latency and a jitter. Both
+        draws are functions of the pulse's step, so they do not depend on how time is divided.
         """
         parameters = self._parameters
         if len(pulse.x_um) == 0:
@@ -147,7 +147,7 @@ class Coupling:
 
 
 def in_order(*kicks: Kicks) -> Kicks:
-    """All the kicks given, in the order of their steps; those of one step stay in the order given."""
+    """All kicks in order of their steps; those of one step keep their order."""
     step, neuron, mv = (np.concatenate(column) for column in zip(*kicks, strict=True))
     order = np.argsort(step, kind="stable")
     return Kicks(step[order], neuron[order], mv[order])

@@ -1,4 +1,4 @@
-"""The slow drift of excitation over hours, which nothing that the culture does brings about."""
+"""The slow drift of excitation over hours, independent of the culture's activity."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from animat.cultures.tissue.parameters import TissueParameters
 
 MARK_S = 10
-"""Excitation is constant between marks of the tissue's clock, so that it does not depend on how time is cut."""
+"""Excitation is constant between marks of the tissue's clock, so it does not depend on how time is divided."""
 
 
 class Drift:
@@ -15,7 +15,7 @@ class Drift:
 
     Args:
         seed: decides the drift.
-        parameters: `drift_share`, `drift_min` of o.
+        parameters: with `drift_share` and `drift_min` of o.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters) -> None:
@@ -25,8 +25,8 @@ class Drift:
         self._drifts = [0.0]
 
     def gain(self, mark: int) -> float:
-        """The factor on all excitatory weights from `mark` to the next, marks being `MARK_S` apart."""
-        # Every mark takes one draw, in order: the drift is one function of time, however time is passed.
+        """The factor on all excitatory weights from `mark` to the next, `MARK_S` later."""
+        # One draw per mark, in order: the drift is the same function of time, however time is divided.
         for draw in self._draws.standard_normal(max(0, mark + 1 - len(self._drifts))).tolist():
             self._drifts.append(self._drifts[-1] * self._kept + self._spread * draw)
         return max(0.0, 1 + self._drifts[mark])

@@ -1,8 +1,8 @@
 """The stepping loop of the virtual tissue, compiled.
 
-No fast mathematics: every operation is rounded as written, so the same state gives the same spikes bit for bit however
-many steps a call takes and however wide the processor's vectors are. The loops over neurons are short and each writes
-few arrays, because that is what the compiler turns into vector code.
+No fast-math: every operation is rounded as written, so the same state gives the same spikes bit for bit, however many
+steps a call takes and however wide the processor's vectors are. The loops over neurons are short and each writes few
+arrays, because the compiler vectorises such loops.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ ORDER = (
     "arriving_gaba last_spike x u available scaling last_scaled load missing last_driven",
     "filled target",
 )
-"""Of the arrays of `Wiring`, `State` and `Arrivals`. Numba keeps the compiled loop by the date of this file alone: what
-is changed there must be changed here too (a test holds them together)."""
+"""Arrays of `Wiring`, `State` and `Arrivals`. Numba caches the compiled loop by the date of this file alone,
+so changes there belong here too (a test compares them)."""
 
 f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
 FAINT = f4(1e-20)
-"""Added at every decay, so that silence ends at about 1e-17 and never at subnormal numbers, which are slow."""
+"""Added at every decay, so that values level off at about 1e-17 and never become subnormal, which is slow."""
 AXONAL_KICK_MV = f4(1000.0)
-"""A spike that arrives along the axon brings the soma over any threshold."""
+"""A spike that arrives along the axon takes the soma over any threshold."""
 NOISE_STEPS = 5
-"""How often a neuron's noise moves: 1 ms, well below its time constant."""
+"""Interval between updates of a neuron's noise: 1 ms, well below its time constant."""
 SHARED_STEPS = 25
-"""How often the noise that a community shares moves: it is slow."""
+"""Interval between updates of the slow noise that a community shares."""
 STRETCH = 128
 SUM_OF_FOUR_MEAN = f4(2 * 65535)
 SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
@@ -43,8 +43,7 @@ SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 
 
 compiled = kept_njit(error_model="numpy", fastmath=False)
-# Without inlining, every call copies the description of every array of its arguments; and each would be compiled for
-# itself, too.
+# Without inlining, every call would copy the descriptors of all its arrays, and every function be compiled separately.
 inlined = numba.njit(error_model="numpy", inline="always")
 
 
@@ -59,13 +58,13 @@ def mixed(key: np.uint64, step: int) -> np.uint64:
 
 @inlined
 def uniform(bits: np.uint64) -> float:
-    """A number from 0 to before 1, of the upper 53 bits."""
+    """A number in [0, 1) from the upper 53 bits."""
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @inlined
 def sum_of_four(bits: np.uint64) -> np.float32:
-    """The sum of the four 16-bit integers in 64 bits, less its mean: nearly normal (excess kurtosis -0.3)."""
+    """The sum of the four 16-bit integers in 64 bits, minus its mean: nearly normal (excess kurtosis -0.3)."""
     low = np.uint64(0xFFFF)
     total = (bits & low) + ((bits >> np.uint64(16)) & low) + ((bits >> np.uint64(32)) & low) + (bits >> np.uint64(48))
     return f4(np.int32(total)) - SUM_OF_FOUR_MEAN
@@ -84,7 +83,7 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
     for i in range(v_mv.size):
         v = v_mv[i]
         y = min(max((v - middle_mv) * per_mv, -ONE), ONE)
-        # Estrin's scheme: its products do not wait for each other as Horner's do.
+        # Estrin's scheme: unlike Horner's, its products do not depend on one another.
         y2 = y * y
         y4 = y2 * y2
         low = (b0 + b1 * y) + (b2 + b3 * y) * y2
@@ -93,7 +92,7 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
         total = ONE + ampa[i] + nmda[i] * unblocked + gaba[i] + potassium[i]
         current = leak_mv + drive_mv[i] + gaba[i] * gaba_mv + potassium[i] * potassium_mv - total * v
         z = total * step_over_membrane[i]
-        # Chosen before it is added: a choice of what is stored would be stored through a mask, which is slow.
+        # Select the summand, not the stored value: a conditional store would go through a mask, which is slow.
         change = current * step_over_membrane[i] / (ONE + z * (HALF + z * TWELFTH))
         v_mv[i] = v + (change if refractory[i] == 0 else f4(0.0))
 
@@ -106,7 +105,7 @@ def move_noise(
     key: UInt64[np.ndarray, " neurons"],
     step: int,
 ) -> None:
-    """`NOISE_STEPS` of the Ornstein-Uhlenbeck drive, its noise a function of the neuron and the step alone."""
+    """`NOISE_STEPS` of the Ornstein-Uhlenbeck drive, whose noise depends only on the neuron and the step."""
     keep, scale = constants.keep_noise, constants.noise_scale_mv
     for i in range(drive_mv.size):
         noise_mv = scale * sum_of_four(mixed(key[i], step))
@@ -124,14 +123,14 @@ def move_shared(constants: Constants, wiring: Wiring, state: State, step: int) -
 
 @inlined
 def fill_mean(wiring: Wiring, state: State, mean_mv: Float32[np.ndarray, " neurons"]) -> None:
-    """What each neuron's drive fluctuates about: its own, and what its community shares."""
+    """The mean of each neuron's drive: its own constant drive plus the noise of its community."""
     for i in range(mean_mv.size):
         mean_mv[i] = wiring.drive_mv[i] + state.shared_mv[wiring.community[i]]
 
 
 @inlined
 def decay(values: Float32[np.ndarray, " neurons"], lose: np.float32) -> None:
-    """One step of an exponential decay; single precision holds the small share lost better than what is kept."""
+    """One step of exponential decay; single precision represents the small share lost better than the share kept."""
     for i in range(values.size):
         values[i] = values[i] - values[i] * lose + FAINT
 
@@ -145,7 +144,7 @@ def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
 
 @inlined
 def arrive(constants: Constants, state: State, arrivals: Arrivals, slot: int) -> None:
-    """Add what arrives in this step to the conductances, and empty its row of the ring."""
+    """Add this step's arrivals to the conductances, and empty its row of the rings."""
     to_ampa, to_nmda, to_gaba = state.arriving_ampa[slot], state.arriving_nmda[slot], state.arriving_gaba[slot]
     for place in range(arrivals.filled[0, slot]):
         i = arrivals.target[0, slot, place]
@@ -161,14 +160,14 @@ def arrive(constants: Constants, state: State, arrivals: Arrivals, slot: int) ->
 
 @inlined
 def note(arrivals: Arrivals, kind: int, row: int, target: int) -> None:
-    """Note a place of a ring that is no longer empty."""
+    """Record a place of a ring that is no longer empty."""
     arrivals.target[kind, row, arrivals.filled[kind, row]] = target
     arrivals.filled[kind, row] += 1
 
 
 @inlined
 def over_threshold(constants: Constants, state: State, first: int, last: int) -> np.int32:
-    """How many neurons from `first` to before `last` are over their threshold; refractory ones lie at the reset."""
+    """Number of neurons from `first` up to `last` above threshold; refractory ones are at the reset potential."""
     v_mv, adaptation_mv, threshold_mv = state.v_mv, state.adaptation_mv, constants.threshold_mv
     count = np.int32(0)
     for i in range(first, last):
@@ -178,7 +177,7 @@ def over_threshold(constants: Constants, state: State, first: int, last: int) ->
 
 @inlined
 def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: float) -> float:
-    """What an exponential recovery to `rest` has come to."""
+    """The value after exponential recovery towards `rest`."""
     return rest + (value - rest) * math.exp(-elapsed_s / time_constant_s)
 
 
@@ -193,7 +192,7 @@ def missing_of(constants: Constants, state: State, i: int, step: int) -> float:
 
 @inlined
 def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: int) -> bool:
-    """Whether neuron i's stimulated axon brings its spike to the soma, which loads the axon."""
+    """Whether neuron i's stimulated axon conducts its spike to the soma, which loads the axon."""
     missing = missing_of(constants, state, i, step)
     if uniform(mixed(wiring.axon_key[i], step)) < missing:
         return False
@@ -207,7 +206,7 @@ def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: i
 def fire(
     constants: Constants, wiring: Wiring, state: State, arrivals: Arrivals, i: int, step: int, gain: float
 ) -> None:
-    """Let neuron i spike: release, depress, tire, send along every synapse, reset."""
+    """Let neuron i spike: release, depress, reduce availability, send along every synapse, reset."""
     kind = 0 if i < constants.n_excitatory else 1
     elapsed_s = (step - state.last_spike[i]) * constants.step_s
     state.last_spike[i] = step
@@ -238,7 +237,7 @@ def fire(
             if to_ampa[place] == 0 and arriving != 0:
                 note(arrivals, 0, row, target)
             to_ampa[place] += arriving
-            # Two arrivals in one step fill a share each of what the other leaves: as if one came after the other.
+            # Two arrivals in one step each fill a share of the remaining gap, as if they came one after the other.
             to_nmda[place] += min(constants.nmda_fill * arriving, ONE) * (ONE - to_nmda[place])
     else:
         to_gaba = state.arriving_gaba.ravel()
@@ -259,7 +258,7 @@ def fire(
 
 @inlined
 def release_of(constants: Constants, state: State, i: int, kind: int, towards: int, elapsed_s: float) -> float:
-    """Recover u and x since the last spike, release u x, and leave them as they are after it."""
+    """Recover u and x since the last spike, release u x, and store their values after it."""
     use = constants.use[kind, towards]
     x = recovered(state.x[i, towards], 1.0, elapsed_s, constants.recovery_s[kind, towards])
     u = use
@@ -286,20 +285,20 @@ def advance(
     spike_step: Int64[np.ndarray, " capacity"],
     spike_neuron: Int64[np.ndarray, " capacity"],
 ) -> tuple[int, int, int]:
-    """Advance by up to `n_steps`; stops early where a step's spikes might no longer fit the output.
+    """Advance by up to `n_steps`; stops early when a step's spikes might no longer fit the output.
 
-    A call takes a named tuple apart twice as slowly as a plain one, which shows where a call is 60 steps of 2 us.
+    Unpacking a named tuple takes a call twice as long as a plain one, which matters for calls of 60 steps of 2 us.
 
     Args:
-        record, wires, values, arriving: the tissue, as `packed` constants and plain tuples of `Wiring`, `State` and
+        record, wires, values, arriving: the tissue: constants from `pack`, and plain tuples of `Wiring`, `State` and
             `Arrivals`; the last two are changed in place.
-        first_step, n_steps: the tissue's clock, in steps, and how far to go.
-        gain: factor on excitatory weights over this call.
-        kick_step, kick_neuron, kick_mv: kicks in the order of their steps, none before `first_step`.
-        spike_step, spike_neuron: output, at least as long as there are neurons.
+        first_step, n_steps: the tissue's clock, in steps, and the number of steps.
+        gain: factor on excitatory weights during this call.
+        kick_step, kick_neuron, kick_mv: kicks in order of their steps, none before `first_step`.
+        spike_step, spike_neuron: output, with room for at least one spike per neuron.
 
     Returns:
-        The steps taken, the kicks passed, and the spikes written.
+        The numbers of steps taken, kicks passed, and spikes written.
     """
     constants, wiring, state, arrivals = record[0], Wiring(*wires), State(*values), Arrivals(*arriving)
     n = state.v_mv.size
@@ -331,7 +330,7 @@ def advance(
         decay(state.gaba, constants.lose_gaba)
         decay(state.potassium, constants.lose_potassium)
         decay(state.adaptation_mv, constants.lose_adaptation)
-        # A stretch is counted in vector code, and looked at neuron by neuron only where one of them spikes.
+        # Vector code counts spikes in a stretch, which is scanned neuron by neuron only if there are any.
         for first in range(0, n, STRETCH):
             last = min(first + STRETCH, n)
             if over_threshold(constants, state, first, last) > 0:
@@ -352,7 +351,7 @@ def axonal_draws(
     draw: Float64[np.ndarray, " axons"],
     jitter: Float64[np.ndarray, " axons"],
 ) -> None:
-    """Draws of one pulse at `step`: a uniform and a nearly standard normal number for each axon's key."""
+    """Random draws of a pulse at `step`: a uniform and a nearly standard normal number for each axon's key."""
     for j in range(key.size):
         draw[j] = uniform(mixed(key[j], 2 * step))
         jitter[j] = sum_of_four(mixed(key[j], 2 * step + 1)) / SUM_OF_FOUR_SD

@@ -1,4 +1,4 @@
-"""Where the neurons of a virtual tissue sit, what they are, and how they are connected: all from one seed."""
+"""Positions, types and connections of the neurons of a virtual tissue, from one seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from animat.cultures.tissue.parameters import TissueParameters
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Neurons, excitatory ones first, and synapses: those of neuron i are rows start[i] to start[i + 1], by delay.
+    """Neurons, excitatory ones first, and synapses; those of neuron i are rows start[i] to start[i + 1], by delay.
 
     Attributes:
         x_um, y_um: positions, shape (neurons,).
@@ -20,7 +20,7 @@ class Network:
         community: which patch of the plane each neuron belongs to, shape (neurons,).
         drive_mv: constant drive of each neuron, shape (neurons,).
         start: first synapse of each neuron, and the end of the last, shape (neurons + 1,).
-        target: the neuron a synapse ends on, shape (synapses,).
+        target: postsynaptic neuron of each synapse, shape (synapses,).
         weight: its peak conductance in units of the leak, before release, shape (synapses,).
         delay_steps: its delay, at least one step, shape (synapses,).
     """
@@ -40,7 +40,7 @@ class Network:
 
 
 def grow(seed: int, parameters: TissueParameters) -> Network:
-    """Grow a network: neurons uniform on the array, each with a fixed number of synapses from each type.
+    """Generate a network: neurons uniform on the array, each with a fixed number of synapses from each type.
 
     The probability of a synapse from j to i falls with their distance d as
     s_j c_ij ((1 - a) exp(-d / reach) / Z_i + a / C_i), where a is the long-range share, s_j the log-normal propensity
@@ -69,7 +69,7 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
         far = anywhere / anywhere.sum(axis=1, keepdims=True)
         share = parameters.long_range_share
         chance = sends[first:last] * ((1 - share) * near + share * far)
-        # The largest of log chance + Gumbel noise are a draw without replacement in proportion to the chances.
+        # The largest values of log chance + Gumbel noise are a weighted draw without replacement.
         score = np.log(chance) + rng.gumbel(size=chance.shape)
         own = np.arange(first, last)
         score[own, own - first] = -np.inf
@@ -79,7 +79,7 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
     source, target = np.concatenate(sources), np.concatenate(targets)
     delay_ms = parameters.delay_ms + distance_um[target, source] / parameters.conduction_um_per_ms
     delay_steps = np.maximum(np.rint(delay_ms / parameters.step_ms), 1).astype(np.int32)
-    # Each neuron's synapses by delay: what arrives in one step lies together in memory.
+    # Each neuron's synapses are sorted by delay, so that arrivals of one step are adjacent in memory.
     order = np.lexsort((target, delay_steps, source))
     source, target, delay_steps = source[order], target[order], delay_steps[order]
 
@@ -106,10 +106,10 @@ def _communities(
     y_um: Float64[np.ndarray, " neurons"],
     parameters: TissueParameters,
 ) -> tuple[Int64[np.ndarray, " neurons"], Float64[np.ndarray, " communities"]]:
-    """Each neuron's community, of the nearest centre, and the drive in mV that each community has in addition."""
+    """Each neuron's community, that of the nearest centre, and each community's additional drive in mV."""
     communities = parameters.communities
     size_um = np.array([parameters.width_um, parameters.height_um])
-    # Of many draws the one whose centres keep furthest apart: communities of similar size.
+    # Of many draws, take the one with the centres furthest apart, for communities of similar size.
     drawn = rng.uniform(0, size_um, (200, communities, 2))
     apart_um = np.hypot(*np.moveaxis(drawn[:, :, None] - drawn[:, None], -1, 0))
     apart_um[:, np.arange(communities), np.arange(communities)] = np.inf

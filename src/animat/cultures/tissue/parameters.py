@@ -10,9 +10,9 @@ from animat.errors import InvalidArgument
 from animat.records import Number, Positive, Share, Whole, record
 
 REVISION = 6
-"""Of the tissue's numerics. To be raised by one whenever the same seed, parameters and pulses give other spikes than
-before, whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of
-another revision are then refused, in place of being gone on with as if they were of this tissue."""
+"""Revision of the tissue's numerics. Raise it by one when the same seed, parameters and pulses give different spikes,
+whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of another
+revision are then refused instead of being continued as if they were of this tissue."""
 
 FromZero = Annotated[Number, Field(ge=0)]
 
@@ -38,10 +38,10 @@ class ShortTerm:
 class TissueParameters:
     """The parameters of a virtual tissue; conductances are in units of the leak.
 
-    Marks: [L] from the literature, [C] calibrated so that the figures of `docs/virtual-culture.md` come out.
+    Marks: [L] from the literature, [C] calibrated to reproduce the figures of `docs/virtual-culture.md`.
 
     Raises:
-        InvalidArgument: for a number that is not finite or outside what it may be.
+        InvalidArgument: for a number that is not finite or outside its range.
     """
 
     # Size and place.
@@ -102,7 +102,7 @@ class TissueParameters:
     """[C] Sigma of the log-normal weights."""
     in_degree_e: Whole = 52
     in_degree_i: Whole = 30
-    """[C] Synapses on each neuron, from excitatory and from inhibitory ones."""
+    """[C] Synapses on each neuron, from excitatory and from inhibitory neurons."""
     reach_um: Positive = 220.0
     """[C] A connection's probability falls as exp(-distance / reach)."""
     long_range_share: Share = 0.1
@@ -110,9 +110,9 @@ class TissueParameters:
     out_degree_sigma: Number = 0.4
     """[C] Sigma of the log-normal spread of out-degrees."""
     communities: Annotated[Whole, Field(ge=1)] = 2
-    """[C] Number of communities, each the neurons nearest to one of as many centres."""
+    """[C] Number of communities, each of the neurons nearest to one centre."""
     between_share: Annotated[Share, Field(gt=0)] = 0.035
-    """[C] A connection between communities is this share as likely as one within, at the same distance."""
+    """[C] Likelihood of a connection between communities, relative to one within at the same distance."""
     delay_ms: FromZero = 0.8
     """Delay of a synapse without distance."""
     conduction_um_per_ms: Positive = 500.0
@@ -123,7 +123,7 @@ class TissueParameters:
     drive_spread_mv: Number = 1.8
     """[C] Mean of the constant drive over neurons, and its standard deviation."""
     community_drive_mv: Number = 0.1
-    """[C] Standard deviation over communities of the drive that a community's neurons have in addition: some lead."""
+    """[C] Standard deviation of the additional drive of each community's neurons: some lead."""
     noise_mv: Number = 7.5
     """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: Positive = 5.0
@@ -131,7 +131,7 @@ class TissueParameters:
     shared_noise_mv: Number = 0.6
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
     shared_noise_ms: Positive = 575.0
-    """[C] Its time constant (astrocytes excite neighbours together for about so long: Fellin et al. 2004,
+    """[C] Its time constant (astrocytes excite neighbours together for about as long: Fellin et al. 2004,
     doi 10.1016/j.neuron.2004.08.011)."""
 
     # Stimulation.
@@ -149,7 +149,7 @@ class TissueParameters:
     """[L] Probability that a pulse drives an axon in its reach."""
     axon_latency_ms: FromZero = 0.5
     axon_latency_spread_ms: FromZero = 1.0
-    """[C] Latency: this, conduction, and a share of the spread that is each neuron's own."""
+    """[C] Latency: this, conduction, and a share of the spread specific to each neuron."""
     axon_jitter_ms: FromZero = 0.16
     """[L] Standard deviation of the latency from pulse to pulse."""
     availability_loss: Share = 0.033
@@ -158,7 +158,7 @@ class TissueParameters:
     """[C] Time constant of its recovery (Goldental et al. 2014: failures above a critical frequency)."""
     availability_needed_low: Number = 0.30
     availability_needed_high: Number = 0.55
-    """[C] A pulse drives a neuron only while its availability is above its own draw between these."""
+    """[C] A pulse drives a neuron only while its availability exceeds a threshold drawn between these."""
 
     # What changes over minutes and hours.
     scaling_loss: Share = 3e-5
@@ -166,22 +166,22 @@ class TissueParameters:
     scaling_min: Positive = 120.0
     """[L] Time constant of its recovery (Turrigiano 2008: hours)."""
     scaling_at_hz: FromZero = 0.62
-    """[C] The excitatory neurons' mean rate that scaling holds: loss and recovery then balance at the full weights."""
+    """[C] Mean excitatory rate that scaling maintains, at which loss and recovery balance at full weights."""
     load_gain: Share = 0.08
-    """[C] Share of what is left to 1 that each spike which a stimulus brings along an axon adds to the axon's load."""
+    """[C] Share of the gap between the axon's load and 1 that each spike started in the axon by a stimulus fills."""
     load_min: Positive = 30.0
-    """[C] Time constant with which the load leaves."""
+    """[C] Time constant with which the load decays."""
     conduction_min: Positive = 90.0
     """[C] Time constant with which the share of such spikes that fail follows it (Grubb & Burrone 2010: hours)."""
     output_loss: Share = 1.0
-    """[C] How much of what an excitatory neuron's axon fails to conduct is missing in its output too; 1: all of it."""
+    """[C] Share of an excitatory axon's conduction failures that also reduces its output; 1: all of it."""
     drift_share: Share = 0.03
     drift_min: Positive = 30.0
     """[C] Standard deviation and time constant of the slow drift of all excitatory weights."""
 
     def __post_init__(self) -> None:
         if self.load_min == self.conduction_min:
-            raise InvalidArgument(f"load_min, conduction_min: expected two that differ, got {self.load_min} twice")
+            raise InvalidArgument(f"load_min, conduction_min: expected different values, got {self.load_min} twice")
         for degree, available in (
             (self.in_degree_e, self.n_excitatory),
             (self.in_degree_i, self.neurons - self.n_excitatory),
@@ -194,7 +194,7 @@ class TissueParameters:
 
     @property
     def scaling_rest(self) -> float:
-        """What the scaling recovers to: there, recovery balances the loss at `scaling_at_hz` and full weights."""
+        """Value to which the scaling recovers; recovery then balances the loss at `scaling_at_hz` and full weights."""
         return 1 + self.scaling_loss * self.scaling_at_hz * self.scaling_min * 60
 
     @property

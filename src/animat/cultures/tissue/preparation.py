@@ -1,4 +1,4 @@
-"""From parameters and a network to what the kernel takes: constants per step, wiring, and the state to start from."""
+"""The kernel's input from parameters and a network: constants per step, wiring, and the initial state."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from animat.cultures.tissue.network import Network
 from animat.cultures.tissue.parameters import TissueParameters
 
 BLOCK_MIDDLE_MV, BLOCK_HALF_MV, BLOCK_DEGREE = -60.0, 25.0, 9
-"""Where a polynomial stands for the NMDA block, to 1e-7; outside, its value at the nearer end holds."""
+"""Range in which a polynomial replaces the NMDA block, to 1e-7; beyond it, the value at the nearer end applies."""
 
 
 def prepare_constants(parameters: TissueParameters) -> Constants:
-    """The parameters as the kernel takes them: per step, and in single precision."""
+    """The parameters in the form that the kernel takes: per step, and in single precision."""
     f4, step_ms = np.float32, parameters.step_ms
 
     def lose(time_constant_ms: float) -> np.float32:
@@ -85,7 +85,7 @@ def block_polynomial() -> Float32[np.ndarray, " coefficients"]:
 
 
 def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) -> Wiring:
-    """The network as the kernel takes it, with each neuron's key of its noise and its need of availability."""
+    """The network in the form that the kernel takes, with each neuron's noise key and needed availability."""
     rng = np.random.default_rng([seed, 7])
     is_e, step_ms = network.is_excitatory, parameters.step_ms
     membrane_ms = np.where(is_e, parameters.membrane_e_ms, parameters.membrane_i_ms)
@@ -107,7 +107,7 @@ def prepare_wiring(seed: int, parameters: TissueParameters, network: Network) ->
 
 
 def fresh_state(seed: int, parameters: TissueParameters, network: Network, wiring: Wiring) -> State:
-    """A rested tissue: recovered synapses, no conductances, drive and membrane drawn from a plausible spread."""
+    """A rested tissue: recovered synapses, no conductances, drive and potential drawn from plausible ranges."""
     rng = np.random.default_rng([seed, 8])
     n = len(network)
     drive_mv = wiring.drive_mv + parameters.noise_mv * rng.standard_normal(n)

@@ -1,6 +1,6 @@
-"""A tissue's state at one time, and whether it is one that a tissue can come to.
+"""A tissue's state at one time, and whether a tissue can reach it.
 
-The compiled kernel checks no index and no clock: what it is given must have been checked before.
+The compiled kernel checks no index and no clock: its arguments must have been checked before.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument, shown
 
 LONGEST_NS = 366 * 86_400 * 1_000_000_000
-"""A tissue's clock goes to a year: its slow drift is computed from the start."""
+"""A tissue's clock runs for up to a year: its slow drift is computed from the start."""
 KICKS_WITHIN_NS = 1_000_000_000
-"""Kicks under way arrive within this time: axons are shorter."""
+"""Pending kicks arrive within this time: axons are shorter."""
 LARGEST = 1e6
-"""No potential (mV) and no conductance (in those of the leak) comes near it."""
+"""No potential (mV) and no conductance (in units of the leak) comes near it."""
 _SHARES = ("x", "u", "available", "load", "missing")
 
 
@@ -37,7 +37,7 @@ class Snapshot:
 
 
 def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) -> None:
-    """Refuse a snapshot whose clock, shapes, indices or values are none of a tissue's.
+    """Refuse a snapshot whose clock, shapes, indices or values no tissue can have.
 
     Args:
         snapshot: to be restored.
@@ -46,7 +46,7 @@ def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) 
         step_ns: its time step.
 
     Raises:
-        InvalidArgument: naming the number or the array, what was expected and what came.
+        InvalidArgument: naming the number or the array.
     """
     expect_whole("tissue_now_ns", snapshot.now_ns, 0, LONGEST_NS)
     step = snapshot.now_ns // step_ns
@@ -54,11 +54,11 @@ def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) 
     for name, values in snapshot.state._asdict().items():
         expect_array(name, values, getattr(like, name).dtype, getattr(like, name).shape)
         if values.dtype.kind == "f":
-            # A share is the difference of two: rounding may take it past its end by a last bit.
+            # Rounding may take a share past its limit by a last bit.
             low, high = (-1e-9, 1 + 1e-9) if name in _SHARES else (-LARGEST, LARGEST)
             expect_within(name, values, low, high)
     for name in ("arriving_ampa", "arriving_nmda", "arriving_gaba"):
-        # The kernel notes once what arrives at a neuron: what cancels out would be noted twice.
+        # The kernel records each target once: arrivals that cancel out would be recorded twice.
         expect_within(name, getattr(snapshot.state, name), 0.0, LARGEST)
     alone = (snapshot.state.arriving_nmda > 0) & (snapshot.state.arriving_ampa == 0)
     if alone.any():
@@ -68,7 +68,7 @@ def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) 
     expect_within("refractory", snapshot.state.refractory, 0, int(wiring.refractory_steps.max(initial=0)))
     for name in ("last_spike", "last_scaled", "last_driven"):
         expect_within(name, getattr(snapshot.state, name), 0, step)
-    # A tissue that never spikes comes to its rest, 1.2 with the usual parameters.
+    # A tissue that never spikes approaches the rest value, 1.13 with the default parameters.
     expect_within("scaling", snapshot.state.scaling, 0.0, snapshot.parameters.scaling_rest * (1 + 1e-9))
     for name, values in snapshot.kicks._asdict().items():
         expect_array(f"kicks.{name}", values, np.float32 if name == "mv" else np.int64, (len(snapshot.kicks.step),))
@@ -79,7 +79,7 @@ def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) 
 
 
 def expect_whole(name: str, value: object, low: int, high: int) -> None:
-    """Refuse what is no whole number from `low` to `high`."""
+    """Refuse anything but a whole number from `low` to `high`."""
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
         expected = f"{low}" if low == high else f"a whole number from {low} to {high}"
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(value)}")
@@ -101,6 +101,6 @@ def expect_within(name: str, values: np.ndarray[Any, Any], low: float, high: flo
 
 
 def expect_rising(name: str, values: np.ndarray[Any, Any]) -> None:
-    """Refuse values of which one is less than the one before it."""
+    """Refuse values that are not in ascending order."""
     if np.any(np.diff(values) < 0):
-        raise InvalidArgument(f"{name}: expected values that do not fall, got some that do")
+        raise InvalidArgument(f"{name}: expected values in ascending order, got some that fall")

@@ -1,4 +1,4 @@
-"""A piece of living matter that is simulated: neurons on a plane that spike, can be stimulated, and grow tired."""
+"""A simulated neuronal tissue: neurons on a plane that spike, can be stimulated, and tire."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from animat.cultures.tissue import kernel
-from animat.cultures.tissue.arrays import State, arrivals_of, packed
+from animat.cultures.tissue.arrays import State, arrivals_of, pack
 from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
 from animat.cultures.tissue.drift import MARK_S, Drift
 from animat.cultures.tissue.network import grow
@@ -24,11 +24,11 @@ MINUTE_NS = 60 * NS
 
 
 class Spikes(NamedTuple):
-    """Spikes in the order of time.
+    """Spikes in order of time.
 
     Attributes:
         time_s: on the tissue's clock, shape (spikes,).
-        neuron: which neuron, shape (spikes,).
+        neuron: neuron of each spike, shape (spikes,).
     """
 
     time_s: Float64[np.ndarray, " spikes"]
@@ -39,15 +39,15 @@ NO_SPIKES = Spikes(np.empty(0), np.empty(0, np.int64))
 
 
 class Tissue:
-    """A simulated culture of neurons without electrodes: `docs/virtual-culture.md` holds its equations.
+    """A simulated culture of neurons without electrodes; `docs/virtual-culture.md` has its equations.
 
     Conductance-based leaky integrate-and-fire neurons with Tsodyks-Markram synapses. The same seed, parameters and
-    pulses give the same spikes bit for bit, in whatever pieces time is passed. Positions are in micrometres from the
-    array's corner. Nothing is known here of channels, files or protocols.
+    pulses give the same spikes bit for bit, however time is divided. Positions are in micrometres from the array's
+    corner. Channels, files and protocols are unknown here.
 
     Args:
         seed: decides the network, every draw of noise, and the drift over hours; zero or more.
-        parameters: the model's numbers.
+        parameters: of the model.
 
     Raises:
         InvalidArgument: for a negative seed.
@@ -61,9 +61,9 @@ class Tissue:
         self._network = grow(seed, self.parameters)
         self._coupling = Coupling(seed, self.parameters, self._network)
         self._drift = Drift(seed, self.parameters)
-        self._constants = packed(prepare_constants(self.parameters))
+        self._constants = pack(prepare_constants(self.parameters))
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
-        self._have(fresh_state(seed, self.parameters, self._network, self._wiring))
+        self._adopt(fresh_state(seed, self.parameters, self._network, self._wiring))
         self._step_ns = round(self.parameters.step_ms * 1e6)
         self._step_s = self._step_ns / NS
         self._now_ns = 0
@@ -75,7 +75,7 @@ class Tissue:
 
     @property
     def now_s(self) -> float:
-        """The tissue's clock: what has been advanced and rested since it was made."""
+        """The tissue's clock: the time advanced and rested since its creation."""
         return self._now_ns / NS
 
     @property
@@ -96,15 +96,15 @@ class Tissue:
     def advance(self, duration_s: float, pulses: Sequence[Pulse] = ()) -> Spikes:
         """Let time pass, stimulate meanwhile, and return the spikes.
 
-        Time is kept to a nanosecond and stepped as far as whole steps fit, so a second in eighty pieces of 12.5 ms is
-        the same as in one. A pulse takes effect at the first step that does not begin before it.
+        The clock counts nanoseconds and the model runs all steps that are complete, so a second in eighty pieces of
+        12.5 ms is the same as in one. A pulse acts at the first step that does not begin before it.
 
         Args:
             duration_s: how long, zero or more.
-            pulses: pulses whose times lie in [now_s, now_s + duration_s), in any order.
+            pulses: with times in [now_s, now_s + duration_s), in any order.
 
         Raises:
-            InvalidArgument: for a negative duration, or a pulse outside this stretch of time; nothing has then passed.
+            InvalidArgument: for a negative duration, or a pulse outside this stretch of time; no time has then passed.
         """
         end_ns = self._now_ns + _nanoseconds(duration_s)
         if pulses:
@@ -129,11 +129,11 @@ class Tissue:
             if passed:
                 self._kicks = Kicks(*(column[passed:] for column in self._kicks))
             parts.append(Spikes(self._spike_step[:spikes] * self._step_s, self._spike_neuron[:spikes].copy()))
-        # Mostly one: joining it with nothing costs 1 % of what 12.5 ms do.
+        # Usually one part: concatenating it with nothing would add 1 % to the cost of 12.5 ms.
         return parts[0] if len(parts) == 1 else Spikes(*map(np.concatenate, zip(NO_SPIKES, *parts, strict=True)))
 
     def rest(self, duration_s: float) -> None:
-        """Let time pass as `advance` does and forget the spikes: any length, in the memory of a minute.
+        """Let time pass like `advance`, without keeping the spikes: any duration takes the memory of a minute.
 
         Args:
             duration_s: how long, zero or more.
@@ -146,27 +146,27 @@ class Tissue:
             self.advance(min(end_ns - self._now_ns, MINUTE_NS) / NS)
 
     def snapshot(self) -> Snapshot:
-        """A copy of the state, to come back to."""
+        """A copy of the state, for `restore`."""
         state = State(*(values.copy() for values in self._state))
         return Snapshot(self.seed, self.parameters, self._now_ns, self._step, self._kicks, state)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go back, or on, to a snapshot: what follows is bit for bit what followed it.
+        """Return to a snapshot; from there the tissue continues bit for bit as it did after it.
 
         Raises:
             Mismatch: for a snapshot of another seed or other parameters.
-            InvalidArgument: for numbers that no tissue comes to; nothing has then changed.
+            InvalidArgument: for a state that no tissue can reach; nothing has then changed.
         """
         if (snapshot.seed, snapshot.parameters) != (self.seed, self.parameters):
             raise Mismatch(
-                f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or of "
-                "other parameters: make a tissue with those"
+                f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or with "
+                "other parameters: create a tissue with those"
             )
         expect_sound(snapshot, self._state, self._wiring, self._step_ns)
-        self._have(State(*(values.copy() for values in snapshot.state)))
+        self._adopt(State(*(values.copy() for values in snapshot.state)))
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
 
-    def _have(self, state: State) -> None:
+    def _adopt(self, state: State) -> None:
         self._state = state
         self._run = self._constants, tuple(self._wiring), tuple(state), tuple(arrivals_of(state))
 

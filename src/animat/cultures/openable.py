@@ -1,4 +1,4 @@
-"""Opening and closing what can be stimulated, and stopping it: what a session is."""
+"""Opening, closing and stopping a culture: sessions."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, NoReturn, Self, final
 
-from animat.cultures.failing import as_device_failure
+from animat.cultures.failures import as_device_failure
 from animat.cultures.history import History
-from animat.cultures.holding import held
+from animat.cultures.holding import hold
 from animat.cultures.limits import Limits, plain_limits
 from animat.cultures.safety import Guard
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.stimulation.plain import seconds
 
 _LOOK_S = 0.02
-"""How often whoever waits looks whether an emergency stop ended what it waits for."""
+"""How often a waiting call checks for an emergency stop."""
 
 
 class Turns:
     """The turns of one session: `with turns:` waits until no other thread has one.
 
-    A session ends with its turns. What hangs in an earlier one keeps nobody waiting in the next. Whoever waits is
-    refused when the guard is stopped, as what it waits for may never end.
+    Each session has its own, so that a call that hangs in an earlier session blocks nothing in the next. Waiting calls
+    are refused when the guard is stopped, as the call they wait for may never end.
 
     Args:
         guard: of the session.
@@ -41,7 +41,7 @@ class Turns:
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether this is the copy of another process, which a fork made."""
+        """Whether this is a copy that a fork made of another process's turns."""
         return self._process != os.getpid()
 
     def __enter__(self) -> Guard:
@@ -50,17 +50,14 @@ class Turns:
                 if (reason := self.guard.stopped) is not None:
                     raise UnsafeStimulus(
                         "stopped",
-                        f"an emergency stop is in force ({reason}) and a call from another thread has not come back: "
+                        f"an emergency stop is in force ({reason}) and a call from another thread has not returned: "
                         "close and open again",
                     )
-        wrong = None
-        if self._is_over:
-            wrong = "an open one, got one that was closed meanwhile"
-        elif self._is_taken:
-            wrong = "one call to be over before the next, got one from within another"
-        if wrong is not None:
+        if self._is_over or self._is_taken:
             self._lock.release()
-            raise InvalidArgument(f"culture: expected {wrong}")
+            if self._is_over:
+                raise InvalidArgument("culture: expected an open one, got one that was closed meanwhile")
+            raise InvalidArgument("culture: expected one call to end before the next, got one from within another")
         self._is_taken = True
         return self.guard
 
@@ -69,10 +66,10 @@ class Turns:
         self._lock.release()
 
     def end(self, wait_s: float) -> None:
-        """Let no further call have a turn, and wait for the one that has it to end.
+        """Allow no further turn, and wait for the current one to end.
 
         Args:
-            wait_s: at most so long; below 0: however long.
+            wait_s: how long to wait at most; below 0: without limit.
         """
         self._is_over = True
         if self._lock.acquire(timeout=wait_s):
@@ -80,7 +77,7 @@ class Turns:
 
     @property
     def is_taken_elsewhere(self) -> bool:
-        """Whether a call from another thread has its turn now."""
+        """Whether another thread has the turn now."""
         if self._lock.acquire(blocking=False):
             self._lock.release()
             return False
@@ -88,7 +85,7 @@ class Turns:
 
 
 class Openable(abc.ABC):
-    """What is opened for a session, with limits and a guard, and closed; `Culture` says what is done meanwhile.
+    """Opened for a session, with limits and a guard, and closed; `Culture` adds what happens in between.
 
     Args:
         limits: tighter limits than the device's; None: the device's.
@@ -96,28 +93,26 @@ class Openable(abc.ABC):
 
     name: ClassVar[str]
     ends_within_s: ClassVar[float] = 0.5
-    """How long closing waits for a delivery from another thread, which it stopped, to end; below 0: until it does."""
+    """How long closing waits for a stopped delivery of another thread to end; below 0: without limit."""
 
     def __init__(self, limits: Limits | None = None) -> None:
         self._asked_limits = None if limits is None else plain_limits(limits)
-        # What follows has names that no subclass takes by accident.
+        # Names that no subclass takes by accident.
         self.__turns: Turns | None = None
-        # Of all sessions: a rate limit must not be passed by closing and opening again.
+        # Covers all sessions: closing and reopening must not circumvent a rate limit.
         self.__history = History()
         self.__stops: list[str] = []
-        # One thread may come back to it: a signal's handler that closes what is being opened must not wait for itself.
-        self.__door = threading.RLock()
+        # Re-entrant: a signal handler that closes a culture during opening must not wait for itself.
+        self.__open_close_lock = threading.RLock()
         self.__is_opening = False
         self.__process = os.getpid()
         self.__hold = ExitStack()
         self.__token = os.urandom(8).hex()
 
     def __reduce_ex__(self, protocol: object) -> NoReturn:
-        raise InvalidArgument(
-            "culture: expected to stay the one that it is, got a request to copy it: make another one"
-        )
+        raise InvalidArgument("culture: expected no copies, got a request to copy or pickle it: create another one")
 
-    # What a backend is, and does.
+    # The backend's data and methods.
 
     @property
     @abc.abstractmethod
@@ -127,16 +122,16 @@ class Openable(abc.ABC):
     @property
     @abc.abstractmethod
     def device_limits(self) -> Limits:
-        """What the device and the culture stand."""
+        """What the device and the culture tolerate."""
 
     @property
     @abc.abstractmethod
     def now_s(self) -> float:
-        """The culture's clock; where it can, it goes on while the culture is closed."""
+        """The culture's clock; if it can, it keeps running while the culture is closed."""
 
     @property
     def device(self) -> Path | None:
-        """The folder that stands for what only one culture object can hold (`holding`); None: each has its own."""
+        """The folder that represents a device that only one culture object can hold (`holding`); None: not shared."""
         return None
 
     @abc.abstractmethod
@@ -149,27 +144,27 @@ class Openable(abc.ABC):
 
     @abc.abstractmethod
     def _halt(self) -> None:
-        """Stop whatever is being delivered, at once; may be called from another thread, and when nothing is."""
+        """Stop any delivery immediately; may be called from another thread, and without a delivery."""
 
     @abc.abstractmethod
     def _close(self) -> None:
-        """Leave the device safe and let go of it; also called where `_open` failed half way."""
+        """Leave the device safe and release it; also called when `_open` failed half way."""
 
-    # What a user calls.
+    # The user's methods.
 
     @final
     def open(self) -> Self:
-        """Get ready, and begin a session: stimuli are counted anew and an emergency stop is lifted.
+        """Get ready, and begin a session: counts of stimuli restart and an emergency stop is lifted.
 
-        What was delivered in the second before is remembered from session to session. Where the last delivery was
-        broken off, or the clock began anew, all of its last second counts as delivered just now. Where another culture
-        object had the device last, a second is let pass first.
+        Stimuli of the last second are remembered from session to session. If the last delivery was interrupted, or the
+        clock was restarted, everything in its last second counts as delivered just now. If another culture object had
+        the device last, opening first lets a second pass.
 
         Raises:
-            InvalidArgument: if it is open already, or its limits are looser than the device's.
+            InvalidArgument: if it is already open, or its limits are looser than the device's.
             DeviceFailed: if it cannot be opened, or another culture object holds the device; it is then closed.
         """
-        if self.__is_opening or not self.__door.acquire(blocking=False):
+        if self.__is_opening or not self.__open_close_lock.acquire(blocking=False):
             raise InvalidArgument("culture: expected a closed one to open, got one that is being opened or closed")
         try:
             if self.__turns is not None:
@@ -177,47 +172,61 @@ class Openable(abc.ABC):
             self.__is_opening, self.__process = True, os.getpid()
             self.__stops.clear()
             if self._asked_limits is not None:
-                # Again when it is open: some devices tell their step of amplitude only then.
+                # Checked again once open: some devices report their amplitude step only then.
                 replace(plain_limits(self._asked_limits), amplitude_step=0.0).check_within(self.device_limits)
             with as_device_failure(self.name, "open"):
                 device = self.device
                 holder = f"{self.__token} {os.getpid()}"
-                is_handed_over = device is not None and self.__hold.enter_context(held(device, holder))
+                is_handed_over = device is not None and self.__hold.enter_context(hold(device, holder))
             try:
                 with as_device_failure(self.name, "open"):
                     self._open()
                     limits = self.limits
                     plain_limits(self._asked_limits or limits).check_within(self.device_limits)
                     if is_handed_over:
-                        # What the other one delivered is not known here: rates and intervals look back as long.
+                        # What the other delivered is unknown here: wait as long as rates and intervals look back.
                         self._rest(max(1.0, limits.interval_us * 1e-6))
                     now_s = seconds("now_s", self.now_s)
                     self.__turns = Turns(Guard(limits, self.stimulation_electrodes, self.__history, now_s))
             except BaseException as error:
                 self.__turns = None
-                self._close_after(error, None)
+                try:
+                    with as_device_failure(self.name, "close"), self.__hold.pop_all():
+                        self._close()
+                except Exception as failed:
+                    error.add_note(f"and then: {failed}")
                 raise
             for reason in self.__stops:
                 self.__turns.guard.stop(reason)
             return self
         finally:
             self.__is_opening = False
-            self.__door.release()
+            self.__open_close_lock.release()
 
     @final
     def close(self) -> None:
-        """Leave the device safe and let go of it; a closed culture stays closed.
+        """Leave the device safe and release it; a closed culture stays closed.
 
-        A delivery that is under way in another thread is stopped; one that opens it is waited for.
+        A delivery in progress in another thread is stopped; opening in another thread is waited for.
 
         Raises:
-            DeviceFailed: if the device does not say that it is safe; it is closed all the same.
+            DeviceFailed: if the device does not confirm that it is safe; the culture is closed all the same.
         """
-        with self.__one_at_the_door():
+        with self.__closing():
             turns, self.__turns = self.__turns, None
-            if turns is not None:
-                with as_device_failure(self.name, "close"):
-                    self._end(turns)
+            if turns is None:
+                return
+            with as_device_failure(self.name, "close"), self.__hold.pop_all():
+                if turns.is_elsewhere:
+                    # A fork's copy is not a culture of this process, which must not close the device.
+                    return
+                try:
+                    turns.guard.stop("it was closed")
+                    if turns.is_taken_elsewhere:
+                        self._halt()
+                    turns.end(self.ends_within_s)
+                finally:
+                    self._close()
 
     @final
     def __enter__(self) -> Self:
@@ -227,22 +236,21 @@ class Openable(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is None:
+        try:
             self.close()
-        else:
-            with self.__one_at_the_door():
-                turns, self.__turns = self.__turns, None
-                if turns is not None:
-                    self._close_after(error, turns)
+        except Exception as failed:
+            if error is None:
+                raise
+            error.add_note(f"and then: {failed}")
 
-    def __one_at_the_door(self) -> AbstractContextManager[object]:
-        # A fork copies a lock that another thread has, but not the thread, which would let go of it.
-        return self.__door if self.__process == os.getpid() else nullcontext()
+    def __closing(self) -> AbstractContextManager[object]:
+        # A fork copies a lock that another thread holds, but not the thread that would release it.
+        return self.__open_close_lock if self.__process == os.getpid() else nullcontext()
 
     @property
     @final
     def limits(self) -> Limits:
-        """The limits in force; amplitudes are rounded to the device's own step, whatever was asked for."""
+        """The limits in force; the amplitude step is always the device's own."""
         if (turns := self.__turns) is not None:
             return turns.guard.limits
         device, asked = plain_limits(self.device_limits), self._asked_limits
@@ -251,7 +259,7 @@ class Openable(abc.ABC):
     @property
     @final
     def is_open(self) -> bool:
-        """Whether a session is under way."""
+        """Whether a session is in progress."""
         return self.__turns is not None
 
     @property
@@ -263,50 +271,27 @@ class Openable(abc.ABC):
     @property
     @final
     def delivered(self) -> int:
-        """Stimuli delivered in this session."""
+        """Number of stimuli delivered in this session."""
         return self._opened().guard.delivered
 
     @final
-    def stop(self, reason: str = "asked for") -> None:
+    def stop(self, reason: str = "requested") -> None:
         """Emergency stop: deliver nothing more until the culture is closed and opened again. Safe from any thread.
 
         Raises:
-            DeviceFailed: if the device does not say that it stopped; whatever is asked for from now on is refused.
+            DeviceFailed: if the device does not confirm that it stopped; all later stimuli are refused all the same.
         """
-        # No turn is waited for: what has it may hang. One that is being opened finds the reason, and opens stopped.
+        # Waits for no turn: the call that has it may hang. A culture being opened finds the reason and opens stopped.
         self.__stops.append(reason)
         if (turns := self.__turns) is not None:
             turns.guard.stop(reason)
         with as_device_failure(self.name, "stop"):
             self._halt()
 
-    def _end(self, turns: Turns | None) -> None:
-        """End a session, leave the device safe and let go of it."""
-        with self.__hold.pop_all():
-            if turns is not None and turns.is_elsewhere:
-                # What a fork copied is no culture of this process: the device is not its to close.
-                return
-            try:
-                if turns is not None:
-                    turns.guard.stop("it was closed")
-                    if turns.is_taken_elsewhere:
-                        self._halt()
-                    turns.end(self.ends_within_s)
-            finally:
-                self._close()
-
-    def _close_after(self, error: BaseException, turns: Turns | None) -> None:
-        """Close because of an error, which goes on; that closing failed too is a note of it."""
-        try:
-            with as_device_failure(self.name, "close"):
-                self._end(turns)
-        except Exception as failed:
-            error.add_note(f"and then: {failed}")
-
     def _opened(self) -> Turns:
         turns = self.__turns
         if turns is None:
             raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
         if turns.is_elsewhere:
-            raise InvalidArgument("culture: expected one that this process opened, got a copy that a fork made")
+            raise InvalidArgument("culture: expected one that this process opened, got a copy made by a fork")
         return turns
