@@ -155,7 +155,7 @@ def test_a_coupling_does_not_see_the_goal() -> None:
 
 
 def test_bodies_that_are_stepped_in_python_have_none() -> None:
-    with pytest.raises(InvalidArgument, match="only robots in JAX have one"):
+    with pytest.raises(InvalidArgument, match="expected one in JAX, as the search for the best coupling takes"):
         best_coupling(WithoutNeurons(robot_named("gymnasium:Pendulum-v1"), None), None)
 
 
@@ -238,7 +238,7 @@ def test_the_optimums_grid_is_in_the_scores_interval() -> None:
 def test_of_one_episode_there_is_no_gap() -> None:
     gap = context_gap(np.array([40.0]), np.array([-10.0]), optimum_of(90.0))
     assert gap.gap is None and not gap.needs_context and gap.to_dict()["coupling_standard_error"] is None
-    assert gap.to_text() == "best coupling 40.0; no context gap of one episode"
+    assert gap.to_text() == "best coupling 40.0; no context gap with one episode"
 
 
 @pytest.mark.parametrize("coupling", [-60.0, -85.0])
@@ -282,7 +282,7 @@ def test_where_no_agent_is_above_random_stimuli_or_the_coupling_nothing_is_known
     rng = np.random.default_rng(3)
     couplings, random, known = (rng.normal(mean, 1, 50) for mean in (0.0, -80.0, -85.0))
     below_random = least_context_gap(couplings, random, known[None])
-    assert below_random.gap is None and "the best agent known (-8" in below_random.to_text()
+    assert below_random.gap is None and "the best known agent (-8" in below_random.to_text()
     below_coupling = least_context_gap(couplings, random, known[None] + 60)
     assert below_coupling.gap is not None and below_coupling.gap.value == 0 and not below_coupling.needs_context
     assert below_coupling.to_text().endswith("whether this task needs more than a reflex is not known")

@@ -236,9 +236,9 @@ def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
     np.testing.assert_array_equal(rows["policies"].episodes.returns, rows["shuffled"].episodes.returns)
     assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=500, seed=3).rows[0]
                   .episodes.returns)  # fmt: skip
-    assert "as trained: what is delivered is drawn anew" in found.to_text()
+    assert "as trained: the delivered condition is drawn at random" in found.to_text()
     assert found.score(rows["policies"]) is None and found.score(rows["random"]) == 0.0
-    assert "none for policies and silent and shuffled, whose optimum is another" in found.to_text()
+    assert "none for policies and silent and shuffled, whose optimum is different" in found.to_text()
 
 
 def test_simulators_made_otherwise_than_in_training_are_told() -> None:
@@ -247,7 +247,7 @@ def test_simulators_made_otherwise_than_in_training_are_told() -> None:
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
     noticed = evaluate({"a": policy}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
-    assert finding.message.endswith("made otherwise: bins 40, here 20")
+    assert finding.message.endswith("fitted differently: bins 40, here 20")
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
     noticed = evaluate({"a": alike}, timeline, episodes=50).findings
     assert "other-simulator" not in {each.name for each in noticed}
@@ -300,7 +300,7 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
             assert row["normalised_score"] == pytest.approx((row["mean_return"] - random) / (best - random))
     assert rows["random"]["normalised_score"] == 0
     text = found.to_text()
-    assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is another" in text
+    assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is different" in text
     assert f"{rows['policies']['normalised_score']:.2f}  as trained" in text
 
     # Without random actions there is nothing to score against.

@@ -24,7 +24,7 @@ from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Robot, Shuttle
 from fake_culture import FakeCulture
 from test_closed_loop import loop_of
-from test_whose_work import linear_networks
+from test_interventions import linear_networks
 
 POOL_HZ = np.array([1.5, 2.5, 3.5, 60.0])
 POLICIES = {"p0": AnyCondition(5), "p1": OneCondition(3)}

@@ -112,7 +112,7 @@ def answers(n: Sequence[int], seed: int, spread: Sequence[float] = SPREAD) -> Re
 
 
 def test_three_responses_promise_nothing() -> None:
-    with pytest.raises(UnusableData, match="expected 30 non-burst responses or more to some condition, got 3 at most"):
+    with pytest.raises(UnusableData, match="expected at least 30 non-burst ones to some condition, got at most 3"):
         optimal_returns(answers([3] * 5, 1), SHORT)
 
 

@@ -221,14 +221,14 @@ def test_without_running_the_controller_only_the_value_is_known() -> None:
     assert not alone.findings()
 
 
-def test_a_value_that_its_controller_does_not_get_is_told() -> None:
-    """3 standard errors and the grid's error apart is chance and grid; more is a bracket, or a grid too rough."""
+def test_a_value_that_its_controller_does_not_reach_is_reported() -> None:
+    """3 standard errors and the grid's error apart is chance and grid; more is a bracket, or a grid too coarse."""
     assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
     assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # nothing is drawn: the two are alike as they are printed
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
     assert "between the two" in above.message and above.value == pytest.approx(2.1)
     (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)
-    assert "too rough" in below.message
+    assert "too coarse" in below.message
 
 
 @pytest.mark.oracle
@@ -313,7 +313,7 @@ def test_refusals_say_what_to_do() -> None:
     environment = Animat(Navigation(), Thresholds(1), 5)
     with pytest.raises(InvalidArgument, match="cases"):
         best_returns([])
-    with pytest.raises(Mismatch, match="one robot"):
+    with pytest.raises(Mismatch, match="the same robot in all"):
         best_returns([(environment, SIMULATOR), (Animat(Cartpole(), Thresholds(1), 5), SIMULATOR)])
     with pytest.raises(InvalidArgument, match="simulator"):
         best_return(environment, None)

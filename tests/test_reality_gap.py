@@ -33,16 +33,16 @@ from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.evaluation.verdict import Beside
+from animat.evaluation.verdict import EpisodeComparison
 from animat.neurons.kinds import Kind
 from animat.neurons.remembering import Remembered
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
-from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
+from animat.reality_gap.session_responses import read_responses
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import RecordedCulture, Recording
@@ -153,12 +153,12 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     anew = np.array([each.returns.mean(axis=1) for each in rolled[ROLL_OUTS:]])
     for i, name in enumerate(policies):
         np.testing.assert_array_equal(rows[name].predicted, predicted[i])
-        np.testing.assert_allclose(rows[name].predicted_anew, anew[:, i])
+        np.testing.assert_allclose(rows[name].bootstrap_means, anew[:, i])
         # Who watches the session has it beforehand.
         told, found = gap.session.log.header["predicted"][name], rows[name].prediction
         assert told == {"mean": found.value, "low": found.low, "high": found.high}
     np.testing.assert_array_equal(rows["policies"].predicted, predicted.ravel())
-    np.testing.assert_allclose(rows["policies"].predicted_anew, anew.mean(axis=1))
+    np.testing.assert_allclose(rows["policies"].bootstrap_means, anew.mean(axis=1))
     for each in rolled[:ROLL_OUTS]:
         np.testing.assert_array_equal(each.presented.sum(axis=1), each.lengths.sum(axis=1))
     low, high = rows["policies"].prediction.low, rows["policies"].prediction.high
@@ -184,10 +184,10 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
 
     for row in gap.rows[3:]:
         expected = mannwhitneyu(rows["policies"].measured, row.measured, alternative="two-sided", method="asymptotic")
-        assert row.beside is not None
-        assert row.beside.p == pytest.approx(min(1.0, expected.pvalue))
+        assert row.comparison is not None
+        assert row.comparison.p == pytest.approx(min(1.0, expected.pvalue))
         pairs = len(rows["policies"].measured) * len(row.measured)
-        assert row.beside.wins == pytest.approx(expected.statistic / pairs)
+        assert row.comparison.wins == pytest.approx(expected.statistic / pairs)
     for row in gap.rows:
         assert row.gap.value == pytest.approx(row.measured.mean() - row.predicted.mean())
         assert row.gap.low <= row.gap.value + 1e-9
@@ -247,7 +247,7 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     policies, *each, random = gap.rows
 
     def verdict(p: float, wins: float, measured: float) -> str:
-        control = replace(random, beside=Beside(p, wins, 20, 20))
+        control = replace(random, comparison=EpisodeComparison(p, wins, 20, 20))
         rows = (replace(policies, measured=np.full(20, measured)), *each, control)
         return replace(gap, rows=rows).verdict()
 
@@ -255,7 +255,7 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.001, 0.9, high).startswith("the policies outperform every control (p < 0.01; ")
     assert verdict(0.02, 0.6, high).startswith("the policies do not outperform random (p = 0.02; ")
     at = float(policies.predicted.mean())
-    assert verdict(0.001, 0.9, at).endswith("of the pairs of episodes or more)")
+    assert verdict(0.001, 0.9, at).endswith("% of the pairs of episodes)")
     looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
     for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         told = (
@@ -288,7 +288,7 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
         if not tick.is_burst:
             # Two pulses a trial: neurons remember nothing.
             thresholds.add(tick.delivered, Remembered(), np.array(tick.rate_hz))
-    found = answered(gap.session, gap.loop, tuple(policies))
+    found = read_responses(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
     np.testing.assert_array_equal(found.responses.rate_hz, [tick.rate_hz for tick in ticks])
@@ -328,9 +328,11 @@ def test_what_was_not_measured_is_named(without_controls: Ran) -> None:
     gap = without_controls[0]
     policies, *others = gap.rows
     none = np.empty(0)
-    no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, beside=None) for row in others)))
+    no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, comparison=None) for row in others)))
     assert no_controls.verdict().startswith("no control ran to its end")
-    no_policy = replace(gap, rows=(replace(policies, measured=none), *(replace(row, beside=None) for row in others)))
+    no_policy = replace(
+        gap, rows=(replace(policies, measured=none), *(replace(row, comparison=None) for row in others))
+    )
     assert no_policy.verdict().startswith("no episode of a policy ran to its end")
 
 
@@ -390,7 +392,7 @@ def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, 
     rolled = roll_out(environment, recorded, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, 0))
     np.testing.assert_array_equal(gap.rows[1].predicted[:EPISODES], rolled.returns[0])
     other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
-    assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
+    assert not np.array_equal(gap.rows[0].bootstrap_means, other.rows[0].bootstrap_means)
 
 
 @pytest.mark.oracle
@@ -509,7 +511,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
         row = replace(
             gap.rows[0],
             predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),
-            predicted_anew=np.array(
+            bootstrap_means=np.array(
                 [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.bootstraps)]
             ),
             measured=returns(living, 40, 1000 + seed),
@@ -584,7 +586,7 @@ def test_whose_work_it_is_in_a_loop(tmp_path: Path, series: list[Responses]) -> 
         assert found[name].lost.value == pytest.approx(measured.mean() - rows[name].measured.mean())
         assert found[name].lost.low <= found[name].lost.value <= found[name].lost.high
     assert found["its simulator"].lost == gap.rows[0].gap
-    # Predicted as in simulation alone.
+    # As in simulation alone.
     simulated = evaluate(policies, fit_timeline(series), episodes=100, seed=1, interventions=True).whose_work
     assert simulated is not None
     for row in simulated.rows:
@@ -606,7 +608,7 @@ def test_the_best_coupling_runs_beside_the_policies(
     coupling = {row.name: row for row in gap.rows}["coupling"]
     rewards = [tick.reward or 0.0 for tick in read_session(tmp_path).ticks if tick.agent == "coupling"]
     assert len(coupling.measured) == 4 and coupling.measured.sum() == pytest.approx(sum(rewards))
-    assert len(coupling.predicted) and coupling.beside is not None
+    assert len(coupling.predicted) and coupling.comparison is not None
 
 
 @pytest.mark.oracle

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from animat.reality_gap.answered import Answered, Commanded
-from animat.reality_gap.predicting import Predicted
+from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
+from animat.reality_gap.session_responses import CommandSums, SessionResponses
 from animat.responses.condition import Condition
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Presented, Responses
@@ -44,11 +44,11 @@ def session(
     drawn = rng.integers(0, RECORDED, (100, 2, RECORDED))
     anew = summed(np.take_along_axis(np.broadcast_to(recorded, drawn.shape), drawn, axis=-1))
     everywhere = np.full(2, RECORDED)
-    predicted = Predicted(
+    predicted = Prediction(
         np.zeros(1),
         np.zeros(1),
-        Commanded(everywhere, summed(recorded)),
-        Commanded(everywhere + 0 * drawn[..., 0], anew),
+        CommandSums(everywhere, summed(recorded)),
+        CommandSums(everywhere + 0 * drawn[..., 0], anew),
     )
     calibration: Any = SimpleNamespace(
         responses_hz=tuple(recorded),
@@ -83,7 +83,7 @@ def session(
         place=EVERY,
     )
     command = commands(told["rate_hz"][None], recorded)[0]
-    answered = Answered(responses, episode, told["late_s"], np.ones(len(EVERY), bool), command, told["returns"])
+    answered = SessionResponses(responses, episode, told["late_s"], np.ones(len(EVERY), bool), command, told["returns"])
     return Evidence(answered, calibration, predicted, gap)  # type: ignore[arg-type]
 
 
@@ -183,7 +183,7 @@ def test_a_simulator_that_remembers_is_not_told_that_it_does_not() -> None:
 
 def test_of_few_episodes_no_trend_and_no_command_is_told() -> None:
     evidence = session(1, **CASES["answers"][0])
-    answered = evidence.answered
+    answered = evidence.session
     kept = answered.episode < 7
     few = replace(
         answered,
@@ -197,7 +197,7 @@ def test_of_few_episodes_no_trend_and_no_command_is_told() -> None:
         **{name: getattr(answered, name)[kept] for name in ("episode", "late_s", "moved", "command")},
         returns=answered.returns[:7],
     )
-    assert reasons(replace(evidence, answered=few)) == ()
+    assert reasons(replace(evidence, session=few)) == ()
 
 
 def test_of_nine_thresholds_commands_tell_what_the_median_alone_does_not() -> None:
@@ -223,7 +223,7 @@ def test_of_nine_thresholds_commands_tell_what_the_median_alone_does_not() -> No
 
 def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
     def on_halves(left: Evidence, right: Evidence) -> Evidence:
-        each = [evidence.answered for evidence in (left, right)]
+        each = [evidence.session for evidence in (left, right)]
         responses = replace(
             each[0].responses,
             readouts=Readouts(("left", "right"), ((1,), (2,))),
@@ -232,11 +232,12 @@ def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
         answered = replace(each[0], responses=responses, command=np.stack([one.command for one in each], axis=1))
         told = left.predicted
         once, anew = (
-            Commanded(each.presented, np.stack([each.total] * 2, -1)) for each in (told.commanded, told.commanded_anew)
+            CommandSums(each.presented, np.stack([each.total] * 2, -1))
+            for each in (told.commanded, told.commanded_bootstraps)
         )
         recorded = tuple(np.stack([x, x], axis=1) for x in left.calibration.responses_hz)
         calibration: Any = SimpleNamespace(**{**vars(left.calibration), "responses_hz": recorded})
-        return Evidence(answered, calibration, told._replace(commanded=once, commanded_anew=anew), -1)
+        return Evidence(answered, calibration, told._replace(commanded=once, commanded_bootstraps=anew), -1)
 
     check = CHECKS["mean commands"]
     same, other = session(3), session(3, rate_hz=lambda condition, rate_hz: rate_hz - 3.0)

@@ -70,7 +70,7 @@ def test_policies_of_blocks_are_reported_by_training_and_evaluation(
     assert "other-presentation" in evaluated["not_met_in_a_closed_loop"]
     assert main(["evaluate", str(tmp_path / "b"), "--recordings", blocked]) == 0
     assert (
-        "a closed loop on the culture would not meet these returns: see the warnings (other-presentation)"
+        "a closed loop on the culture would not reach these returns: see the warnings (other-presentation)"
         in capsys.readouterr().out
     )
 
@@ -89,7 +89,7 @@ def test_an_unknown_presentation_is_not_told_as_another(tmp_path: Path, capsys: 
     train = ["train", "cartpole", "--recordings", recordings, *QUICK, "--out", str(tmp_path / "p")]
     assert {f["name"] for f in ran(capsys, *train)["findings"]} >= {"unknown-presentation"}
     assert main(["evaluate", str(tmp_path / "p"), "--recordings", recordings]) == 0
-    said = "whether a closed loop on the culture would meet these returns is not known: see the warnings (unknown-pres"
+    said = "it is not known whether a closed loop on the culture would reach these returns: see the warnings (unknown-"
     assert said in capsys.readouterr().out
     # Another robot's folder is refused by the robot, not by what follows from it.
     assert main(["train", "navigation", *train[2:]]) == 1

@@ -16,7 +16,7 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
-from animat.reality_gap.as_read import as_read
+from animat.reality_gap.rereading import reread
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
@@ -92,7 +92,7 @@ class Calibration:
                 are those that it was trained with.
             at_min: the minute whose newest recording is taken instead; None without a policy: the last.
             adaptive: whether the loop's thresholds will adapt, or are fixed. Of thresholds that adapt, simulators are
-                made of responses as these read them (`animat.reality_gap.as_read`), except for recordings in blocks and
+                made of responses as these read them (`animat.reality_gap.rereading`), except for recordings in blocks and
                 for policies with other mappings than 1 and 9 thresholds.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
@@ -114,7 +114,7 @@ class Calibration:
         fit["room"] = room_for(series)
         answers = responses
         if adaptive and not responses.is_blocked and (policy is None or isinstance(policy.mapping, Thresholds)):
-            answers = as_read(responses, adjusted)
+            answers = reread(responses, adjusted)
             # The loop shows policies what the recording's own simulator remembers.
             known = recorded.memory if isinstance(recorded, MemorySimulator) else None
             sees = policy is not None and policy.neural_observation

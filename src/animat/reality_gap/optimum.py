@@ -16,7 +16,7 @@ RESOLUTION = 0.5
 """Of the grid: fast and rough, 0.8 of the cartpole's 200."""
 
 
-class OptimumBeside:
+class BackgroundOptimum:
     """The optimal return, computed in a thread: beside a loop that takes what time it takes, on another core."""
 
     def __init__(self, environment: Animat[Any], simulator: NeuronSimulator) -> None:
@@ -46,7 +46,7 @@ class OptimumBeside:
             in_phase(progress, "optimal return").update(0, 1, "working it out on the simulator")
         return self._found.result()
 
-    def let_end(self) -> None:
+    def join(self) -> None:
         """Wait until it computes no more: a program that ends while JAX computes in a thread is ended by a signal."""
         wait([self._found])
 

@@ -17,8 +17,8 @@ from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
 from animat.evaluation.rollouts import Episodes, Uniform, roll_out
 from animat.progress import Progress, Silent
-from animat.reality_gap.answered import Commanded
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.session_responses import CommandSums
 from animat.robots.host import HostRobot
 
 EPISODES = 200
@@ -30,7 +30,7 @@ BOOTSTRAPS_ON_HOST = 40
 """Fewer for a robot that is stepped on the host, where an episode takes a thousand times as long."""
 
 
-class Predicted(NamedTuple):
+class Prediction(NamedTuple):
     """What simulators say of one agent.
 
     Attributes:
@@ -38,13 +38,13 @@ class Predicted(NamedTuple):
         anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
             as the recording's responses and, a little, as its episodes do.
         commanded: in all its episodes on the simulator of the recording, shape (conditions,).
-        commanded_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
+        commanded_bootstraps: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
     """
 
     returns: Float64[np.ndarray, " episodes"]
     anew: Float64[np.ndarray, " bootstraps"]
-    commanded: Commanded
-    commanded_anew: Commanded
+    commanded: CommandSums
+    commanded_bootstraps: CommandSums
 
     @property
     def presented(self) -> Float64[np.ndarray, " conditions"]:
@@ -52,18 +52,18 @@ class Predicted(NamedTuple):
         return np.asarray(self.commanded.presented / len(self.returns))
 
 
-def together(predicted: Sequence[Predicted]) -> Predicted:
+def pool(predicted: Sequence[Prediction]) -> Prediction:
     """Several policies as one agent."""
-    return Predicted(
+    return Prediction(
         np.concatenate([each.returns for each in predicted]),
-        np.mean([each.anew for each in predicted], axis=0),
+        np.mean([each.bootstrap_means for each in predicted], axis=0),
         _stacked([each.commanded for each in predicted]).summed(0),
-        _stacked([each.commanded_anew for each in predicted]).summed(0),
+        _stacked([each.commanded_bootstraps for each in predicted]).summed(0),
     )
 
 
-def _stacked(commanded: Sequence[Commanded]) -> Commanded:
-    return Commanded(*(np.array(sums) for sums in zip(*commanded, strict=True)))
+def _stacked(commanded: Sequence[CommandSums]) -> CommandSums:
+    return CommandSums(*(np.array(sums) for sums in zip(*commanded, strict=True)))
 
 
 def predict(
@@ -75,7 +75,7 @@ def predict(
     *,
     seed: int = 1,
     progress: Progress | None = None,
-) -> dict[str, Predicted]:
+) -> dict[str, Prediction]:
     """Run policies and controls on the simulator of a recording, and on those of its responses drawn anew.
 
     Args:
@@ -94,14 +94,14 @@ def predict(
     if isinstance(environment.robot, HostRobot):
         simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
         episodes_each = episodes_on_host(environment.robot)
-    acting = [policies, *map(_by_anybody, controls)]
+    acting = [policies, *map(_with_random_actor, controls)]
 
     def rolled(number: int, on: int) -> Episodes:
         control, drawn = acting[number], roll_out_seed(seed, number, on)
         within = control.within(environment, simulators[on])
         return roll_out(*within, control.actor, control.n_actors, episodes=episodes_each, seed=drawn)
 
-    found: dict[str, Predicted] = {}
+    found: dict[str, Prediction] = {}
     # A body on the host hangs in the first thread or is not noticed (`animat.robots.host.within`).
     on_host = isinstance(environment.robot, HostRobot)
     with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -114,15 +114,15 @@ def predict(
             progress.update(number, len(acting), control.name)
             episodes = list(side_by_side(rolled, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
-            commanded = _stacked([Commanded(each.presented, each.commanded) for each in episodes])
+            commanded = _stacked([CommandSums(each.presented, each.commanded) for each in episodes])
             rows = {control.name: [*range(control.n_actors)]} if number else {name: [i] for i, name in enumerate(names)}
             for name, of in rows.items():
-                each = Commanded(*(sums[:, of] for sums in commanded)).summed(1)
-                found[name] = Predicted(
+                each = CommandSums(*(sums[:, of] for sums in commanded)).summed(1)
+                found[name] = Prediction(
                     returns[:ROLL_OUTS, of].ravel(),
                     returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
-                    Commanded(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
-                    Commanded(*(sums[ROLL_OUTS:] for sums in each)),
+                    CommandSums(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
+                    CommandSums(*(sums[ROLL_OUTS:] for sums in each)),
                 )
     return found
 
@@ -137,7 +137,7 @@ def roll_out_seed(seed: int, group: int, on: int) -> int:
     return int(np.random.SeedSequence((seed, group, on)).generate_state(1)[0])
 
 
-def _by_anybody(control: Control) -> Control:
+def _with_random_actor(control: Control) -> Control:
     """With random choices, where they decide nothing: without stimuli, or where what is delivered is drawn anyway."""
     if control.delivery not in ("silent", "shuffled"):
         return control

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from animat.reality_gap.answered import Answered
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.predicting import Predicted
+from animat.reality_gap.predicting import Prediction
+from animat.reality_gap.session_responses import SessionResponses
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.quality.memory import memory_findings
@@ -40,9 +40,9 @@ class Evidence:
         gap: the sign of their gap: -1 where less was measured.
     """
 
-    answered: Answered
+    session: SessionResponses
     calibration: Calibration
-    predicted: Predicted
+    predicted: Prediction
     gap: Literal[-1, 1]
 
 
@@ -53,7 +53,7 @@ def reasons(evidence: Evidence) -> tuple[Finding, ...]:
 
 def presentation(evidence: Evidence) -> Finding | None:
     """The loop presented otherwise than the recording that predicted."""
-    recorded, presented = evidence.calibration.presentation, evidence.answered.responses.presentation
+    recorded, presented = evidence.calibration.presentation, evidence.session.responses.presentation
     if recorded == presented:
         return None
     message = f"the recording was presented {recorded or 'as is not known'}, the loop {presented}"
@@ -71,7 +71,7 @@ def few_samples(evidence: Evidence) -> Finding | None:
 
 def lateness(evidence: Evidence) -> Finding | None:
     """Pulses came so late that a condition was at another frequency."""
-    answers, told, most = evidence.answered, [], 0.0
+    answers, told, most = evidence.session, [], 0.0
     for i, condition in enumerate(_conditions(evidence)):
         late_s = answers.late_s[answers.responses.condition == i]
         if not len(late_s) or (part := float(late_s.mean()) / condition.interval_s) < LEAST_LATE:
@@ -87,7 +87,7 @@ def lateness(evidence: Evidence) -> Finding | None:
 
 def bursts(evidence: Evidence) -> Finding | None:
     """Many responses were bursts, which no simulator has."""
-    is_burst = evidence.answered.responses.is_burst
+    is_burst = evidence.session.responses.is_burst
     count, n = int(is_burst.sum()), len(is_burst)
     if count < max(_FEWEST_BURSTS, LEAST_BURSTS * n):
         return None
@@ -106,7 +106,7 @@ def trend(evidence: Evidence) -> Finding | None:
     """
     from scipy.stats import kendalltau, linregress
 
-    answers = evidence.answered
+    answers = evidence.session
     responses, time_s, episodes = answers.responses, answers.responses.time_s, len(answers.returns)
     if time_s is None or episodes < FEWEST_EPISODES:
         return None
@@ -145,7 +145,7 @@ def memory(evidence: Evidence) -> Finding | None:
     """What the culture answered depends on its answer before, and the simulator that predicted does not know it."""
     if evidence.calibration.simulator.has_memory:
         return None
-    found = next(memory_findings(evidence.answered.responses), None)
+    found = next(memory_findings(evidence.session.responses), None)
     return None if found is None else Finding("memory", "note", found.message, found.value)
 
 
@@ -159,12 +159,12 @@ def answers(evidence: Evidence) -> Finding | None:
     """
     from scipy.stats import t as student
 
-    measured, predicted = evidence.answered.commanded, evidence.predicted
+    measured, predicted = evidence.session.commanded, evidence.predicted
     episodes, recorded_hz = len(measured.presented), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
         return None
     conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
-    names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
+    names, read_hz = evidence.session.responses.readouts.names, evidence.session.responses.read_hz
     # Of one readout there is no axis.
     of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
     tested = [(i, of) for i in conditions.tolist() for of in of_readouts]
@@ -175,13 +175,13 @@ def answers(evidence: Evidence) -> Finding | None:
         mean, expected = float(total.sum() / n.sum()), float(predicted.commanded.mean[at])
         between = episodes / (episodes - 1) * float(np.sum((total - mean * n) ** 2)) / float(n.sum()) ** 2
         error = max(between, _variance(mean, int(n.sum()))) ** 0.5
-        anew = float(np.nanvar(predicted.commanded_anew.mean[:, *at]))
+        anew = float(np.nanvar(predicted.commanded_bootstraps.mean[:, *at]))
         expected_error = max(anew, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = mean - expected
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < LEVEL / len(tested) and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
-            measured_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
+            measured_hz = read_hz[evidence.session.responses.condition == i, *of].mean()
             on = f" on {names[of[0]]}" if of else ""
             told.append(
                 f"{_conditions(evidence)[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
@@ -213,4 +213,4 @@ def _variance(command: float, n: int) -> float:
 
 
 def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
-    return evidence.answered.responses.conditions
+    return evidence.session.responses.conditions

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.evaluation.verdict import Beside
+from animat.evaluation.verdict import EpisodeComparison
 from animat.records import as_json
 
 _RESAMPLES = 10_000
@@ -22,7 +22,7 @@ class Row:
     Attributes:
         name, meaning: who acted.
         predicted: returns on the simulator, shape (episodes,).
-        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
+        bootstrap_means: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
         measured: returns of whole episodes on the culture, shape (episodes,).
         pulses_per_action: that the culture was given, without the warm-up; so is all that follows of the culture.
         electrode_pulses: in whole episodes, on average; NaN without any. One for each electrode of each pulse.
@@ -38,7 +38,7 @@ class Row:
     name: str
     meaning: str
     predicted: Float64[np.ndarray, " predicted"]
-    predicted_anew: Float64[np.ndarray, " bootstraps"]
+    bootstrap_means: Float64[np.ndarray, " bootstraps"]
     measured: Float64[np.ndarray, " measured"]
     pulses_per_action: float
     electrode_pulses: float
@@ -46,13 +46,13 @@ class Row:
     pulse_cost: float
     bursts: float
     late: float
-    beside: Beside | None = None
+    comparison: EpisodeComparison | None = None
     met: dict[str, Any] = field(default_factory=dict)
 
     @property
     def prediction(self) -> Interval:
         """Mean predicted return, and between which it lies as the recording's responses are drawn anew."""
-        return between(self.predicted.mean(), self.predicted_anew)
+        return bootstrap_interval(self.predicted.mean(), self.bootstrap_means)
 
     @property
     def gap(self) -> Interval:
@@ -66,7 +66,7 @@ class Row:
             return Interval(float(value), -np.inf, np.inf, CONFIDENCE)
         rng = np.random.default_rng(0)
         measured = resampled_means(self.measured, rng)
-        return between(value, measured - rng.choice(self.predicted_anew, len(measured)))
+        return bootstrap_interval(value, measured - rng.choice(self.bootstrap_means, len(measured)))
 
     @property
     def net(self) -> float | None:
@@ -106,13 +106,13 @@ class Row:
             "predicted_net": self.predicted_net,
             "bursts": self.bursts,
             "late": self.late,
-            "p": None if self.beside is None else self.beside.p,
-            "wins": None if self.beside is None else self.beside.wins,
+            "p": None if self.comparison is None else self.comparison.p,
+            "wins": None if self.comparison is None else self.comparison.wins,
             **self.met,
         }
 
 
-def between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
+def bootstrap_interval(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
     """A value with the interval that holds 95 % of what was drawn anew."""
     # Of a hundred draws the usual interpolation would hold 93 %.
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")

@@ -31,18 +31,18 @@ from animat.evaluation.transfer import (
     other_calibration,
     other_simulator,
 )
-from animat.evaluation.verdict import beside
+from animat.evaluation.verdict import compare_episodes
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
-from animat.reality_gap.answered import answered, outcomes
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.optimum import OptimumBeside
+from animat.reality_gap.interventions import half_an_episode, intervention_table, run_ideal_actuator
+from animat.reality_gap.optimum import BackgroundOptimum
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Predicted, episodes_on_host, predict, together
+from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
-from animat.reality_gap.row import Row, between
+from animat.reality_gap.row import Row, bootstrap_interval
+from animat.reality_gap.session_responses import outcomes, read_responses
 from animat.reality_gap.table import RealityGap
-from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
 from animat.robots.grid import no_grid
@@ -51,7 +51,7 @@ from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
-"""Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
+"""Enough to show (p < 0.01) that ten or more episodes of policies outperform it."""
 
 
 def run_policies(
@@ -105,7 +105,7 @@ def run_policies(
     first = check_policies(policies)
     check_conditions(first, calibration)
     loop, findings = _loop_of(first, calibration, pulses, settings)
-    findings += tuple(_warned(first, loop, calibration, culture.now_s / 60))
+    findings += tuple(_warnings(first, loop, calibration, culture.now_s / 60))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -129,7 +129,7 @@ def run_policies(
             raise InvalidArgument(f"--interventions: expected a robot in JAX, got {loop.robot.name}")
         half = half_an_episode(trained, environment, simulator, seed)
         of_ideal, *changed = interventions_of(environment, simulator, networks, n_policies, switch_at=half)
-        ideal = with_ideal_actuator(of_ideal, environment, simulator, seed)
+        ideal = run_ideal_actuator(of_ideal, environment, simulator, seed)
         controls += [each for each in changed if each.name not in ("silent", "shuffled")]
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     pooled = np.concatenate(calibration.responses_hz)
@@ -152,7 +152,7 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = OptimumBeside(animat, simulator) if why_no_optimum is None else None
+    optimum = BackgroundOptimum(animat, simulator) if why_no_optimum is None else None
     if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
         # Such a loop has no time to lose.
         optimum.value(progress)
@@ -177,11 +177,13 @@ def run_policies(
             seed=seed,
             account=account,
             progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
-            predicted={name: between(of.returns.mean(), of.anew) for name, of in predicted.items()},
+            predicted={
+                name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()
+            },
         )
     except Exception:
         if optimum is not None:
-            optimum.let_end()
+            optimum.join()
         raise
     best = None
     # Whoever stopped the session does not wait for it.
@@ -194,7 +196,7 @@ def run_policies(
     found: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
         evidence = Evidence(
-            answered(session, loop, tuple(policies)), calibration, together([predicted[p] for p in policies]), sign
+            read_responses(session, loop, tuple(policies)), calibration, pool([predicted[p] for p in policies]), sign
         )
         found = reasons(evidence)
     return RealityGap(
@@ -210,7 +212,7 @@ def run_policies(
         responses=sum(map(len, calibration.responses_hz)),
         outlook=ahead,
         reasons=found,
-        whose_work=() if ideal is None else replaced(rows, *ideal),
+        whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
 
 
@@ -228,7 +230,7 @@ def _loop_of(
     return Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
 
 
-def _warned(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
+def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
     """Why less or other than the prediction may be measured, as far as it is known before the session."""
     yield from other_calibration(first.presentation, calibration.presentation)
     if first.delivery == "shuffled":
@@ -305,7 +307,7 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
 def _rows(
     agents: Sequence[Agent],
     names: tuple[str, ...],
-    predicted: Mapping[str, Predicted],
+    predicted: Mapping[str, Prediction],
     session: Session,
     loop: Loop,
     pulse_cost: float,
@@ -318,13 +320,13 @@ def _rows(
         whole = [each for each in episodes if each.is_whole]
         actions = max(1, sum(each.iterations for each in episodes))
         trials = max(1, sum(each.trials for each in episodes))
-        of_them = together([predicted[each] for each in of])
+        of_them = pool([predicted[each] for each in of])
         met = [came_to[episode.number] for episode in episodes if episode.number in came_to]
         return Row(
             name=name,
             meaning=meaning,
             predicted=of_them.returns,
-            predicted_anew=of_them.anew,
+            bootstrap_means=of_them.bootstrap_means,
             measured=np.array([episode.total for episode in whole], np.float64),
             pulses_per_action=sum(each.pulses - each.warm_up_pulses for each in episodes) / actions,
             electrode_pulses=sum(each.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
@@ -347,6 +349,6 @@ def _rows(
         control = row(agent.name, agent.meaning, [agent.name])
         # With another goal in mid-episode policies are to do as well as ever: nothing to outperform.
         if len(control.measured) and len(policies.measured) and agent.switch_at is None:
-            control = replace(control, beside=beside(policies.measured, control.measured))
+            control = replace(control, comparison=compare_episodes(policies.measured, control.measured))
         rows.append(control)
     return tuple(rows)

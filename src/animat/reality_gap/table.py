@@ -14,10 +14,10 @@ from animat.evaluation.verdict import Verdict
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, told_satisfaction
 from animat.lined_up import lined_up
+from animat.reality_gap.interventions import Intervention, intervention_lines
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
 from animat.reality_gap.row import Row
-from animat.reality_gap.whose_work import Replaced, told_replaced
 from animat.recordings.findings import Finding
 
 LARGE_SHARE = 0.1
@@ -52,12 +52,12 @@ class RealityGap:
     responses: int
     outlook: Outlook
     reasons: tuple[Finding, ...]
-    whose_work: tuple[Replaced, ...] = ()
+    whose_work: tuple[Intervention, ...] = ()
 
     @property
-    def beside_controls(self) -> Verdict | None:
+    def control_verdict(self) -> Verdict | None:
         """Whether the policies outperform each control that was run to the end of an episode; None if none was."""
-        controls = {row.name: row.beside for row in self.rows if row.beside is not None}
+        controls = {row.name: row.comparison for row in self.rows if row.comparison is not None}
         return Verdict(controls) if controls else None
 
     @property
@@ -70,7 +70,7 @@ class RealityGap:
 
     def verdict(self) -> str:
         """Whether the policies outperform the controls, and what the gap may come from."""
-        beside, policies = self.beside_controls, self.rows[0]
+        beside, policies = self.control_verdict, self.rows[0]
         if beside is None:
             who = "no control" if len(policies.measured) else "no episode of a policy"
             return f"{who} ran to its end: nothing can be said of the policies beside the controls"
@@ -102,7 +102,7 @@ class RealityGap:
             "pulse_cost": self.rows[0].pulse_cost,
             "gap_share": self.gap_share,
             "rows": [row.to_dict() for row in self.rows],
-            "not_outperformed": None if self.beside_controls is None else self.beside_controls.not_outperformed,
+            "not_outperformed": None if self.control_verdict is None else self.control_verdict.not_outperformed,
             "verdict": self.verdict(),
             "reasons": [reason.to_dict() for reason in self.reasons],
             "whose_work": [each.to_dict() for each in self.whose_work],
@@ -125,7 +125,7 @@ class RealityGap:
             if (gap := told["gap"]) is not None:
                 between = "unknown" if gap["low"] is None else f"{gap['low']:+.1f} to {gap['high']:+.1f}"
                 measured = [f"{told['measured']:.1f}", f"{gap['value']:+.1f}", between]
-            p = "" if row.beside is None else f"{row.beside.p:.2g}"
+            p = "" if row.comparison is None else f"{row.comparison.p:.2g}"
             counts = [
                 *(cells_of(row.met) if objectives else []),
                 str(len(row.measured)),
@@ -165,7 +165,7 @@ class RealityGap:
             f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"
         )
         if self.whose_work:
-            lines += told_replaced(self.rows[0], self.whose_work)
+            lines += intervention_lines(self.rows[0], self.whose_work)
         if outline["unanswered_pulses"]:
             lines.append(f"  {told_unanswered(self.session)}")
         if self.session.outline.left_out:

@@ -18,7 +18,7 @@ from animat.responses.responses import Presented, Responses
 from animat.robots.base import Robot
 
 
-class Commanded(NamedTuple):
+class CommandSums(NamedTuple):
     """What each condition led to.
 
     Attributes:
@@ -37,13 +37,13 @@ class Commanded(NamedTuple):
         with np.errstate(invalid="ignore"):
             return np.asarray(self.total / (self.presented[..., None] if of_several else self.presented))
 
-    def summed(self, axis: int) -> Commanded:
+    def summed(self, axis: int) -> CommandSums:
         """Over policies or episodes."""
-        return Commanded(self.presented.sum(axis=axis), self.total.sum(axis=axis))
+        return CommandSums(self.presented.sum(axis=axis), self.total.sum(axis=axis))
 
 
 @dataclass(frozen=True, eq=False)
-class Answered:
+class SessionResponses:
     """Responses in the episodes of policies that came to their end, without the warm-up.
 
     Attributes:
@@ -64,14 +64,14 @@ class Answered:
     returns: Float64[np.ndarray, " episodes"]
 
     @property
-    def commanded(self) -> Commanded:
+    def commanded(self) -> CommandSums:
         """Of the responses that moved the robot in each episode, shape (episodes, conditions)."""
         shape, moved = (len(self.returns), len(self.responses.conditions)), self.moved
         presented, total = np.zeros(shape, np.int64), np.zeros((*shape, *self.command.shape[1:]))
         at = self.episode[moved], self.responses.condition[moved]
         np.add.at(presented, at, 1)
         np.add.at(total, at, self.command[moved])
-        return Commanded(presented, total)
+        return CommandSums(presented, total)
 
     @property
     def span_min(self) -> float:
@@ -80,7 +80,7 @@ class Answered:
         return 0.0 if time_s is None or not len(time_s) else float(time_s[-1] - time_s[0]) / 60
 
 
-def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answered:
+def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> SessionResponses:
     """Read what policies were answered from a session's log.
 
     Args:
@@ -132,7 +132,7 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     )
     returns = np.array([each.total for each in whole], np.float64)
     command = np.array(commands, np.float64).reshape(len(acted), *of_each)
-    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
+    return SessionResponses(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
 
 
 def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:

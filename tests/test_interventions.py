@@ -15,9 +15,9 @@ from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.controls import interventions_of
+from animat.evaluation.interventions import run_interventions
 from animat.evaluation.rollouts import Actor, Networks, roll_out
 from animat.evaluation.traces import trace
-from animat.evaluation.whose_work import whose_work
 from animat.neurons.simulator import indifferent
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Quantity, Robot, Wheels
@@ -153,7 +153,7 @@ def linear_networks(*weights: np.ndarray) -> Networks:
 @pytest.mark.oracle
 def test_the_table_tells_a_policy_that_knows_its_goal_from_one_that_does_not() -> None:
     towards = np.array([[0.0] * 5, [-1.0, 0.0, 0.0, 0.0, 1.0]])
-    knows = whose_work(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), 2, episodes=50, seed=1)
+    knows = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), 2, episodes=50, seed=1)
     told = {row["name"]: row for row in knows.to_dict()["rows"]}
     # Of two goals that are equally likely each has its action: 1 bit, whether the culture listens or not.
     for name in ("as they are", "silent", "shuffled"):
@@ -161,12 +161,12 @@ def test_the_table_tells_a_policy_that_knows_its_goal_from_one_that_does_not() -
     turning = knows.turning
     assert turning is not None and (turning.at, turning.episodes, turning.after) == (5, 64, 1.0)
     assert turning.turned == 1.0
-    blind = whose_work(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), 1, episodes=50, seed=1)
+    blind = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), 1, episodes=50, seed=1)
     information = blind.rows[0].information
     assert information is not None and (information.bits.value, information.p) == (0.0, 1.0)
     assert blind.turning is not None and (blind.turning.turned, blind.turning.after) == (0.0, None)
     text = knows.to_text()
-    assert "of 1.00 bits" in text and "the first time with action 1 after it" in text
+    assert "of 1.00 bits" in text and "first at action 1 after the switch" in text
     usual, turned = (row.returns for row in (knows.rows[0], knows.rows[6]))
     np.testing.assert_allclose(knows.rows[6].lost.value, (usual - turned).mean())
 
@@ -174,8 +174,8 @@ def test_the_table_tells_a_policy_that_knows_its_goal_from_one_that_does_not() -
 @pytest.mark.oracle
 def test_one_goal_alone_and_no_neurons_are_said() -> None:
     falling = linear_networks(np.zeros((4, 5)))
-    made = whose_work(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
+    made = run_interventions(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
     assert made.turning is None and "the robot has only one goal" in made.to_text()
     assert [row.name for row in made.rows][-1] == "turned round"
     with pytest.raises(InvalidArgument, match="expected policies that act through neurons"):
-        whose_work(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)
+        run_interventions(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)

@@ -18,14 +18,14 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.reality_gap.row import Row, resampled_means
 from animat.records import as_json
 
-REPLACED = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
+MEASURED = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
 """Those that were measured, in their order."""
 EPISODES = 100
 """Of each policy on the simulator, with an ideal actuator, and to know when an episode is half over."""
 
 
 @dataclass(frozen=True)
-class Replaced:
+class Intervention:
     """One line: the same policies with something in the culture's place.
 
     Attributes:
@@ -51,7 +51,7 @@ def half_an_episode(policies: Control, environment: Environment[Any], simulator:
     return max(1, int(np.median(ran.lengths)) // 2)
 
 
-def with_ideal_actuator(
+def run_ideal_actuator(
     ideal: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int
 ) -> tuple[str, Float64[np.ndarray, " episodes"]]:
     """What an ideal actuator is, and returns of policies that have one in the culture's place."""
@@ -60,34 +60,34 @@ def with_ideal_actuator(
     return ideal.meaning, np.asarray(ran.returns, np.float64).ravel()
 
 
-def replaced(
+def intervention_table(
     rows: Sequence[Row], meaning_of_ideal: str, with_ideal: Float64[np.ndarray, " episodes"]
-) -> tuple[Replaced, ...]:
+) -> tuple[Intervention, ...]:
     """The table: its simulator, an ideal actuator, then what was measured; none where no policy came to an end.
 
     Args:
         rows: of the session's table, the policies first.
-        meaning_of_ideal, with_ideal: as of `with_ideal_actuator`.
+        meaning_of_ideal, with_ideal: as of `run_ideal_actuator`.
     """
     policies = rows[0]
     if not len(policies.measured):
         return ()
     by_name = {row.name: row for row in rows}
     found = [
-        Replaced("its simulator", "as predicted", False, float(policies.predicted.mean()), policies.gap),
-        Replaced(
+        Intervention("its simulator", "as predicted", False, float(policies.predicted.mean()), policies.gap),
+        Intervention(
             "ideal actuator", meaning_of_ideal, False, float(with_ideal.mean()), _lost(policies.measured, with_ideal)
         ),
     ]
-    for name in REPLACED:
+    for name in MEASURED:
         row = by_name.get(name)
         if row is not None and len(row.measured):
             lost = _lost(policies.measured, row.measured)
-            found.append(Replaced(name, row.meaning, True, float(row.measured.mean()), lost))
+            found.append(Intervention(name, row.meaning, True, float(row.measured.mean()), lost))
     return tuple(found)
 
 
-def told_replaced(policies: Row, found: Sequence[Replaced]) -> list[str]:
+def intervention_lines(policies: Row, found: Sequence[Intervention]) -> list[str]:
     """The table as lines for a terminal."""
     cells = []
     for each in found:

@@ -13,7 +13,7 @@ from animat.neurons.remembering import Remembered
 from animat.responses.responses import Responses
 
 
-def as_read(responses: Responses, adjusted: AdjustedRanks) -> Responses:
+def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     """Each response at the recording's quantile of the rank that it has for adaptive thresholds at its time.
 
     Responses rise and fall together, over seconds and minutes. Thresholds that adapt follow that, and it disturbs the

@@ -14,7 +14,7 @@ from animat.neurons.history import Memory, Ranked
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import fit_empirical
 from animat.reality_gap import Calibration
-from animat.reality_gap.as_read import as_read
+from animat.reality_gap.rereading import reread
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
@@ -32,7 +32,7 @@ def mixed(rng: np.random.Generator, n: int, rises: np.ndarray | float = 0.0) -> 
 
 
 def read(responses: Responses) -> Responses:
-    return as_read(responses, AdjustedRanks.of(responses, fit_empirical(responses)))
+    return reread(responses, AdjustedRanks.of(responses, fit_empirical(responses)))
 
 
 def in_common(responses: Responses) -> float:
@@ -72,7 +72,7 @@ def test_each_response_is_at_the_rank_that_it_has_for_the_thresholds_before_it()
     with FakeCulture() as culture:
         recorded = extract_responses(culture.record(PROTOCOL, 0), burst_threshold=0.95)
     adjusted = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY))
-    left, ranked = as_read(recorded, adjusted), Ranked(recorded)
+    left, ranked = reread(recorded, adjusted), Ranked(recorded)
     history = np.stack([ranked.traces(MEMORY), ranked.loads(MEMORY.load_s).at], axis=1)
     explained, everything = history @ adjusted.slopes[:, 0], np.sort(np.concatenate(adjusted.responses_hz))
     answered: list[Answered] = []
