@@ -255,8 +255,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.001, 0.9, high).startswith("the policies outperform every control (p < 0.01; ")
     assert verdict(0.02, 0.6, high).startswith("the policies do not outperform random (p = 0.02; ")
     at = float(policies.predicted.mean())
-    assert verdict(0.001, 0.9, at).endswith("% of the pairs of episodes)")
-    looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
+    assert verdict(0.001, 0.9, at).endswith("larger in at least 90 % of the pairs of episodes)")
+    looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
     for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         told = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
@@ -265,8 +265,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
         assert f"{told}{looked} commands)" in verdict(0.001, 0.9, measured)
     uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
-        f"; their measured return is 20.0 less than predicted, within what the recording's responses ({gap.responses}) "
-        "and the episodes (10) can tell"
+        "; their measured return is 20.0 less than predicted, within the uncertainty due to the number of responses in "
+        f"the recording ({gap.responses}) and of episodes (10)"
     )
     reasons = (Finding("a", "note", "it rained"), Finding("b", "note", "it snowed"))
     explained = replace(gap, rows=(replace(policies, measured=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
@@ -329,11 +329,11 @@ def test_what_was_not_measured_is_named(without_controls: Ran) -> None:
     policies, *others = gap.rows
     none = np.empty(0)
     no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, comparison=None) for row in others)))
-    assert no_controls.verdict().startswith("no control ran to its end")
+    assert no_controls.verdict().startswith("no control completed an episode")
     no_policy = replace(
         gap, rows=(replace(policies, measured=none), *(replace(row, comparison=None) for row in others))
     )
-    assert no_policy.verdict().startswith("no episode of a policy ran to its end")
+    assert no_policy.verdict().startswith("no policy completed an episode")
 
 
 @pytest.mark.oracle

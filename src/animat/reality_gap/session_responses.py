@@ -1,4 +1,4 @@
-"""What a session's log says of its episodes: the responses that moved the policies' robots, and what goals came to."""
+"""From a session's log: the responses that moved the policies' robots, and the outcomes of episodes with a goal."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from animat.robots.base import Robot
 
 
 class CommandSums(NamedTuple):
-    """What each condition led to.
+    """The commands that each condition led to.
 
     Attributes:
-        presented: how often it was presented, shape (..., conditions).
-        total: the sum of its commands, the same shape; of several commands each on its own, shape (..., conditions,
-            commands).
+        presented: how often each condition was presented, shape (..., conditions).
+        total: the sum of its commands, the same shape; several commands separately, shape (..., conditions, commands).
     """
 
     presented: Int64[np.ndarray, "*any conditions"]
@@ -38,22 +37,22 @@ class CommandSums(NamedTuple):
             return np.asarray(self.total / (self.presented[..., None] if of_several else self.presented))
 
     def summed(self, axis: int) -> CommandSums:
-        """Over policies or episodes."""
+        """Summed over an axis of policies or episodes."""
         return CommandSums(self.presented.sum(axis=axis), self.total.sum(axis=axis))
 
 
 @dataclass(frozen=True, eq=False)
 class SessionResponses:
-    """Responses in the episodes of policies that came to their end, without the warm-up.
+    """Responses in the complete episodes of policies, without the warm-up.
 
     Attributes:
-        responses: in the order of time, on the session's clock, with all that the culture was presented between them.
-        episode: which of `returns` each one belongs to, shape (responses,).
-        late_s: by how much its pulses came late, shape (responses,).
+        responses: in order of time, on the session's clock, with everything that was presented between them.
+        episode: index in `returns` of each response's episode, shape (responses,).
+        late_s: lateness of its pulses, shape (responses,).
         moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
-        command: that it moved the robot with, shape (responses,); of several commands each on its own, shape
-            (responses, commands). NaN where it did not move it.
-        returns: of the episodes, in the order of time, shape (episodes,).
+        command: with which it moved the robot, shape (responses,); several commands separately, shape (responses,
+            commands). NaN if it did not move the robot.
+        returns: of the episodes, in order of time, shape (episodes,).
     """
 
     responses: Responses
@@ -65,7 +64,7 @@ class SessionResponses:
 
     @property
     def commanded(self) -> CommandSums:
-        """Of the responses that moved the robot in each episode, shape (episodes, conditions)."""
+        """Commands of the responses that moved the robot in each episode, shape (episodes, conditions)."""
         shape, moved = (len(self.returns), len(self.responses.conditions)), self.moved
         presented, total = np.zeros(shape, np.int64), np.zeros((*shape, *self.command.shape[1:]))
         at = self.episode[moved], self.responses.condition[moved]
@@ -75,16 +74,15 @@ class SessionResponses:
 
     @property
     def span_min(self) -> float:
-        """From the first response to the last."""
+        """Minutes from the first response to the last."""
         time_s = self.responses.time_s
         return 0.0 if time_s is None or not len(time_s) else float(time_s[-1] - time_s[0]) / 60
 
 
 def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> SessionResponses:
-    """Read what policies were answered from a session's log.
+    """Read the responses to policies from the log of a session that has ended.
 
     Args:
-        session: that ended.
         policies: their names among the agents.
     """
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
@@ -94,8 +92,8 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     of_each = loop.decoder.percentiles_shape[:-1]
     nothing, commands = np.full(of_each, np.nan).tolist(), []
     read_hz: list[Sequence[float]] = []
-    for words in session.log.records.words():
-        tick = words.get("tick")
+    for record in session.log.records.words():
+        tick = record.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
         if tick["iteration"] >= 0 and tick["episode"] in place:
@@ -112,12 +110,12 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
     before_s = np.concatenate([[-np.inf], read_s[:-1]])
     is_rested = first_s - before_s > SILENCE_S
-    every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
+    presentations = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
     responses = Responses(
-        condition=every.condition[at],
-        rate_hz=every.rate_hz[at],
+        condition=presentations.condition[at],
+        rate_hz=presentations.rate_hz[at],
         active_ratio=active_ratio,
-        is_burst=every.is_burst[at],
+        is_burst=presentations.is_burst[at],
         conditions=loop.conditions,
         window_ms=loop.window_ms,
         n_channels=len(session.log.header["channels"]["label"]),
@@ -125,7 +123,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
         separability=float("nan"),
         presentation=loop.presentation,
         time_s=read_s[at],
-        presented=every,
+        presented=presentations,
         place=at,
         readouts=loop.readouts,
         readout_hz=None if loop.readouts.are_all else x_hz,
@@ -136,7 +134,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
 
 
 def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:
-    """Of each episode that came to its end, by its number, what it came to; none of a robot without a goal."""
+    """The outcome of each complete episode, by its number; empty for a robot without a goal."""
     if not isinstance(robot, RobotWithGoal):
         return {}
     observed = {episode.number: [episode.start] for episode in session.episodes if episode.is_whole}
