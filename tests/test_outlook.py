@@ -31,7 +31,7 @@ def responses(start_min: float, rate_hz: np.ndarray) -> Responses:
 
 
 def test_a_steady_fall_is_estimated_exactly() -> None:
-    """P50 = 10 exp(-0.01 t), of recordings whose responses are all the same: no error."""
+    """P50 = 10 exp(-0.01 t), with recordings whose responses are all the same: no error."""
     series = [responses(t, np.full(40, 10.0 * math.exp(-0.01 * t))) for t in (0.0, 10.0, 25.0)]
     found = median_drift(series)
     assert found is not None
@@ -55,7 +55,7 @@ def test_the_error_of_a_drift_is_that_of_medians() -> None:
     assert rates.std() == pytest.approx(expected, rel=0.35)
 
 
-def test_the_minutes_to_a_change_are_fewer_the_less_is_known() -> None:
+def test_the_minutes_to_a_change_are_fewer_with_more_uncertainty() -> None:
     likely, least = MedianDrift(-0.01, 0.005).minutes_to(0.25)
     assert (likely, least) == pytest.approx((-100 * math.log(0.75), -50 * math.log(0.75)))
     assert MedianDrift(0.01, 0.0).minutes_to(0.25)[0] == pytest.approx(100 * math.log(1.25))

@@ -98,7 +98,7 @@ def worse(*_: np.ndarray) -> np.ndarray:
 
 
 def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
-    """An answer is larger after a large one."""
+    """A response is larger after a large one."""
     return rate_hz + 1.5 * np.sign(np.concatenate([[0.0], rate_hz[:-1] - 12.0]))
 
 
@@ -153,7 +153,7 @@ def test_where_there_is_no_reason_hardly_one_is_named() -> None:
 
 
 def test_what_differs_between_episodes_is_no_reason() -> None:
-    """Each episode's responses are larger or smaller as a whole: that is no trend, and no other command in all."""
+    """Each episode's responses are larger or smaller as a whole: that is neither a trend nor a different command."""
 
     def uneven(seed: int) -> Any:
         offsets = np.random.default_rng([seed, 1]).normal(0.0, 2.0, EPISODES)
@@ -222,7 +222,7 @@ def test_commands_of_nine_thresholds_show_what_the_median_alone_does_not() -> No
         assert of_nine["answers"].value == pytest.approx(2 * of_each.sum() / 9, abs=0.15)
 
 
-def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
+def test_of_two_readouts_the_one_that_differs_is_named() -> None:
     def on_halves(left: Evidence, right: Evidence) -> Evidence:
         each = [evidence.session for evidence in (left, right)]
         responses = replace(

@@ -1,4 +1,4 @@
-"""Whether policies outperform controls: the rank test counted by hand, and what is said of it."""
+"""Whether policies outperform controls: the rank test counted by hand, and its message."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
 
 
 def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
-    # Of four and four even the clearest difference has p = 0.03; of six and six it has 0.005.
+    # With four and four even the clearest difference has p = 0.03; with six and six it has 0.005.
     four, six = Verdict.of([9.0] * 4, {"a": [0.0] * 4}), Verdict.of(np.arange(6) + 9.0, {"a": np.arange(6.0)})
     assert "4 episodes of the policies and 4 of a control are too few to show" in str(four)
     assert str(six).startswith("the policies outperform every control (p < 0.01; ")
-    # What is known of one control is said, though another was broken off.
+    # The result for one control is reported even if another was broken off.
     both = Verdict.of(np.arange(20.0), {"broken off": [0.0], "better": np.arange(20) + 90.0})
     assert str(both).startswith("the policies do not outperform better (p = ")
     assert str(both).endswith("too few to show (p < 0.01) whether the policies outperform broken off")

@@ -69,7 +69,7 @@ class Commands:
 
             E[f(u) | action] = sum_k w_k f(u_k),    w_k = E[l_k(u) | action]
 
-        with l_k the polynomials (smooth) or the hats (not) that are 1 at node k and 0 at the others. Where all
+        with l_k the polynomials (smooth) or hat functions (otherwise) that are 1 at node k and 0 at the others. If all
         commands are nodes, the weights are their probabilities.
 
         Args:
@@ -124,7 +124,7 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
         probabilities = np.full(levels.shape, 1 / _QUANTILES)
     n_actions = animat.n_conditions
     if is_shuffled(environment):
-        # Whatever is chosen, any condition is delivered: every action leads to the mixture of all.
+        # The delivered condition does not depend on the choice: every action leads to the mixture of all.
         levels = np.tile(levels.reshape(1, -1), (n_actions, 1))
         probabilities = np.tile(probabilities.reshape(1, -1) / n_actions, (n_actions, 1))
     return Commands(np.arange(n_actions), levels, probabilities)
@@ -191,7 +191,7 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
     levels, histories = _answers(animat, simulator, _histories(simulator))
     levels, classes = np.asarray(levels), class_of(simulator, histories)
     if is_shuffled(environment):
-        # Whatever is chosen, any condition is delivered: one action stands for all.
+        # The delivered condition does not depend on the choice: one action represents all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
     actions, even = np.arange(levels.shape[1]), np.full(levels.shape[1:], 1 / levels.shape[-1])
     after = [Commands(actions, of_class.astype(np.float64), even) for of_class in levels]
@@ -219,7 +219,7 @@ def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histori
     recorded = _recorded(simulator)
     ends = np.searchsorted(class_of(simulator, recorded), np.arange(CLASSES + 1))
     within = (np.arange(_HISTORIES_PER_CLASS) + 0.5) / _HISTORIES_PER_CLASS
-    # Only an episode's start can be in a class without recorded histories: their neighbours represent it.
+    # A class without recorded histories can only contain an episode's start; the nearest histories represent it.
     rows = (ends[:-1, None] + within * np.diff(ends)[:, None]).astype(np.int64)
     return recorded[np.minimum(rows, len(recorded) - 1)]
 

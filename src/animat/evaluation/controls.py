@@ -16,7 +16,7 @@ import numpy as np
 from animat.environment import Animat, Environment
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
@@ -43,7 +43,7 @@ class Control:
         meaning: a short description.
         actor: one actor, or the policies side by side.
         n_actors: their number.
-        delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn again at each iteration;
+        delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn at random in each iteration;
             `"silent"`: nothing; `"yoked"`: the stimuli of another episode.
         is_drawn: whether a random recorded response replaces the neurons' own.
         is_turned_round: whether every command is reversed.
@@ -97,7 +97,7 @@ def controls_of(
 
     *random*, an action drawn at random; *constant*, always the same action, one control for each; *heuristic*, the
     robot's `heuristic`, if it has one; and, through neurons, with policies: *silent*, on a culture without stimuli;
-    *shuffled*, with the delivered condition drawn again at each iteration, whatever they choose.
+    *shuffled*, with the delivered condition drawn at random in each iteration, whatever they choose.
 
     Args:
         environment, simulator: what the policies are evaluated in (no simulator without neurons).
@@ -108,12 +108,9 @@ def controls_of(
     for i, label in enumerate(labels):
         controls.append(Control(f"constant {label}", "always this one", Constant(jnp.array([i]))))
     if hasattr(environment.robot, "heuristic"):
-        heuristic: Actor = Heuristic()
-        meaning = "no learning: the command of the robot's heuristic"
-        if environment.n_actions is not None:
-            heuristic = heuristic_policy(environment, simulator)
-            meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
-        controls.append(Control("heuristic", meaning, heuristic))
+        action = "the command" if environment.n_actions is None else "the stimulus nearest to the command"
+        meaning = f"no learning: {action} of the robot's heuristic"
+        controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
     if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
         controls += _without_influence(policies, n_policies)
     return controls

@@ -17,7 +17,7 @@ from scipy.stats import t as student_t
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
@@ -130,7 +130,7 @@ def best_coupling(
     near_heuristic = _near_heuristic(environment, simulator, seen, seed)
     seeds = np.random.default_rng([seed, 31]).integers(2**31, size=(len(KINDS), RESTARTS, 2)).tolist()
     fresh = seeds[0][0][0] + 1
-    found = []
+    best = []
     for kind, of_kind in zip(KINDS, seeds, strict=True):
         last = []
         for restart, (draws, episodes) in enumerate(of_kind):
@@ -153,8 +153,8 @@ def best_coupling(
             last.append(search.population)
         candidates = np.concatenate(last)
         returns = mean_returns(actor(kind, candidates), FRESH_EPISODES, fresh)
-        found.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
-    return max(found, key=lambda each: each[0])[1]
+        best.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
+    return max(best, key=lambda each: each[0])[1]
 
 
 def _near_heuristic(
@@ -167,7 +167,7 @@ def _near_heuristic(
     robot = environment.robot
     if "heuristic" in lacking(robot):
         return np.zeros((0, 0))
-    policy = Heuristic() if environment.n_actions is None else heuristic_policy(environment, simulator)
+    policy = heuristic_policy(environment, simulator)
     ran = trace(environment, simulator, policy, 1, episodes=EPISODES, seed=seed)
     running = np.arange(robot.episode_limit) < ran.lengths[..., None]
     observed = ran.observations[..., :-1, : len(robot.observation_spec)][running]

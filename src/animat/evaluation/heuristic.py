@@ -52,12 +52,14 @@ def _wanted(environment: Environment[Any], observation: Seen) -> Array:
     return commands
 
 
-def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
+def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> Heuristic | HeuristicPolicy:
     """The heuristic policy for an environment and the neurons in it, as one actor for `roll_out`.
 
     Raises:
         InvalidArgument: for a robot without a `heuristic`.
     """
     capability(environment.robot, "heuristic")  # Raises if there is none.
+    if environment.n_actions is None:
+        return Heuristic()
     actions, means = mean_commands(environment, simulator)
     return HeuristicPolicy(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])

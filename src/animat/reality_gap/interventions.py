@@ -93,9 +93,9 @@ def intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str
         where = "measured" if each.is_measured else "simulator"
         lost = f"{each.lost.value:.1f}", each.lost.ends
         cells.append([each.name, f"{each.mean_return:.1f}", *lost, where, each.meaning])
-    usual = f"{policies.measured.mean():.1f}"
     return [
-        f"whose work is it: return with the culture replaced, and the loss from the measured {usual}",
+        "whose work is it: return with the culture replaced, and the loss from the measured "
+        f"{policies.measured.mean():.1f}",
         *lined_up(["", "return", "lost", "95 % interval", "", ""], cells),
     ]
 

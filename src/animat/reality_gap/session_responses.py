@@ -89,8 +89,8 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     place = {each.number: row for row, each in enumerate(whole)}
     presented: list[tuple[int, float, bool, float, float]] = []
     acted: list[tuple[int, int, float, float, bool]] = []
-    of_each = loop.decoder.percentiles_shape[:-1]
-    nothing, commands = np.full(of_each, np.nan).tolist(), []
+    shape = loop.decoder.percentiles_shape[:-1]
+    no_command, commands = np.full(shape, np.nan).tolist(), []
     read_hz: list[Sequence[float]] = []
     for record in session.log.records.words():
         tick = record.get("tick")
@@ -99,7 +99,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
         if tick["iteration"] >= 0 and tick["episode"] in place:
             moved = tick["handled"] == "used"
             read_hz.append(tick.get("readout_hz") or [tick["rate_hz"]])
-            commands.append(tick["command"] if moved else nothing)
+            commands.append(tick["command"] if moved else no_command)
             acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved))
         presented.append(
             (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])
@@ -108,8 +108,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     episode, at, late_s, active_ratio, moved = _columns(acted, 5)
     at = at.astype(np.int64)
     x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
-    before_s = np.concatenate([[-np.inf], read_s[:-1]])
-    is_rested = first_s - before_s > SILENCE_S
+    is_rested = first_s - np.concatenate([[-np.inf], read_s[:-1]]) > SILENCE_S
     presentations = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
     responses = Responses(
         condition=presentations.condition[at],
@@ -129,7 +128,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
         readout_hz=None if loop.readouts.are_all else x_hz,
     )
     returns = np.array([each.total for each in whole], np.float64)
-    command = np.array(commands, np.float64).reshape(len(acted), *of_each)
+    command = np.array(commands, np.float64).reshape(len(acted), *shape)
     return SessionResponses(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
 
 
