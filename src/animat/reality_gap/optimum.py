@@ -13,7 +13,7 @@ from animat.progress import Progress, in_phase
 from animat.robots.grid import grid_for
 
 RESOLUTION = 0.5
-"""Of the grid: fast and coarse, with an error of 0.8 of the cartpole's 200."""
+"""Of the grid: fast and coarse, with an error of 0.8 on the range of 200 of the cartpole."""
 
 
 class BackgroundOptimum:
