@@ -20,7 +20,7 @@ from animat.stimulation.stimulus import Stimulus
 
 @contextmanager
 def opened(backend: str, channels: int, seed: int) -> Iterator[Culture]:
-    """A culture by the name of its backend, open; the number of channels is the virtual one's."""
+    """An open culture by the name of its backend; `channels` is for the virtual culture."""
     if backend == "cl1":
         from animat.cultures.devices.cl1 import CL1Culture
         from animat.cultures.devices.cl1_source import use_simulated_culture
@@ -40,7 +40,7 @@ def opened(backend: str, channels: int, seed: int) -> Iterator[Culture]:
 
 @contextmanager
 def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
-    """A MaxOne whose stand-in answers as the virtual culture does to the pulses that it was given."""
+    """A MaxOne whose stand-in answers pulses as the virtual culture does."""
     import pytest
 
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -48,7 +48,7 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
     from animat.cultures.devices.maxone import MaxOneCulture
 
     class Answering(stand_in_maxlab.Stream):
-        """Lets the tissue live as far as frames are waited for."""
+        """Advances the tissue up to the frames that are waited for."""
 
         def __init__(self, rig: stand_in_maxlab.Rig) -> None:
             super().__init__(rig)
@@ -74,7 +74,7 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
             of = self.spikes[(self.spikes[:, 0] >= start) & (self.spikes[:, 0] < stop)]
             return of[:, 0], of[:, 1]
 
-    # Not known before it is open; what is seen until then is forgotten.
+    # Not known before it is open; spikes until then are discarded.
     amplifier = np.full(len(virtual.channels), -1)
     with pytest.MonkeyPatch.context() as patch:
         rig = stand_in_maxlab.install(patch)
@@ -89,6 +89,6 @@ def _frame(pulse: Any) -> int:
 
 
 def _stimulus(pulses: list[Any], time_s: float) -> Stimulus:
-    """Pulses that began together, as the virtual culture takes them."""
+    """Pulses that began together, in the form that the virtual culture takes."""
     phases = tuple(Phase(50.0 * samples, amplitude_mv=mv) for samples, mv in pulses[0].phases)
     return Stimulus(time_s, tuple(pulse.electrode for pulse in pulses), Pulse(phases))

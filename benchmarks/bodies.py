@@ -1,10 +1,10 @@
-"""How fast a body of others is trained on one core, beside stable-baselines3's SAC on the same body, to one return.
+"""How fast a third-party body is trained on one core, compared with stable-baselines3's SAC to the same return.
 
     python benchmarks/bodies.py [--bodies Pendulum-v1=-200 Reacher-v5=-8] [--cap-s 300] [--json results.json]
 
-Every measurement runs in a process of its own, pinned to one core before anything is imported. Times are processor
-seconds, as other work may run on the machine; compiling and evaluating are left out of them, and told apart. Needs the
-extra `[mujoco]` for Reacher; the peer is left out where stable-baselines3 is not installed.
+Every measurement runs in its own process, pinned to one core before anything is imported. Times are processor seconds,
+as other work may run on the machine, without compilation and evaluation. Reacher needs the extra `[mujoco]`; the peer
+is left out if stable-baselines3 is not installed.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from pathlib import Path
 from typing import Any
 
 EPISODES = 20
-"""Of an evaluation, the most probable action taken at each step."""
+"""Episodes per evaluation, with the most probable action at each step."""
 
 HELD = 2
-"""The return is reached when this many evaluations in a row have it on average: one alone is luck."""
+"""Consecutive evaluations that must reach the return on average: one alone may be luck."""
 
 
 def main() -> int:
-    """Run all parts, or in a child one of them, and print the table."""
-    parser = argparse.ArgumentParser(description="How fast bodies of others are trained, beside stable-baselines3.")
+    """Run all parts, or in a child process one of them, and print the table."""
+    parser = argparse.ArgumentParser(description="How fast third-party bodies are trained, against stable-baselines3.")
     parser.add_argument("--bodies", nargs="+", default=["Pendulum-v1=-200", "Reacher-v5=-8"], metavar="ID=RETURN")
-    parser.add_argument("--cap-s", type=float, default=300.0, help="processor seconds after which one is cut off")
+    parser.add_argument("--cap-s", type=float, default=300.0, help="processor seconds after which training is cut off")
     parser.add_argument("--core", type=int, default=max(os.sched_getaffinity(0)))
-    parser.add_argument("--json", metavar="FILE", help="write everything that was measured to a file")
+    parser.add_argument("--json", metavar="FILE", help="write all measurements to a file")
     parser.add_argument("--part", choices=sorted(PARTS), help=argparse.SUPPRESS)
     options = parser.parse_args()
     wanted = {name: float(value) for name, _, value in (each.partition("=") for each in options.bodies)}
@@ -54,19 +54,20 @@ def main() -> int:
             if ran.returncode:
                 raise SystemExit(f"{id}, {part}: {ran.stderr.strip().splitlines()[-1]}")
             measured[id][part] = json.loads(ran.stdout.splitlines()[-1])
-        print("\n".join(_told(id, return_, measured[id])), flush=True)
+        print("\n".join(_lines(id, return_, measured[id])), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps(measured, indent=2) + "\n")
     return 0
 
 
-def _told(id: str, wanted: float, parts: dict[str, Any]) -> list[str]:
+def _lines(id: str, wanted: float, parts: dict[str, Any]) -> list[str]:
     lines = []
-    for part, told in parts.items():
-        reached = f"{wanted:g} held after" if told["held"] else f"{wanted:g} not held in"
+    for part, figures in parts.items():
+        reached = f"{wanted:g} held after" if figures["held"] else f"{wanted:g} not held in"
         lines.append(
-            f"{id}, {part}: {told['iterations'] / told['training_s']:,.0f} iterations/s; mean return {reached} "
-            f"{told['training_s']:.1f} s and {told['iterations']:,} iterations (the best {max(told['returns']):.1f})"
+            f"{id}, {part}: {figures['iterations'] / figures['training_s']:,.0f} iterations/s; mean return {reached} "
+            f"{figures['training_s']:.1f} s and {figures['iterations']:,} iterations "
+            f"(best {max(figures['returns']):.1f})"
         )
     if len(parts) > 1:
         ours, peer = parts["animat"], parts["stable-baselines3"]
@@ -76,7 +77,7 @@ def _told(id: str, wanted: float, parts: dict[str, Any]) -> list[str]:
 
 
 def _mean_return(id: str, act: Callable[[Any], Any]) -> float:
-    """Of the same episodes for both, in Gymnasium's own environment."""
+    """Mean return over the same episodes for both, in Gymnasium's own environment."""
     import gymnasium
 
     env, returns = gymnasium.make(id), []
@@ -91,7 +92,7 @@ def _mean_return(id: str, act: Callable[[Any], Any]) -> float:
 
 
 class _Watch:
-    """The processor seconds of training alone, and the returns in between."""
+    """Processor seconds of training alone, and the returns of the evaluations."""
 
     def __init__(self, wanted: float, cap_s: float) -> None:
         self.wanted, self.cap_s = wanted, cap_s
@@ -109,7 +110,7 @@ class _Watch:
         last = self.returns[-HELD:]
         return len(last) == HELD and sum(last) / HELD >= self.wanted
 
-    def told(self, iterations: int) -> dict[str, Any]:
+    def to_dict(self, iterations: int) -> dict[str, Any]:
         return {
             "training_s": self.training_s,
             "iterations": iterations,
@@ -119,7 +120,7 @@ class _Watch:
 
 
 def animat(id: str, wanted: float, cap_s: float) -> dict[str, Any]:
-    """One policy of ours without neurons, its settings the defaults, evaluated every 3,200 iterations."""
+    """Our SAC: one policy without neurons, with default settings, evaluated every 3,200 iterations."""
     import numpy as np
 
     from animat.robots import robot_named
@@ -129,7 +130,7 @@ def animat(id: str, wanted: float, cap_s: float) -> dict[str, Any]:
     robot = robot_named(f"gymnasium:{id}")
     training = Training(robot, None, policies=1, iterations=CHUNKS * 3_200)
     together = SideBySide(Group(training, (0,), None, "benchmark", {}))
-    # Compiles, in a training that is thrown away.
+    # Compiles, in a training run that is thrown away.
     began = time.process_time()
     SideBySide(Group(training, (1,), None, "benchmark", {})).train(0, None)
     compiling_s = time.process_time() - began
@@ -145,11 +146,11 @@ def animat(id: str, wanted: float, cap_s: float) -> dict[str, Any]:
             return np.asarray(action, body._dtype)
 
         if watch.is_over(lambda: _mean_return(id, act)):
-            return watch.told(index * 3_200) | {"compiling_s": compiling_s}
+            return watch.to_dict(index * 3_200) | {"compiling_s": compiling_s}
 
 
 def stable_baselines3(id: str, wanted: float, cap_s: float) -> dict[str, Any]:
-    """Its SAC with its defaults, evaluated every 500 steps."""
+    """stable-baselines3's SAC with its defaults, evaluated every 500 steps."""
     import gymnasium
     import torch
     from stable_baselines3 import SAC
@@ -167,7 +168,7 @@ def stable_baselines3(id: str, wanted: float, cap_s: float) -> dict[str, Any]:
     model = SAC("MlpPolicy", gymnasium.make(id), seed=1)
     watch.resumed = time.process_time()
     model.learn(10_000_000, callback=Watching())
-    return watch.told(model.num_timesteps)
+    return watch.to_dict(model.num_timesteps)
 
 
 PARTS: dict[str, Callable[[str, float, float], dict[str, Any]]] = {

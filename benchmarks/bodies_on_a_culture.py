@@ -3,10 +3,10 @@
     python benchmarks/bodies_on_a_culture.py [--bodies cartpole wheels ...] [--seed 1] [--policies 10] [--episodes 3]
         [--out bodies/]
 
-Bodies with one command are trained on `animat record`, those with two on `animat record --places corners`; everything
-else is as by default, but for the number of policies and episodes. The same is trained without neurons, which moves the
-body directly. Everything is kept under `--out`, and what is there already is not done again. Bodies of MuJoCo need the
-extra `[mujoco]`.
+Bodies with one command are trained on `animat record`, those with two on `animat record --places corners`, with default
+settings except for the number of policies and episodes. The same is trained without neurons, so that actions move the
+body directly. Everything is kept under `--out`; existing results are not computed again. MuJoCo bodies need the extra
+`[mujoco]`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ BODIES = (
 def main() -> None:
     """Record, train, run, and print the table."""
     parser = argparse.ArgumentParser(description="Bodies on a culture: predicted and measured returns.")
-    parser.add_argument("--bodies", nargs="+", default=list(BODIES), help="the last one is of the tests' folder")
+    parser.add_argument("--bodies", nargs="+", default=list(BODIES), help="the last one is in the tests' folder")
     parser.add_argument("--seed", type=int, default=1, help="of the virtual culture")
     parser.add_argument("--policies", type=int, default=10)
     parser.add_argument("--episodes", type=int, default=3, help="of each policy, in closed loop")
@@ -62,7 +62,7 @@ COLUMNS = (
 
 
 def row(body: str, options: argparse.Namespace) -> str:
-    """A line of the table."""
+    """A row of the table."""
     places = ["--places", "corners"] if robot_named(body).n_commands == 2 else []
     recordings = str(options.out / f"culture{options.seed}" / (places or ["one-place"])[-1])
     expect(["record", "--seed", str(options.seed), *places, "--out", recordings])
@@ -70,25 +70,25 @@ def row(body: str, options: argparse.Namespace) -> str:
     count = ["--policies", str(options.policies)]
     alone = folder / "without.json"
     if not alone.exists():
-        told = ran(["train", body, "--mapping", "none", *count, "--out", str(folder / "without")])
-        alone.write_text(json.dumps(told) + "\n")
+        outcome = ran(["train", body, "--mapping", "none", *count, "--out", str(folder / "without")])
+        alone.write_text(json.dumps(outcome) + "\n")
     table = folder / "run.json"
     if not table.exists():
         expect(["train", body, "--recordings", recordings, *count, "--out", str(folder / "policies")])
         session = free(folder / "session")
         run = ["run", str(folder / "policies"), "--recordings", recordings, "--out", str(session)]
         # A body from an importable module is imported only where it is named.
-        told = ran([*run, "--robot", body, "--episodes", str(options.episodes)])
+        outcome = ran([*run, "--robot", body, "--episodes", str(options.episodes)])
         ticks = pd.read_csv(session / "ticks.csv")
         ours = ticks[ticks["agent"].str.fullmatch(r"p\d+")]
-        told["episodes"] = int((ours["is_terminated"] | ours["is_truncated"]).sum())
-        told["terminated"] = int(ours["is_terminated"].sum())
-        table.write_text(json.dumps(told) + "\n")
+        outcome["episodes"] = int((ours["is_terminated"] | ours["is_truncated"]).sum())
+        outcome["terminated"] = int(ours["is_terminated"].sum())
+        table.write_text(json.dumps(outcome) + "\n")
     return line(body, json.loads(table.read_text()), json.loads(alone.read_text()))
 
 
 def line(body: str, measured: dict[str, Any], without: dict[str, Any]) -> str:
-    """What was found, as a line of Markdown."""
+    """The results as a line of Markdown."""
     rows = {each["name"]: each for each in measured["rows"]}
     policies, heuristic = measured["rows"][0], rows.get("heuristic")
     prediction, gap = policies["prediction"], policies["gap"]

@@ -1,10 +1,10 @@
-"""How many neurons of the simulated culture a CL application carries in real time.
+"""How many neurons of the simulated culture a CL application can run in real time.
 
     python benchmarks/cl1_in_real_time.py [--neurons 200 300 400 600 1200] [--seconds 30]
 
-The application looks at 1,000 ticks a second and stimulates the channel of every spike, the most that a culture can be
-asked. Each size runs in a process of its own, until its time is over or the SDK ends it. Needs Python 3.12 and the
-extra `[cl1]`, and a machine that does nothing else.
+The application reads 1,000 ticks per second and stimulates the channel of every spike, the highest possible load. Each
+size runs in its own process, until its time is over or the SDK ends it. Needs Python 3.12, the extra `[cl1]`, and an
+otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import time
 
 
 def application(neurons: int, seconds: float) -> dict[str, float | str]:
-    """The application itself; what it stimulated, and how long it took."""
+    """Run the application; return how often it stimulated and how long it took."""
     os.environ.pop("CL_SDK_ACCELERATED_TIME", None)
     from animat.cultures.devices.cl1_source import use_simulated_culture
 
@@ -50,8 +50,8 @@ def application(neurons: int, seconds: float) -> dict[str, float | str]:
 
 
 def main() -> int:
-    """Each size in a process of its own, and a line for each."""
-    parser = argparse.ArgumentParser(description="How many neurons a CL application carries in real time.")
+    """Run each size in its own process, and print a line for each."""
+    parser = argparse.ArgumentParser(description="How many neurons a CL application can run in real time.")
     parser.add_argument("--neurons", type=int, nargs="+", default=[200, 300, 400, 600, 1200])
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)

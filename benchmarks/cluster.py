@@ -1,8 +1,8 @@
-"""What a cluster costs on one machine, and how work grows with policies and cultures.
+"""The overhead of a cluster on one machine, and how work grows with policies and cultures.
 
     python benchmarks/cluster.py [--parts study tasks sizes growth] [--rounds 3] [--json results.json]
 
-Two pinned processes stand beside a Dask scheduler with two workers, in turns. Needs the extra `[cluster]`.
+Two pinned processes are compared with a Dask scheduler and two workers, in turns. Needs the extra `[cluster]`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ WORKERS = 2
 
 @dataclass(frozen=True)
 class Rest(Task):
-    """Takes so long, and leaves a file."""
+    """Takes a given time, and leaves a file."""
 
     number: int
     seconds: float
@@ -56,7 +56,7 @@ class Rest(Task):
 
 
 def timed(work: Callable[[Path, Any], Any], scheduler: Path | None, longest_s: float = 30.0) -> float:
-    """Seconds of some work in a new folder: on pinned processes, or on a cluster that runs already."""
+    """Seconds of some work in a new folder: on pinned processes, or on a running cluster."""
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         if scheduler is None:
@@ -68,7 +68,7 @@ def timed(work: Callable[[Path, Any], Any], scheduler: Path | None, longest_s: f
 
 
 def study(scheduler: Path, rounds: int) -> dict[str, Any]:
-    """The same study on both, in turns, after one that fills the cache of compiled programs."""
+    """The same study on both, in turns, after one run that fills the cache of compiled programs."""
 
     def work(folder: Path, cluster: Any) -> None:
         here = None if cluster else WORKERS
@@ -84,8 +84,8 @@ def study(scheduler: Path, rounds: int) -> dict[str, Any]:
 
 
 def tasks(scheduler: Path, rounds: int) -> dict[str, Any]:
-    """A thousand tasks of a second, of 0.1 s and of nothing, each with its receipt, beside what they rest."""
-    told = {}
+    """A thousand tasks of a second, of 0.1 s and of no work, each with its receipt, and the overhead per task."""
+    figures = {}
     for seconds in (1.0, 0.1, 0.0):
 
         def work(folder: Path, cluster: Any, seconds: float = seconds) -> None:
@@ -100,13 +100,13 @@ def tasks(scheduler: Path, rounds: int) -> dict[str, Any]:
         ):
             took_s = timed(work, where, longest_s)
             over = took_s - 1000 * seconds / WORKERS
-            told[f"{name}, {seconds} s each"] = {"s": took_s, "tasks_a_s": 1000 / took_s, "ms_more_a_task": over}
-    return told
+            figures[f"{name}, {seconds} s each"] = {"s": took_s, "tasks_a_s": 1000 / took_s, "ms_more_a_task": over}
+    return figures
 
 
 def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
-    """Bytes of a study's tasks and answers as they are sent, and of the files that each leaves, by kind."""
-    told: dict[str, list[tuple[int, int, int]]] = {}
+    """Bytes of a study's tasks and answers as sent, and of the files that each leaves, by kind."""
+    by_kind: dict[str, list[tuple[int, int, int]]] = {}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         the_study = read_study(STUDY)
@@ -118,16 +118,16 @@ def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
             task = pickle.dumps((carry_out_alone, (job.task, folder, notice), {}))
             answer = pickle.dumps(Done(dict(receipt.outputs), 1.0))
             left = sum((folder / name).stat().st_size for name in receipt.outputs)
-            told.setdefault(job.name.split("/")[0], []).append((len(task), len(answer), left))
+            by_kind.setdefault(job.name.split("/")[0], []).append((len(task), len(answer), left))
     names = ("task", "answer", "files")
-    return {kind: dict(zip(names, map(max, zip(*rows, strict=True)), strict=True)) for kind, rows in told.items()}
+    return {kind: dict(zip(names, map(max, zip(*rows, strict=True)), strict=True)) for kind, rows in by_kind.items()}
 
 
 def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
     """Seconds for 10, 100 and 1,000 policies of 10,000 iterations, and for a small study on 1, 10 and 100 cultures.
 
-    The study is the tiny one with its first two arms, and each culture has its recordings. On pinned processes, once
-    each, after one of each kind that fills the cache of compiled programs.
+    The study is the tiny one with its first two arms; all cultures share its recordings. Each size runs once on pinned
+    processes, after one run of each kind that fills the cache of compiled programs.
     """
     from training import timeline, training
 
@@ -145,24 +145,24 @@ def growth(scheduler: Path, rounds: int) -> dict[str, Any]:
             study = replace(study, culture=culture, arms=study.arms[:2], optimum_resolution=0.1)
             return timed(lambda folder, _: run_over_cultures(study, folder, base=Path(base), workers=WORKERS), None)
 
-    told = {}
+    seconds = {}
     for name, work, most in (("policies", policies, 1000), ("cultures", cultures, 100)):
         work(2)
         for many in (most // 100, most // 10, most):
-            told[f"{many} {name}"] = work(many)
-            print(f"{many} {name}: {told[f'{many} {name}']:.1f} s", flush=True)
-    return told
+            seconds[f"{many} {name}"] = work(many)
+            print(f"{many} {name}: {seconds[f'{many} {name}']:.1f} s", flush=True)
+    return seconds
 
 
 PARTS = {"study": study, "tasks": tasks, "sizes": sizes, "growth": growth}
 
 
 def main() -> int:
-    """Run the parts and print what was measured."""
+    """Run the parts and print the measurements."""
     parser = argparse.ArgumentParser(description="What a cluster costs on one machine, and how work grows.")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured to a file")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all measurements to a file")
     options = parser.parse_args()
     measured: dict[str, Any] = {"load": os.getloadavg()[0]}
     with tempfile.TemporaryDirectory() as folder, local_cluster(WORKERS, Path(folder) / "cluster.json"):
@@ -175,7 +175,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    # By its own name, so that workers can import its tasks.
+    # Imported by its own name, so that workers can import its tasks.
     import cluster
 
     sys.exit(cluster.main())

@@ -1,9 +1,9 @@
-"""How fast the virtual culture's tissue runs against real time, with Brian2 in the same run.
+"""How fast the virtual culture's tissue runs relative to real time, with Brian2 in the same run.
 
     python benchmarks/culture.py [--seconds 20] [--repeats 3] [--pairs 60]
 
-Pin it to one core. Brian2 2.9 needs NumPy below 2.4, so install it with animat in an environment of its own to have the
-comparison; where it is absent, that is said and the rest is measured.
+Pin it to one core. Brian2 2.9 needs NumPy below 2.4, so install it with animat in a separate environment for the
+comparison. If it is missing, the benchmark says so and measures the rest.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ COLD = "from animat.cultures.tissue import Tissue; Tissue(1).advance(0.001)"
 
 
 def real_time_factor(run: Callable[[float], None], culture_s: float, repeats: int) -> tuple[float, float]:
-    """Culture seconds per second of processor time, and per second on the wall: the medians of several runs.
+    """Culture seconds per second of processor time, and per wall-clock second: the medians of several runs.
 
-    The two differ where other programs share the core.
+    The two differ if other programs share the core.
     """
     processor, wall = [], []
     for _ in range(repeats):
@@ -47,9 +47,9 @@ def real_time_factor(run: Callable[[float], None], culture_s: float, repeats: in
 
 
 def piece_us(living: Living, pairs: int) -> tuple[float, float]:
-    """What a piece of 12.5 ms costs, and what a longer piece costs in the same time, in us of processor time.
+    """The cost of a piece of 12.5 ms, and of a longer piece per same time, in us of processor time.
 
-    Two seconds are passed in one piece and two in pieces, in turns; each figure is the median of all turns.
+    Two seconds are simulated in one piece and two in pieces, in turns; each figure is the median of all turns.
     """
     pieces = round(PAIR_S / PIECE_S)
     took_s: dict[int, list[float]] = {1: [], pieces: []}
@@ -66,7 +66,7 @@ def piece_us(living: Living, pairs: int) -> tuple[float, float]:
 
 
 def compare_pieces(name: str, living: Living, pairs: int) -> None:
-    """Print what cutting time costs."""
+    """Print the cost of cutting time into pieces."""
     piece, whole = piece_us(living, pairs)
     print(
         f"{name}: a piece of 12.5 ms takes {piece:.1f} us ({PIECE_S * 1e6 / piece:.0f} times real time), as part of a "
@@ -87,7 +87,7 @@ def cold_start_s() -> tuple[float, float]:
 
 
 def stimulated(tissue: Tissue, frequency_hz: float) -> Callable[[float], None]:
-    """Pieces of 12.5 ms with patterns of five electrodes out of 32, one each 1/f, as a closed loop gives them."""
+    """Pieces of 12.5 ms with patterns of five electrodes out of 32, one every 1/f, as a closed loop delivers them."""
     rng = np.random.default_rng(1)
     site = np.flatnonzero(tissue.is_excitatory)[:32]
     x_um, y_um = tissue.x_um[site], tissue.y_um[site]
@@ -105,7 +105,7 @@ def stimulated(tissue: Tissue, frequency_hz: float) -> Callable[[float], None]:
 
 
 def brian2_runs(seconds: float) -> list[tuple[str, float]] | None:
-    """Brian2's real-time factor in one piece and in pieces of 12.5 ms, compiled; None where it is not installed."""
+    """Brian2's real-time factor in one piece and in pieces of 12.5 ms, compiled; None if it is not installed."""
     try:
         import brian2  # type: ignore[import-not-found]
     except ImportError:
@@ -137,15 +137,15 @@ def brian2_runs(seconds: float) -> list[tuple[str, float]] | None:
 
 
 def void(_: object) -> None:
-    """A run's results are not wanted here."""
+    """Discard a run's results."""
 
 
 def main() -> None:
     """Measure and print."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
-    arguments.add_argument("--seconds", type=float, default=20.0, help="seconds of culture a run")
+    arguments.add_argument("--seconds", type=float, default=20.0, help="seconds of culture per run")
     arguments.add_argument("--repeats", type=int, default=3)
-    arguments.add_argument("--pairs", type=int, default=60, help="turns in which one piece and many are compared")
+    arguments.add_argument("--pairs", type=int, default=60, help="turns in which one piece is compared with many")
     options = arguments.parse_args()
 
     def in_pieces(culture_s: float) -> None:

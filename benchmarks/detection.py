@@ -1,13 +1,13 @@
-"""How fast spikes are found in raw traces against real time, beside SpikeInterface's own detection in the same run.
+"""How fast spikes are detected in raw traces relative to real time, compared with SpikeInterface in the same run.
 
     python benchmarks/detection.py [--channels 1024] [--seconds 20] [--stimuli-hz 0] [--json results.json]
 
-The traces are synthetic: noise of 5 uV with spikes of 60 uV at known times, 16-bit whole numbers at 20 kHz, in an HDF5
-file as a rig writes it, so that reading counts. Each row is a process of its own on all cores; its memory is the
-largest resident memory of the process, and of those that it started. With stimuli, ours removes artefacts around so
-many a second, and the spikes in what is blanked are lost; SpikeInterface knows of none. Reading and finding
-count, importing does not. Beside the time on the wall is the processor time, which other programs on the machine change
-less: with c cores, c / (processor seconds a second of traces) is the most that can be reached. SpikeInterface is
+The traces are synthetic: noise of 5 uV with spikes of 60 uV at known times, 16-bit integers at 20 kHz, in an HDF5 file
+as a rig writes it, so that reading counts. Each row is a separate process on all cores; its memory is the peak resident
+memory of the process and its children. With `--stimuli-hz`, ours removes artefacts around that many stimuli per second,
+and spikes in blanked intervals are lost; SpikeInterface is not informed of stimuli. Reading and detection count,
+importing does not. Processor time is reported as well as wall-clock time, as other programs on the machine affect it
+less: with c cores, c / (processor seconds per second of traces) is the highest real-time factor. SpikeInterface is
 optional (`animat[raw]`).
 """
 
@@ -35,7 +35,7 @@ ENGINES = ("animat", "spikeinterface")
 
 
 def write_traces(path: Path, channels: int, seconds: float) -> None:
-    """Traces (samples, channels) and the true spikes of each channel, second by second to save memory."""
+    """Traces (samples, channels) and the true spikes of each channel, made second by second to save memory."""
     rng = np.random.default_rng(1)
     shape = -60 / STEP_UV * np.exp(-((np.arange(-20, 41) / 3.0) ** 2) / 2)
     samples = round(seconds * RATE_HZ)
@@ -46,7 +46,7 @@ def write_traces(path: Path, channels: int, seconds: float) -> None:
             stop = min(start + round(RATE_HZ), samples)
             piece = rng.normal(0, 5 / STEP_UV, (stop - start, channels)).astype(np.float32)
             for channel in range(channels):
-                # No two within 3 ms, none at the ends of the second.
+                # No two within 3 ms, and none at the ends of the second.
                 at = 100 + np.cumsum(60 + rng.exponential(RATE_HZ / SPIKES_PER_S - 60, 20).astype(int))
                 at = at[at < stop - start - 100]
                 for sample in at:
@@ -94,7 +94,7 @@ def measure(engine: str, path: Path, stimuli_hz: float) -> dict[str, float]:
 
 
 def by_spikeinterface(path: Path, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """SpikeInterface's own noise, filter and detection as they come, on the same samples in memory."""
+    """SpikeInterface's noise estimate, filter and detection with default settings, on the same samples in memory."""
     import spikeinterface.core as core
     import spikeinterface.preprocessing as preprocessing
     from spikeinterface.sortingcomponents.peak_detection import detect_peaks
@@ -124,8 +124,8 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
     arguments.add_argument("--channels", type=int, default=1024)
     arguments.add_argument("--seconds", type=float, default=20.0, help="of traces")
-    arguments.add_argument("--stimuli-hz", type=float, default=0.0, help="around which artefacts are removed")
-    arguments.add_argument("--json", type=Path, help="file for the figures")
+    arguments.add_argument("--stimuli-hz", type=float, default=0.0, help="stimuli around which artefacts are removed")
+    arguments.add_argument("--json", type=Path, help="write all measurements to a file")
     arguments.add_argument("--measure", help=argparse.SUPPRESS)
     arguments.add_argument("--path", type=Path, help=argparse.SUPPRESS)
     options = arguments.parse_args()

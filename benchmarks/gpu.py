@@ -1,9 +1,9 @@
-"""How fast a GPU trains many policies at once, beside one core and all cores of the same machine.
+"""How fast a GPU trains many policies at once, compared with one core and all cores of the same machine.
 
     python benchmarks/gpu.py --recordings recordings/ [--policies 4 20 100 400 1000]
 
-Cartpole with nine thresholds on the first recording, as `animat train` has it. Every measurement is a process of its
-own; those of cores train five policies and are pinned before JAX is imported.
+Cartpole with nine thresholds on the first recording, as `animat train` runs it. Every measurement is a separate
+process; those on cores train five policies and are pinned before JAX is imported.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from training import finish
 ITERATIONS = 400_000
 POLICIES_A_CORE = 5
 CHUNKS = 8
-"""Sixtieths of a training that are timed: seconds, in which all cores are at work at once."""
+"""Sixtieths of a training run that are timed: seconds, in which all cores work at the same time."""
 
 
 def main() -> None:
-    """Measure the cores, then one number of policies after the other, and print the table."""
-    parser = argparse.ArgumentParser(description="How fast a GPU trains many policies, beside the cores here.")
+    """Measure the cores, then each number of policies in turn, and print the table."""
+    parser = argparse.ArgumentParser(
+        description="How fast a GPU trains many policies, compared with this machine's cores."
+    )
     parser.add_argument("--recordings", required=True)
     parser.add_argument("--policies", type=int, nargs="+", default=[4, 20, 100, 400, 1000])
     parser.add_argument("--measure", type=int, help=argparse.SUPPRESS)
@@ -57,7 +59,7 @@ def main() -> None:
 
 
 def started(recordings: str, policies: int, core: int | None = None) -> subprocess.Popen[str]:
-    """A measurement in a process of its own: on a core, or on whatever JAX finds."""
+    """Run a measurement in a separate process: on a core, or on the device that JAX finds."""
     command = [sys.executable, __file__, "--recordings", recordings, "--measure", str(policies)]
     command += [] if core is None else ["--core", str(core)]
     environment = os.environ | ({} if core is None else {"JAX_PLATFORMS": "cpu"})
@@ -65,7 +67,7 @@ def started(recordings: str, policies: int, core: int | None = None) -> subproce
 
 
 def measured(recordings: str, policies: int) -> dict[str, Any]:
-    """Seconds of a first chunk, which compiles, and of those after it; and the bits of all networks at the end."""
+    """Seconds of the first chunk, which compiles, and of later ones; and a hash of all networks at the end."""
     import jax
     import numpy as np
 

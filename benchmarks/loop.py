@@ -1,19 +1,19 @@
-"""How fast the closed loop decides, and whether it keeps its deadlines, beside an idle loop in the same run.
+"""How fast the closed loop decides, and whether it meets its deadlines, compared with an idle loop in the same run.
 
     python benchmarks/loop.py [--ticks 100000] [--minutes 10] [--json results.json]
 
-Closing: how long that session takes from its last tick until its recording is written, and the memory of it all.
-
 Decision: from the end of the response window, when a culture of 1,024 channels has handed over its spikes, until the
-next stimulus has passed the guard and is handed to the culture. In between lie the extraction of the response, the
-mapping, the robot's step, the log, the policy, the patterns and the safety limits. Beside it, the jitter of the
-machine: a loop that does nothing but wait for as long as a decision takes.
+next stimulus has passed the guard and is handed to the culture. In between are the extraction of the response, the
+mapping, the robot's step, the log, the policy, the patterns and the safety limits. The reference is the jitter of the
+machine: a loop that only waits for as long as a decision takes.
+
+Closing: how long that session takes from its last tick until its recording is written, and its peak memory.
 
 Deadlines: a session in real time at 80 Hz, where 2.4 ms are left from the window's end to the next pulse. At the same
-time, on the same core, an idle loop in a process of its own has the same deadlines: it sleeps until each window's end,
-and once more for as long as a decision takes. A miss of the loop alone is its own. One of both is the machine's
-(another process, a hypervisor) where the loop's process had hardly run meanwhile, which is measured too; a loop that
-computed for so long would have kept the core from both.
+time, on the same core, an idle loop in another process has the same deadlines: it sleeps until each window's end, and
+then for as long as a decision takes. A miss of the loop alone is its own. A miss of both is the machine's (another
+process, a hypervisor) if the loop's process had hardly run in between, which is measured too; a loop that computed for
+that long would have kept the core from both.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ from animat.training.policy import Policy
 
 CHANNELS = 1024
 SPIKES = 300
-"""In one stretch of 10 ms: what 1,024 channels answer at 20 Hz each, and half as much again."""
+"""Spikes in 10 ms: 1.5 times as many as 1,024 channels fire at 20 Hz each."""
 PERIOD_S, WINDOW_S = 1 / 80, 0.0101
 PAUSE_S = 0.1
 DECISION_S = 0.001
-"""The idle loop's: what a decision takes where the core has slept before it, but for a few of a hundred."""
+"""Of the idle loop: longer than all but a few per cent of decisions after the core has slept."""
 CONDITIONS = tuple(Condition(f"{hz} Hz", float(hz), "Hz") for hz in (5, 10, 20, 40, 80))
 
 
 class Instant(Culture):
-    """1,024 channels that answer at once, from a store of spikes, and note when they are asked and have answered."""
+    """1,024 channels that answer instantly, from a store of spikes, and record when they are asked and answer."""
 
     name: ClassVar[str] = "instant"
 
@@ -130,7 +130,7 @@ _NOTHING = np.empty(0), np.empty(0, np.int64)
 
 
 def policy() -> Policy:
-    """Two hidden layers of 64 units, as trained ones have; its weights are random but for the last condition's bias."""
+    """Two hidden layers of 64 units, as in trained policies; weights are random, except the last condition's bias."""
     rng = np.random.default_rng(3)
     sizes = (4, 64, 64, 5)
     weights = tuple((rng.standard_normal((a, b)) / np.sqrt(a)).astype(np.float32) for a, b in itertools.pairwise(sizes))
@@ -148,7 +148,7 @@ def policy() -> Policy:
 
 
 def loop_of(iterations: int, **settings: Any) -> Loop:
-    """A loop whose robot never falls: an episode lasts as long as is measured."""
+    """A loop whose robot never falls: an episode lasts as long as the measurement."""
     robot = Cartpole(angle_limit_rad=1e8, force_n=0.0, episode_limit=iterations)
     percentiles = np.linspace(0, 40, 11)
     settings = {"pause_s": PAUSE_S, "warm_up": 0, **settings}
@@ -156,7 +156,7 @@ def loop_of(iterations: int, **settings: Any) -> Loop:
 
 
 def decisions_us(ticks: int) -> tuple[np.ndarray, dict[str, float]]:
-    """How long each decision took; and how long the session took to close after its last tick, with how much memory."""
+    """How long each decision took; and how long the session took to close after its last tick, with its peak memory."""
     with tempfile.TemporaryDirectory() as folder, Instant(ticks + 1) as culture:
         agent = Agent("policy", "random weights", Greedy(policy()))
         session = run_session(culture, loop_of(ticks), [agent], folder, episodes=1)
@@ -167,12 +167,12 @@ def decisions_us(ticks: int) -> tuple[np.ndarray, dict[str, float]]:
         }
         assert session.ending.by == "plan", session.ending
         assert session.outline.ticks == ticks
-        # Number 0 is the pause, and the first decision is made at its end.
+        # Number 0 is the pause; the first decision is made at its end.
         return (culture.asked_ns[1:] - culture.answered_ns[:-1]) / 1e3, closing
 
 
 def idle_us(waits: int, length_us: float) -> np.ndarray:
-    """How long a wait of `length_us` took, that does nothing but look at the clock."""
+    """How long a busy wait of `length_us` took."""
     took = np.empty(waits)
     now = time.perf_counter_ns
     for i in range(waits):
@@ -184,7 +184,7 @@ def idle_us(waits: int, length_us: float) -> np.ndarray:
 
 
 class OnOneCore(Instant):
-    """Keeps the loop's thread, which is the one that asks, on one core, and tells when each window will end."""
+    """Keeps the loop's thread, which is the caller, on one core, and publishes when each window will end."""
 
     def __init__(self, window_ends_s: Synchronized[float]) -> None:
         super().__init__(deliveries=0)
@@ -205,35 +205,35 @@ class OnOneCore(Instant):
 
 
 def stay_on_one_core() -> None:
-    """Of the calling thread, where the system can."""
+    """Pin the calling thread, where the system can."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
-def idle_loop(told: Connection, window_ends_s: Synchronized[float]) -> None:
-    """Has the deadlines of a session and nothing to do; sends how late it was, in ms, after each window's end."""
+def idle_loop(parent: Connection, window_ends_s: Synchronized[float]) -> None:
+    """Meet the deadlines of a session with nothing to do; send how late it was, in ms, after each window's end."""
     stay_on_one_core()
     gc.disable()
     late: dict[float, float] = {}
-    told.send("ready")
+    parent.send("ready")
     before_s = 0.0
-    while not told.poll():
+    while not parent.poll():
         end_s = window_ends_s.value
         if end_s == before_s:
             time.sleep(0.001)
             continue
         before_s = end_s
         for until_s in (end_s, end_s + DECISION_S):
-            # Never spun: the loop beside it needs the core just then.
+            # No busy wait: the measured loop needs the core just then.
             time.sleep(max(0.0, until_s - time.perf_counter()))
         late[end_s] = 1e3 * max(0.0, time.perf_counter() - (end_s - WINDOW_S + PERIOD_S))
         time.sleep(0.004)
-    told.send(late)
+    parent.send(late)
 
 
 def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each pulse of a session in real time at 80 Hz: how late it came, how late an idle loop was at the same time,
-    and for how long the session's process had run since the pulse before."""
+    """For each pulse of a session in real time at 80 Hz: how late it came, how late an idle loop was at the same time,
+    and for how long the session's process had run since the previous pulse, all in ms."""
     spawning = multiprocessing.get_context("spawn")
     here, there = spawning.Pipe()
     window_ends_s = spawning.Value("d", 0.0)
@@ -244,12 +244,12 @@ def late_ms(ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         agent = Agent("policy", "random weights", Greedy(policy()))
         session = run_session(culture, loop_of(ticks, real_time=True), [agent], folder, episodes=1)
         assert session.ending.by == "plan", session.ending
-        # Ticks are read from the log, which goes with the folder.
+        # Ticks are read from the log, which is deleted with the folder.
         late = np.array([1e3 * tick.late_s for tick in session.ticks])
         assert len(late) == ticks
     here.send("over")
     idle_late = here.recv()
-    # A window's end that it never saw, it slept over. The first pulse is an interval after the pause, without hurry.
+    # A window's end that the idle loop never saw, it overslept. The first pulse is an interval after the pause.
     ends_s = culture.ends_s[1:-1]
     return late[1:], np.array([idle_late.get(end_s, 1e3 * PERIOD_S) for end_s in ends_s]), np.diff(culture.used_ms)[1:]
 
@@ -268,7 +268,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
     parser.add_argument("--ticks", type=int, default=100_000)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of the session in real time; 0 leaves it out")
+    parser.add_argument("--minutes", type=float, default=10.0, help="length of the session in real time; 0 skips it")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
 

@@ -1,10 +1,11 @@
-"""Policies trained on one recording, by shadowing, and on recordings that are drawn, over 90 minutes of closed loop.
+"""Policies trained on one recording, by shadowing, and on randomly drawn recordings, over 90 minutes of closed loop.
 
     python benchmarks/over_drift.py [--seeds 1 2 3 4 5] [--robot cartpole] [--episodes 12] [--pause-s 30] [--out drift/]
 
 Each virtual culture is recorded every ten minutes up to 60 min, as `animat record` does. The same policies are trained
-three ways on that. Then all of them run in one session, in turn, with pauses that make it an hour and a half long: once
-with adaptive thresholds, and once with fixed ones on the culture in the same state. Everything is kept under `--out`.
+on that in three ways. Then all of them run in one session, in turn, with pauses that make it an hour and a half long:
+once with adaptive thresholds, and once with fixed ones on the culture in the same state. Everything is kept under
+`--out`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def main() -> None:
 
 
 def run_through(seed: int, options: argparse.Namespace) -> None:
-    """A culture's recordings, policies and two sessions; a session that is there already is not run again."""
+    """Make a culture's recordings, policies and two sessions; an existing session is not run again."""
     culture = options.out / f"culture{seed}"
     recordings, together = culture / "recordings", culture / "policies"
     expect(["record", "--seed", str(seed), "--sessions", "7", "--interval-min", "10", "--out", str(recordings)])
@@ -65,7 +66,7 @@ def run_through(seed: int, options: argparse.Namespace) -> None:
 
 
 def episodes_of(session: Path) -> pd.DataFrame:
-    """Way of training, minute and return of each whole episode."""
+    """The way of training, minute and return of each complete episode."""
     ticks = pd.read_csv(session / "ticks.csv")
     grouped = ticks.groupby("episode")
     episodes = pd.DataFrame(

@@ -1,6 +1,6 @@
-"""DQN of others on `Animat/Cartpole-v0`: one policy on one core until it reaches a return or its time is up.
+"""Third-party DQN on `Animat/Cartpole-v0`: one policy on one core until it reaches a return or its time is up.
 
-DQN, because it is what both have for discrete actions: SAC in stable-baselines3 and sbx is for continuous ones only.
+DQN is what both have for discrete actions: SAC in stable-baselines3 and sbx is for continuous actions only.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ TUNED = {
     "exploration_final_eps": 0.05,
     "exploration_fraction": 0.025,
 }
-"""Ours where the two share a setting (the replay ratio of 1/8 among them); the others as is usual for such tasks."""
+"""Our values where both have a setting (including the replay ratio of 1/8); the others are usual for such tasks."""
 
 STEPS = 800_000
-"""How long they would train if nothing stopped them, as ours does; the exploration's share is of this."""
+"""How long they would train if nothing stopped them, as ours does; `exploration_fraction` refers to this."""
 
 EVALUATED_EVERY = 5_000
 """Steps between evaluations; training ends when the last `HELD` of them reach the return on average."""
@@ -39,10 +39,10 @@ HELD = 3
 
 
 def train_peer(name: str, seed: int, wanted: float, cap_s: float) -> dict[str, Any]:
-    """Train one policy, and say for how long without the evaluations, for how many steps, and how far it came.
+    """Train one policy; return the time without evaluations, the number of steps, and the returns reached.
 
-    DQN's return goes up and down from one evaluation to the next. So two times are taken: when an evaluation reached
-    the return for the first time, and when it held.
+    DQN's return fluctuates from one evaluation to the next. So two times are taken: when an evaluation first reached
+    the return, and when the return held.
     """
     import gymnasium
     import numpy as np
@@ -65,7 +65,7 @@ def train_peer(name: str, seed: int, wanted: float, cap_s: float) -> dict[str, A
     many = gymnasium.make_vec("animat:Animat/Cartpole-v0", num_envs=100, mapping="9-thresholds")
 
     def mean_return(model: Any) -> float:
-        """Of 100 episodes, each the first of one environment, the best action taken at each step."""
+        """Mean return of 100 episodes, each the first of one environment, with the best action at each step."""
         observation, _ = many.reset(seed=1000)
         returns, going = np.zeros(100), np.ones(100, bool)
         while going.any():
@@ -76,7 +76,7 @@ def train_peer(name: str, seed: int, wanted: float, cap_s: float) -> dict[str, A
         return float(returns.mean())
 
     class Watch(BaseCallback):  # type: ignore[misc]
-        """Evaluates now and then with the clock stopped, and ends the training."""
+        """Evaluates at intervals with the clock stopped, and ends the training."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -98,7 +98,7 @@ def train_peer(name: str, seed: int, wanted: float, cap_s: float) -> dict[str, A
 
     environment = make()
     if which == "tuned":
-        # The same scales that our learner divides observations and rewards by.
+        # The scales by which our learner divides observations and rewards.
         environment = gymnasium.wrappers.TransformObservation(environment, lambda o: o / scales, None)
         environment = gymnasium.wrappers.TransformReward(environment, lambda reward: 0.1 * float(reward))
         settings = TUNED | {"policy_kwargs": {"net_arch": net_arch}}

@@ -1,11 +1,11 @@
-"""How far two commands can be set apart: the readouts' responses to each condition of place and frequency.
+"""How well two commands can be separated: the readouts' responses to each condition of place and frequency.
 
     python benchmarks/readouts.py [--cultures 1 2 3] [--places halves] [--frequencies 5 80] [--trials 500]
     python benchmarks/readouts.py --places corners --frequencies 20
 
-Of each virtual culture one recording is made, with its conditions mixed, one pulse each. Printed, as a table of
-Markdown, is for each condition how often each readout gives a command above 0 (x of P50 or more), how often each corner
-of commands is hit, and Spearman's correlation of the readouts within the condition.
+Each virtual culture is recorded once, with its conditions mixed, one pulse each. The output is a Markdown table. It
+shows for each condition how often each readout gives a command above 0 (x of P50 or more), how often each corner of
+commands is hit, and Spearman's correlation of the readouts within the condition.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def recorded(seed: int, places: str, frequencies_hz: tuple[float, ...], trials: 
 
 
 def table(responses: Responses) -> list[str]:
-    """A row a condition."""
+    """A row for each condition."""
     names, p50_hz = responses.readouts.names, np.median(responses.read_hz[~responses.is_burst], axis=0)
     corners = list(itertools.product((False, True), repeat=len(names)))
     signs = ["".join("+" if up else "-" for up in corner) for corner in corners]
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--cultures", type=int, nargs="+", default=[1, 2, 3], help="seeds")
     parser.add_argument("--places", default="halves", choices=NAMED)
     parser.add_argument("--frequencies", type=float, nargs="+", default=[5.0, 80.0], help="Hz")
-    parser.add_argument("--trials", type=int, default=500, help="of each condition")
+    parser.add_argument("--trials", type=int, default=500, help="trials of each condition")
     given = parser.parse_args()
     for seed in given.cultures:
         responses = recorded(seed, given.places, tuple(given.frequencies), given.trials)

@@ -5,16 +5,15 @@
         [--controls] [--out gap/]
     python benchmarks/reality_gap.py --backends virtual cl1 maxone --channels 1024 256 128 60 16
 
-For each virtual culture and way - the commands without options, as in the README; the paper's blocks with one pulse,
-mixed with one, mixed with five, and mixed with one, recorded five times as long and simulated with its memory, through
-one threshold and through nine - the culture is
-recorded at 0 and 10 min, policies are trained on that, and run in closed loop on the same
-culture from where the last recording left it.
-Everything is kept under `--out`, one folder each; what is there already is not done again.
+Each virtual culture is recorded at 0 and 10 min, and policies are trained on that and run in closed loop on the same
+culture, in the state in which the last recording left it. The ways are: the commands without options, as in the README;
+the paper's blocks with one pulse; mixed with one; mixed with five; and mixed with one, recorded five times as long and
+simulated with memory, with one threshold and with nine. Everything is kept under `--out`, one folder each; existing
+results are not computed again.
 
-With `--backends` each culture is opened once, recorded at 0 and 10 min as without options, and run by policies that
-are trained as without options: the virtual culture with so many channels, the CL1 through its SDK's simulator and the
-MaxOne through the tests' stand-in, both over the same tissue.
+With `--backends` each culture is opened once, recorded at 0 and 10 min with default settings, and run by policies
+trained with default settings: the virtual culture with `--channels` channels, the CL1 through its SDK's simulator and
+the MaxOne through the tests' stand-in, the last two over the same tissue.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Way:
-    """How a culture is recorded and simulated, and what policies act through."""
+    """How a culture is recorded and simulated, and the mapping of the policies."""
 
     order: str = "mixed"
     pulses: int = 1
@@ -59,7 +58,7 @@ class Way:
 
     @property
     def recorded(self) -> str:
-        """In words."""
+        """Order, pulses and trials."""
         return f"{self.order}, {self.pulses}, {self.trials} times"
 
 
@@ -74,7 +73,7 @@ WAYS = {
 
 
 def recording_options(way: Way | None) -> list[str]:
-    """Of `animat record`."""
+    """Options of `animat record`."""
     if way is None:
         return []
     presented = ["--order", way.order, "--pulses", str(way.pulses), "--trials", str(way.trials)]
@@ -82,7 +81,7 @@ def recording_options(way: Way | None) -> list[str]:
 
 
 def training_options(way: Way | None, robot: str, policies: int, iterations: int | None) -> list[str]:
-    """Of `animat train`; the paper's iterations, unless asked otherwise."""
+    """Options of `animat train`; iterations are the paper's by default."""
     if way is None:
         return []
     given = ["--policies", str(policies), "--simulator", way.simulator, "--mapping", way.mapping]
@@ -90,7 +89,7 @@ def training_options(way: Way | None, robot: str, policies: int, iterations: int
 
 
 def running_options(way: Way | None, thresholds: str, episodes: int, *, controls: bool) -> list[str]:
-    """Of `animat run`."""
+    """Options of `animat run`."""
     if way is None:
         return []
     return ["--episodes", str(episodes), "--controls", "all" if controls else "random", "--thresholds", thresholds]
@@ -106,10 +105,12 @@ def main() -> None:
     parser.add_argument("--policies", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--iterations", type=int, help="default: the paper's")
-    parser.add_argument("--controls", action="store_true", help="all controls, not the random one only")
+    parser.add_argument("--controls", action="store_true", help="all controls, not only the random one")
     parser.add_argument("--out", type=Path, default=Path("gap"))
     parser.add_argument("--backends", nargs="+", choices=["virtual", "cl1", "maxone"], default=[])
-    parser.add_argument("--channels", type=int, nargs="+", default=[1024], help="of the virtual culture")
+    parser.add_argument(
+        "--channels", type=int, nargs="+", default=[1024], help="numbers of channels of the virtual culture"
+    )
     options = parser.parse_args()
 
     lines: list[str] = []
@@ -140,16 +141,16 @@ def main() -> None:
                     run = ["run", policies, "--recordings", recordings, "--out", str(free(folder / thresholds))]
                     run += running_options(way, thresholds, options.episodes, controls=options.controls)
                     table.write_text(json.dumps(ran(run)) + "\n")
-                lines.append(told(seed, way, thresholds, read_table(table)))
+                lines.append(table_row(seed, way, thresholds, read_table(table)))
                 print(lines[-1], flush=True)
     print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
     print("\n".join(lines))
 
 
 def live_once(backend: str, channels: int, seed: int, robot: str, options: argparse.Namespace) -> str | None:
-    """A line of the table: a culture that is opened once is recorded, and driven by policies trained on that.
+    """A row of the table: a culture is opened once, recorded, and driven by policies trained on that.
 
-    None for a session that did not end by its plan.
+    None for a session that did not end as planned.
     """
     from animat.cultures.kinds import pulse_for
     from animat.cultures.series import record_series
@@ -162,7 +163,7 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
     folder = options.out / f"culture{seed}" / f"{backend}{channels or ''}" / robot
     table = folder / "once.json"
     if not table.exists():
-        # A culture that was left half way is not there again.
+        # A culture that was left half way cannot be resumed.
         attempt = next(path for i in itertools.count() if not (path := folder / f"attempt{i}").exists())
         with backends.opened(backend, channels, seed) as culture:
             pulse = pulse_for(backend)
@@ -188,33 +189,33 @@ def live_once(backend: str, channels: int, seed: int, robot: str, options: argpa
             print(f"{attempt}: no row: {outcome['session']['ended']}", file=sys.stderr)
             return None
         table.write_text(json.dumps(outcome) + "\n")
-    return told(seed, None, "adaptive", read_table(table))
+    return table_row(seed, None, "adaptive", read_table(table))
 
 
 FORMER = {"lived": "measured", "limit": "optimum"}
-"""Keys as tables of before have them."""
+"""Keys in older tables."""
 FORMER_FILES = {"adaptive": "follow", "fixed": "held"}
-"""What tables of before are called."""
+"""Names of older tables."""
 
 
 def table_of(folder: Path, thresholds: str) -> Path:
-    """Where the table is: the former one, or the new one."""
+    """Path of the table: the older one if it exists, else the new one."""
     former = folder / f"{FORMER_FILES[thresholds]}.json"
     return former if former.exists() else folder / f"{thresholds}.json"
 
 
 def read_table(file: Path) -> dict[str, Any]:
-    """What a run came to."""
+    """The results of a run."""
     found: dict[str, Any] = json.loads(file.read_text(), object_hook=_renamed)
     return found
 
 
-def _renamed(words: dict[str, Any]) -> dict[str, Any]:
-    return {FORMER.get(key, key): value for key, value in words.items()}
+def _renamed(pairs: dict[str, Any]) -> dict[str, Any]:
+    return {FORMER.get(key, key): value for key, value in pairs.items()}
 
 
-def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:
-    """A line of the table; the range is from random to the optimum, both on the simulator."""
+def table_row(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> str:
+    """A row of the table; the range is from random to the optimum, both on the simulator."""
     policies, random = ran["rows"][0], next(row for row in ran["rows"] if row["name"] == "random")
     prediction, gap = policies["prediction"], policies["gap"]
     cells = (
@@ -234,7 +235,7 @@ def told(seed: int, way: Way | None, thresholds: str, ran: dict[str, Any]) -> st
 
 
 def free(folder: Path) -> Path:
-    """A folder that no session is in: one that was killed before its table was written keeps its own."""
+    """A folder without a session: one that was killed before its table was written keeps its folder."""
     names = (folder.with_name(f"{folder.name}{number or ''}") for number in itertools.count())
     return next(name for name in names if not (name / "session.log").exists())
 

@@ -1,8 +1,8 @@
-"""How fast policies are trained and answer, beside what others need for the same: see README.md in this folder.
+"""How fast policies are trained and answer, compared with third-party learners: see README.md in this folder.
 
     python benchmarks/training.py [--quick] [--json results.json]
 
-Every measurement runs in a process of its own, pinned to one core before anything is imported.
+Every measurement runs in its own process, pinned to one core before anything is imported.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ MIB = 2**20
 
 
 def main() -> int:
-    """Run all parts, or in a child one of them, and print the table."""
-    parser = argparse.ArgumentParser(description="How fast policies are trained and answer, beside others.")
+    """Run all parts, or in a child process one of them, and print the table."""
+    parser = argparse.ArgumentParser(description="How fast policies are trained and answer, compared with others.")
     parser.add_argument("--quick", action="store_true", help="about two minutes: fewer repeats, peers cut off sooner")
-    parser.add_argument("--json", metavar="FILE", help="write everything that was measured to a file")
+    parser.add_argument("--json", metavar="FILE", help="write all measurements to a file")
     parser.add_argument("--return", type=float, default=40.0, dest="wanted", help="mean return to reach (default: 40)")
     parser.add_argument("--cap-s", type=float, help="seconds of training after which a peer is cut off")
     parser.add_argument("--part", choices=sorted(PARTS), help=argparse.SUPPRESS)
@@ -54,11 +54,11 @@ def main() -> int:
     return 0
 
 
-# --- one process a part ---------------------------------------------------------------------------------------------
+# --- one process per part--------------------------------------------------------------------------------------------
 
 
 def start(part: str, cache: Path, core: int | None, **given: Any) -> subprocess.Popen[str]:
-    """A part in a process of its own, with its own folder of compiled programs."""
+    """Run a part in its own process, with its own folder of compiled programs."""
     command = [sys.executable, __file__, "--part", part, "--given", json.dumps(given)]
     command += [] if core is None else ["--core", str(core)]
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PLATFORMS": "cpu"}
@@ -66,7 +66,7 @@ def start(part: str, cache: Path, core: int | None, **given: Any) -> subprocess.
 
 
 def finish(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """What a part measured."""
+    """The measurements of a part."""
     output, _ = process.communicate()
     if process.returncode != 0:
         raise SystemExit(f"a part of the benchmark ended with status {process.returncode}: {process.args!r}")
@@ -75,7 +75,7 @@ def finish(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 def measure(folder: Path, *, quick: bool, wanted: float, cap_s: float) -> dict[str, Any]:
-    """All of it, in one go."""
+    """Run all parts."""
     cores = sorted(os.sched_getaffinity(0))
     first = cores[0]
     cache = folder / "cache"
@@ -101,7 +101,7 @@ def measure(folder: Path, *, quick: bool, wanted: float, cap_s: float) -> dict[s
             measured[peer] = None
             continue
         say(f"time to the same return: {peer}, for {cap_s:g} s of training at most")
-        # Two at once, one on each core, as ours has both too.
+        # Two at the same time, one on each core, as ours uses both too.
         running = [
             start("peer", cache, core, name=peer, seed=seed, wanted=wanted, cap_s=cap_s)
             for seed, core in enumerate(cores[:2])
@@ -111,7 +111,7 @@ def measure(folder: Path, *, quick: bool, wanted: float, cap_s: float) -> dict[s
 
 
 def of_ten(seeds: list[dict[str, Any]], cap_s: float, ours_s: float) -> dict[str, Any]:
-    """From one policy a core to ten policies on as many cores; where one was cut off, these are lower bounds."""
+    """Scale from one policy per core to ten policies on as many cores; lower bounds if one was cut off."""
     scale = 10 / len(seeds)
     first_s = scale * statistics.mean(seed["first_s"] or cap_s for seed in seeds)
     held_s = scale * statistics.mean(seed["training_s"] for seed in seeds)
@@ -123,7 +123,7 @@ def of_ten(seeds: list[dict[str, Any]], cap_s: float, ours_s: float) -> dict[str
 
 
 def machine(n_cores: int) -> dict[str, Any]:
-    """What it was measured on."""
+    """A description of the machine."""
     names = ("animat", "jax", "numpy", "stable_baselines3", "sbx-rl", "torch")
     versions = {}
     for name in names:
@@ -135,7 +135,7 @@ def machine(n_cores: int) -> dict[str, Any]:
 
 
 def say(what: str) -> None:
-    """Where it is, on standard error."""
+    """Print the progress to standard error."""
     print(f"[{time.strftime('%H:%M:%S')}] {what}", file=sys.stderr, flush=True)
 
 
@@ -143,7 +143,7 @@ def say(what: str) -> None:
 
 
 def algorithm() -> Any:
-    """Our default settings, at eight iterations an update whatever the default is."""
+    """Our default settings, but always with eight iterations per update."""
     from dataclasses import replace
 
     from animat.training.settings import SAC
@@ -153,7 +153,7 @@ def algorithm() -> Any:
 
 
 def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
-    """(environment, settings, simulator, compiled-to-be chunk, learners-to-be), as a worker makes them."""
+    """(environment, settings, simulator, chunk to compile, learners to create), as a worker makes them."""
     from animat.coding.mapping import mapping_named
     from animat.compilation import keep_compilations
     from animat.environment import Animat
@@ -169,7 +169,7 @@ def program(policies: int) -> tuple[Any, Any, Any, Any, Any]:
 
 
 def compilation(policies: int) -> dict[str, Any]:
-    """Seconds from Python functions to compiled ones; cached where the folder of compiled programs has them."""
+    """Seconds from Python functions to compiled ones; cached if they are in the folder of compiled programs."""
     import jax
     import jax.numpy as jnp
 
@@ -189,7 +189,7 @@ def compilation(policies: int) -> dict[str, Any]:
 
 
 def rate(policies: int, repeats: int) -> dict[str, Any]:
-    """Iterations a second with learning, all policies together: best and median of some chunks."""
+    """Iterations per second with learning, all policies together: best and median of several chunks."""
     import jax
     import jax.numpy as jnp
 
@@ -235,7 +235,7 @@ def timeline() -> Any:
 
 
 def training(policies: int, iterations: int, seed: int = 1) -> Any:
-    """What `animat train cartpole --mapping 9-thresholds` trains, at eight iterations an update."""
+    """What `animat train cartpole --mapping 9-thresholds` trains, at eight iterations per update."""
     from animat.coding.mapping import mapping_named
     from animat.robots.cartpole import Cartpole
     from animat.training.specification import Training
@@ -252,7 +252,7 @@ def training(policies: int, iterations: int, seed: int = 1) -> Any:
 
 
 def memory(folder: str) -> dict[str, Any]:
-    """Peak resident memory of a worker that trains five policies, by the kernel's account of ended children."""
+    """Peak resident memory of a worker that trains five policies, as the kernel reports it for ended children."""
     import resource
 
     from animat.execution.training import train
@@ -260,7 +260,7 @@ def memory(folder: str) -> dict[str, Any]:
     # Ten are two groups of five.
     train(training(10, 50_000), timeline(), folder, workers=1)
     of_worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    # A child starts from its parent's figure, so it says something only where it passed that.
+    # A child starts from its parent's figure, so its own is only known if it exceeds that.
     of_parent = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {"worker_mib": of_worker / MIB, "parent_mib": of_parent / MIB}
 
@@ -311,9 +311,9 @@ def forward(calls: int) -> dict[str, Any]:
 
 
 def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
-    """Wall-clock seconds of the shortest training of ten policies, of some lengths, that reaches the return.
+    """Wall-clock seconds of the shortest training run of ten policies, among several lengths, that reaches the return.
 
-    It is all of `train`: starting processes, importing, loading compiled programs, training, checkpoints, saving. The
+    This is all of `train`: starting processes, importing, loading compiled programs, training, checkpoints, saving. The
     next length must reach the return too.
     """
     from animat.coding.mapping import mapping_named
@@ -323,7 +323,7 @@ def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
     from animat.robots.cartpole import Cartpole
 
     culture = timeline()
-    # Another seed, so that the first length is measured with programs compiled as all the others are.
+    # A different seed, so that the first length is measured with compiled programs, like all the others.
     train(training(10, 10_000, seed=2), culture, f"{folder}-first")
     tried = []
     for iterations in ladder:

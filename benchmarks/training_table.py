@@ -1,4 +1,4 @@
-"""What `training.py` measured, as a table for a terminal."""
+"""The measurements of `training.py` as a table for a terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from animat.lined_up import lined_up
 
 
 def print_table(measured: dict[str, Any]) -> None:
-    """What was measured, in words, beside what was aimed at."""
+    """Print the measurements and their targets."""
     one, five, memory_, forward_ = (measured[name] for name in ("one_policy", "five_policies", "memory", "forward"))
     cold, cached, ours_ = (measured[name] for name in ("compile_cold", "compile_cached", "ours"))
     wanted = measured["wanted_return"]

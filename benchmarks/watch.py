@@ -1,14 +1,14 @@
-"""How soon the page shows a pulse, what it does to the loop's deadlines, and how much memory the browser takes.
+"""How soon the page shows a pulse, how it affects the loop's deadlines, and how much memory the browser takes.
 
     python benchmarks/watch.py [--minutes 10] [--turns 3] [--browser chromium] [--json results.json]
 
-A session of `loop.py` in real time at 80 Hz, 1,024 channels, in a process of its own; the page's server as `--watch`
-starts it; and Chromium without a window, with the page open. First so many turns of a minute without and with the page:
-deadlines missed, and how late pulses were. Then a session of so many minutes with it: from each pulse to the frame of
-the page that first shows its tick, and each minute the page's memory.
+A session of `loop.py` in real time at 80 Hz, 1,024 channels, in its own process; the page's server as `--watch` starts
+it; and headless Chromium with the page open. First `--turns` turns of a minute without and a minute with the page:
+deadlines missed, and how late pulses were. Then a session of `--minutes` minutes with the page: the delay from each
+pulse to the frame that first shows its tick, and every minute the page's memory.
 
-It needs Chromium, chromedriver and selenium. `--browser "chrt --idle 0 chromium"` gives the browser what the others
-leave of the cores.
+It needs Chromium, chromedriver and selenium. `--browser "chrt --idle 0 chromium"` gives the browser only idle processor
+time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ new MutationObserver(() => {
 
 
 class Timed(Instant):
-    """Notes on the wall clock when each pulse is given."""
+    """Records the wall-clock time of each pulse."""
 
     def __init__(self) -> None:
         super().__init__(deliveries=0)
@@ -63,7 +63,7 @@ class Timed(Instant):
 
 
 def run(folder: Path, ticks: int) -> None:
-    """A session in real time; when its pulses were given, and how late, is left in its folder."""
+    """Run a session in real time; save in its folder when its pulses were given, and how late."""
     with Timed() as culture:
         agent = Agent("policy", "random weights", Greedy(policy()))
         session = run_session(culture, loop_of(ticks, real_time=True), [agent], folder, episodes=1)
@@ -74,9 +74,9 @@ def run(folder: Path, ticks: int) -> None:
 
 @contextmanager
 def browser_with(command: str, address: str) -> Iterator[webdriver.Chrome]:
-    """A browser that looks at an address."""
+    """A browser that shows an address."""
     with tempfile.TemporaryDirectory() as folder:
-        # Its driver starts one program without arguments of ours before its own.
+        # The driver starts a single program and cannot put our arguments before its own.
         program = Path(folder) / "browser"
         program.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
         program.chmod(0o755)
@@ -95,7 +95,7 @@ def browser_with(command: str, address: str) -> Iterator[webdriver.Chrome]:
 
 @contextmanager
 def page_of(folder: Path, command: str) -> Iterator[webdriver.Chrome]:
-    """The page's server as beside a command, and a browser that shows it."""
+    """The page's server, started as by a command, and a browser that shows the page."""
     words = [sys.executable, "-m", "animat.watch", str(folder), str(os.getpid())]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
@@ -107,7 +107,7 @@ def page_of(folder: Path, command: str) -> Iterator[webdriver.Chrome]:
 
 
 def memory(driver: webdriver.Chrome) -> dict[str, float]:
-    """After a collection of garbage: of the page's scripts, and of the process that draws it, in MB; and its nodes."""
+    """Memory in MB after a garbage collection, of the page's scripts and of its renderer process; and its nodes."""
     driver.execute_cdp_cmd("HeapProfiler.collectGarbage", {})
     nodes = driver.execute_cdp_cmd("Memory.getDOMCounters", {})["nodes"]
     heap = driver.execute_script("return performance.memory.usedJSHeapSize")
@@ -123,7 +123,7 @@ def memory(driver: webdriver.Chrome) -> dict[str, float]:
 
 
 def watched(minutes: float, command: str | None) -> dict[str, Any]:
-    """One session, with the page in a browser or without."""
+    """Run one session, with the page in a browser or without."""
     with tempfile.TemporaryDirectory() as folder:
         ticks = round(60 * minutes / PERIOD_S)
         with nullcontext() if command is None else page_of(Path(folder), command) as driver:
@@ -143,7 +143,7 @@ def watched(minutes: float, command: str | None) -> dict[str, Any]:
         }  # fmt: skip
         if driver is not None:
             number, given_s = np.load(Path(folder) / PULSES).T
-            # The first frame that shows a tick or a later one. What came before the page did, it did not show.
+            # The first frame that shows a tick or a later one. The page did not show what came before it opened.
             at = np.searchsorted(shown[:, 1], number)
             seen = (at < len(shown)) & (number > shown[0, 1])
             took = shown[at[seen], 0] - given_s[seen]
@@ -156,8 +156,8 @@ def watched(minutes: float, command: str | None) -> dict[str, Any]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else None)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of the long session; 0 leaves it out")
-    parser.add_argument("--turns", type=int, default=3, help="of a minute without and a minute with the page")
+    parser.add_argument("--minutes", type=float, default=10.0, help="length of the long session; 0 skips it")
+    parser.add_argument("--turns", type=int, default=3, help="turns of a minute without and a minute with the page")
     parser.add_argument("--browser", default="chromium", help="its command")
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--session", type=Path, help=argparse.SUPPRESS)

@@ -29,7 +29,7 @@ class Sensed(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensing(Robot[Sensed]):
-    """What it senses is drawn anew in each iteration, so that nothing but the sensors can help."""
+    """Its sensor values are drawn in each iteration, so that nothing else can help."""
 
     episode_limit: int = 10
     name = "sensing"
@@ -54,7 +54,7 @@ class Sensing(Robot[Sensed]):
 
 @dataclass(frozen=True)
 class Copying(Sensing):
-    """The best command is tanh(2 a - b + 0.5): 1 an iteration."""
+    """The best command is tanh(2 a - b + 0.5): 1 per iteration."""
 
     def reward(self, at: Any, u: Any) -> Any:
         return 1 - (u - jnp.tanh(2 * at[0] - at[1] + 0.5)) ** 2
@@ -99,7 +99,7 @@ class Hovering(NamedTuple):
 
 @dataclass(frozen=True)
 class Hover(Robot[Hovering]):
-    """Paid for being near the middle of a plane, and ended far from it: whoever leaves at once is soon paid no less."""
+    """Rewarded near the middle of a plane, and ended far from it: leaving immediately soon returns no less."""
 
     episode_limit: int = 40
     name = "hover"
@@ -131,7 +131,7 @@ def test_the_search_begins_near_the_heuristic_too(monkeypatch: pytest.MonkeyPatc
     starts = coupling._near_heuristic(environment, None, (0, 1, 2, 3), seed=1)
     np.testing.assert_allclose(starts[0].reshape(2, 5), weights, atol=1e-5)
     np.testing.assert_allclose(starts[2], 4 * starts[0])
-    # What it begins near is far better than what so few generations find by themselves.
+    # Its starting point is far better than what so few generations find by themselves.
     by_itself = Coupling(jnp.asarray(4 * weights[None], jnp.float32), jnp.zeros((1, 1)), None, "graded", (0, 1, 2, 3))
     known = mean_return(environment, None, by_itself)
     assert mean_return(environment, None, best_coupling(environment, None)) >= known - 0.05 * abs(known)
@@ -155,7 +155,7 @@ def test_a_coupling_does_not_see_the_goal() -> None:
 
 
 def test_bodies_that_are_stepped_in_python_have_none() -> None:
-    with pytest.raises(InvalidArgument, match="only robots in JAX have one"):
+    with pytest.raises(InvalidArgument, match="expected one in JAX, as the search for the best coupling takes"):
         best_coupling(WithoutNeurons(robot_named("gymnasium:Pendulum-v1"), None), None)
 
 
@@ -235,18 +235,16 @@ def test_the_optimums_grid_is_in_the_scores_interval() -> None:
     assert score is not None and score.high - score.value == pytest.approx(0.5 * 10 / 100)
 
 
-def test_of_one_episode_there_is_no_gap() -> None:
+def test_one_episode_gives_no_gap() -> None:
     gap = context_gap(np.array([40.0]), np.array([-10.0]), optimum_of(90.0))
     assert gap.gap is None and not gap.needs_context and gap.to_dict()["coupling_standard_error"] is None
-    assert gap.to_text() == "best coupling 40.0; no context gap of one episode"
+    assert gap.to_text() == "best coupling 40.0; no context gap with one episode"
 
 
 @pytest.mark.parametrize("coupling", [-60.0, -85.0])
 @pytest.mark.parametrize("optimum", [10.0, 20.0, 49.0])
-def test_where_the_optimum_is_not_known_gap_and_score_are_the_least_that_they_can_be(
-    coupling: float, optimum: float
-) -> None:
-    """Above and below random stimuli, which return -80; the best agent that is known returns 10."""
+def test_without_a_known_optimum_gap_and_score_are_lower_bounds(coupling: float, optimum: float) -> None:
+    """Above and below random stimuli, which return -80; the best known agent returns 10."""
     couplings, random, known = (np.full(4, each) for each in (coupling, -80.0, 10.0))
     least = least_context_gap(couplings, random, np.stack([known - 5, known, known - 20]), highest=50.0)
     assert least.is_least and least.best_known == 10 and least.gap is not None and least.needs_context
@@ -256,8 +254,8 @@ def test_where_the_optimum_is_not_known_gap_and_score_are_the_least_that_they_ca
         score = least.score(np.array([policies, policies]), None)
         assert score is not None and score.value <= (policies - coupling) / (optimum - coupling) + 1e-12
         assert score.low == pytest.approx(score.value) and np.sign(score.low) == np.sign(policies - coupling)
-    told = least.to_text(least.score(np.array([8.0, 8.0]), None))
-    assert "context gap at least" in told and "context score at least" in told and "returns 10.0" in told
+    text = least.to_text(least.score(np.array([8.0, 8.0]), None))
+    assert "context gap at least" in text and "context score at least" in text and "returns 10.0" in text
 
 
 def test_the_least_gaps_interval_is_that_of_a_bootstrap_of_episodes_with_the_same_starts() -> None:
@@ -272,7 +270,7 @@ def test_the_least_gaps_interval_is_that_of_a_bootstrap_of_episodes_with_the_sam
     assert (found.gap.low, found.gap.high) == pytest.approx((low, high), abs=0.1 * (high - low))
 
 
-def test_the_best_of_many_agents_is_not_flattered_by_the_episodes_that_it_was_chosen_in() -> None:
+def test_the_best_of_many_agents_is_not_biased_by_the_episodes_in_which_it_was_chosen() -> None:
     rng, nothing = np.random.default_rng(2), np.zeros(40)
     found = [least_context_gap(nothing, nothing - 1, rng.normal(5, 10, (20, 40))).best_known for _ in range(500)]
     assert np.mean(np.array(found, float)) == pytest.approx(5, abs=4 * 10 / np.sqrt(20 * 500))
@@ -282,7 +280,7 @@ def test_where_no_agent_is_above_random_stimuli_or_the_coupling_nothing_is_known
     rng = np.random.default_rng(3)
     couplings, random, known = (rng.normal(mean, 1, 50) for mean in (0.0, -80.0, -85.0))
     below_random = least_context_gap(couplings, random, known[None])
-    assert below_random.gap is None and "the best agent known (-8" in below_random.to_text()
+    assert below_random.gap is None and "the best known agent (-8" in below_random.to_text()
     below_coupling = least_context_gap(couplings, random, known[None] + 60)
     assert below_coupling.gap is not None and below_coupling.gap.value == 0 and not below_coupling.needs_context
     assert below_coupling.to_text().endswith("whether this task needs more than a reflex is not known")

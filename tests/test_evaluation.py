@@ -135,13 +135,13 @@ def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> No
 
 
 def test_jax_does_not_take_actors_without_numbers_for_each_other() -> None:
-    """Where it does, it may run the program of the one for the other, depending on where classes lie in memory."""
+    """If it did, it could run the program of one for the other, depending on where classes lie in memory."""
     assert jax.tree.structure(Uniform()) != jax.tree.structure(Heuristic())
     assert jax.tree.structure(Uniform()) == jax.tree.structure(Uniform())
 
 
 def test_a_constant_actor_is_the_condition_itself() -> None:
-    # Condition 0 always answers low, condition 1 always high: u = -1 or +1 throughout, the mirror of each other.
+    # Condition 0 always gives low responses, condition 1 high ones: u = -1 or +1 throughout, mirror images.
     timeline = fit_timeline([responses_of([10.0] * 9, [50.0] * 9)], kind="empirical")
     environment = Animat(Cartpole(force_noise=0.0), Thresholds(1), 2)
     both = roll_out(environment, timeline.at(0.0), Constant(jnp.array([0, 1])), 2, episodes=3, seed=0)
@@ -164,7 +164,7 @@ def test_on_a_changed_robot_a_policy_sees_what_it_would_when_deployed() -> None:
     timeline = timeline_of()
     policy = policy_of(timeline)
     single = jax.tree.map(lambda leaf: leaf[0], networks_of([policy], greedy=True))
-    # A longer track has another scale of positions; the policy was trained with that of its own.
+    # A longer track has a different scale of positions; the policy was trained with that of its own track.
     longer = Animat(Cartpole(track_length_m=4.0, angle_limit_rad=0.5), policy.mapping, 3)
     assert not np.array_equal(longer.scales, policy.scales)
     observations = np.random.default_rng(0).normal(0, 0.3, (64, 4)).astype(np.float32)
@@ -172,17 +172,17 @@ def test_on_a_changed_robot_a_policy_sees_what_it_would_when_deployed() -> None:
     assert actions.tolist() == [policy.act_greedily(o) for o in observations]
 
 
-def test_the_table_has_every_control_beside_the_policies() -> None:
+def test_the_table_has_the_policies_and_every_control() -> None:
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, seed=1), "b": policy_of(timeline, seed=2)}
-    told: list[tuple[float, float, str]] = []
+    updates: list[tuple[float, float, str]] = []
 
     class Noting:
         def update(self, done: float, total: float, note: str = "") -> None:
-            told.append((done, total, note))
+            updates.append((done, total, note))
 
     evaluation = evaluate(policies, timeline, at_min=14.0, episodes=50, progress=Noting())
-    assert told == [(i + 1, 8, row.name) for i, row in enumerate(evaluation.rows)]
+    assert updates == [(i + 1, 8, row.name) for i, row in enumerate(evaluation.rows)]
     assert [row.name for row in evaluation.rows] == [
         "policies",
         "random",
@@ -202,7 +202,7 @@ def test_the_table_has_every_control_beside_the_policies() -> None:
 
 @pytest.mark.oracle
 def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() -> None:
-    """Held ones are the first recording's, whichever answers; the truth is a roll-out with them put in by hand."""
+    """Fixed ones are the first recording's on every simulator; the truth is a roll-out with them inserted by hand."""
     timeline = timeline_of()
     moving = policy_of(timeline, seed=1)
     held = replace(moving, provenance={"training": {"percentiles": "first"}, "simulators": {"recorded_at_min": [0.0]}})
@@ -227,7 +227,7 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
 
 @pytest.mark.oracle
 def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
-    """Whatever it chooses, what is delivered is drawn: as good as random actions, and no optimum is its own."""
+    """Whatever it chooses, the delivered condition is random: as good as random actions, and without an optimum."""
     timeline = timeline_of()
     chosen = policy_of(timeline, SHORT, seed=1)
     control = replace(chosen, provenance={"training": {"delivery": "shuffled"}})
@@ -236,18 +236,18 @@ def test_a_policy_trained_as_a_control_is_one_when_it_is_evaluated() -> None:
     np.testing.assert_array_equal(rows["policies"].episodes.returns, rows["shuffled"].episodes.returns)
     assert np.any(rows["policies"].episodes.returns != evaluate({"a": chosen}, timeline, episodes=500, seed=3).rows[0]
                   .episodes.returns)  # fmt: skip
-    assert "as trained: what is delivered is drawn anew" in found.to_text()
+    assert "as trained: the delivered condition is drawn at random" in found.to_text()
     assert found.score(rows["policies"]) is None and found.score(rows["random"]) == 0.0
-    assert "none for policies and silent and shuffled, whose optimum is another" in found.to_text()
+    assert "none for policies and silent and shuffled, whose optimum is different" in found.to_text()
 
 
-def test_simulators_made_otherwise_than_in_training_are_told() -> None:
+def test_simulators_fitted_differently_from_training_are_reported() -> None:
     timeline = timeline_of()
     trained = {"kind": "histogram", "bins": 40, "range_hz": None, "recorded_at_min": [0.0]}
     policy = replace(policy_of(timeline), provenance={"simulators": trained})
     noticed = evaluate({"a": policy}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
-    assert finding.message.endswith("made otherwise: bins 40, here 20")
+    assert finding.message.endswith("fitted differently: bins 40, here 20")
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
     noticed = evaluate({"a": alike}, timeline, episodes=50).findings
     assert "other-simulator" not in {each.name for each in noticed}
@@ -265,16 +265,16 @@ def test_the_heuristic_policy_goes_through_the_same_mapping_and_neurons() -> Non
 
 
 @pytest.mark.oracle
-def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment() -> None:
-    """The optimum is `best_return` of the very simulator; scores are worked out again from the means."""
+def test_the_optimum_scores_what_acts_in_the_same_environment() -> None:
+    """The optimum is `best_return` on the same simulator; scores are computed again from the means."""
     timeline = timeline_of()
     policies = {"a": policy_of(timeline, SHORT, seed=1), "b": policy_of(timeline, SHORT, seed=2)}
-    told: dict[str, set[float]] = {}
+    totals: dict[str, set[float]] = {}
 
     class Noting:
         def update(self, done: float, total: float, note: str = "") -> None:
             assert done <= total
-            told.setdefault(note, set()).add(total)
+            totals.setdefault(note, set()).add(total)
 
     plainly = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3)
     found = evaluate(policies, timeline, at_min=14.0, episodes=50, seed=3, optimum_resolution=0.25, progress=Noting())
@@ -283,10 +283,10 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
     assert replace(found.optimum, interval=None) == best_return(environment, timeline.at(14.0), resolution=0.25, seed=3)
     # Nine rows, then the phase of the optimum: its own half, and that of its interval.
     names = [row.name for row in found.rows]
-    assert len(names) == 9 and all(told[name] == {9} for name in names)
-    *_, last_row, own, value, interval = told
+    assert len(names) == 9 and all(totals[name] == {9} for name in names)
+    *_, last_row, own, value, interval = totals
     assert (last_row, own, interval) == ("coupling", "optimal return", "its interval")
-    assert value.startswith("optimum ") and told[own] == told[value] == told[interval] == {2}
+    assert value.startswith("optimum ") and totals[own] == totals[value] == totals[interval] == {2}
     assert set(found.optimum.findings()) <= set(found.findings)
 
     data = json.loads(json.dumps(found.to_dict()))
@@ -300,16 +300,16 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
             assert row["normalised_score"] == pytest.approx((row["mean_return"] - random) / (best - random))
     assert rows["random"]["normalised_score"] == 0
     text = found.to_text()
-    assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is another" in text
+    assert found.optimum.to_text() in text and "none for silent and shuffled, whose optimum is different" in text
     assert f"{rows['policies']['normalised_score']:.2f}  as trained" in text
 
     # Without random actions there is nothing to score against.
     unscored = replace(found, rows=tuple(row for row in found.rows if row.name != "random"))
     assert {row["normalised_score"] for row in unscored.to_dict()["rows"]} == {None}
 
-    # Nothing else changes by it, and nothing is told of it where it was not asked for.
+    # Nothing else changes, and the optimum is not reported if it was not requested.
     assert plainly.optimum is None and plainly.no_optimum is None
-    # The best coupling is the last row; it comes with the optimum alone.
+    # The best coupling is the last row; it is only there with the optimum.
     shared, (reflex,) = data["rows"][:-1], data["rows"][-1:]
     assert reflex["name"] == "coupling" and reflex["mean_return"] == data["context"]["coupling"]
     assert [row["mean_returns"] for row in plainly.to_dict()["rows"]] == [row["mean_returns"] for row in shared]
@@ -318,8 +318,8 @@ def test_the_optimum_stands_beside_and_scores_what_acts_in_the_same_environment(
 
 
 @pytest.mark.oracle
-def test_an_optimum_without_conditions_of_few_responses_scores_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The rows act on these conditions too; the optimum is at the thresholds of all responses, as the rows are."""
+def test_an_optimum_without_conditions_of_few_responses_gives_no_score(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows use these conditions too; the optimum has the thresholds of all responses, as the rows have."""
     monkeypatch.setattr("animat.evaluation.resampling.with_intervals", lambda optima, *_, **__: tuple(optima))
     monkeypatch.setattr("animat.evaluation.table.best_return", partial(best_return, episodes=0))
     responses = answers([60, 60, 60, 60, 3], 2)
@@ -335,7 +335,7 @@ def test_an_optimum_without_conditions_of_few_responses_scores_nothing(monkeypat
 
 @pytest.mark.oracle
 def test_without_neurons_the_optimum_is_a_pole_kept_up_to_the_end() -> None:
-    """In closed form: a reward of 1 an iteration, and no fall, as two forces are enough to hold the pole."""
+    """In closed form: a reward of 1 per iteration, and no fall, as two forces are enough to hold the pole."""
     evaluation = evaluate({"p0": WITHOUT_NEURONS}, None, episodes=50, optimum_resolution=0.6)
     assert evaluation.optimum is not None
     assert evaluation.optimum.value == pytest.approx(120, abs=0.01)
@@ -381,7 +381,7 @@ def test_without_neurons_there_is_nothing_to_silence() -> None:
     assert isinstance(WithoutNeurons(Cartpole(), (-1.0, 1.0)).n_actions, int)
 
 
-def test_what_does_not_belong_together_is_refused() -> None:
+def test_mismatches_are_refused() -> None:
     timeline = timeline_of()
     policy = policy_of(timeline)
     with pytest.raises(InvalidArgument, match="policies"):
@@ -409,7 +409,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
 
 
 @pytest.mark.oracle
-def test_another_presentation_or_window_is_said() -> None:
+def test_a_different_presentation_or_window_is_reported() -> None:
     timeline = timeline_of()
     other = fit_timeline(
         [

@@ -25,7 +25,7 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True)
 class Telling(Robot[Told]):
-    """Senses 0 or 1, drawn anew in each iteration; its goal is one of four, drawn at the start."""
+    """Senses 0 or 1, drawn in each iteration; its goal is one of four, drawn at the start."""
 
     episode_limit: int = 5
     name = "telling"
@@ -52,7 +52,7 @@ class Telling(Robot[Told]):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Choosing(Actor):
-    """One of three actions, by its probability at what is sensed and the goal: shape (actors, 2, 4, 3)."""
+    """One of three actions, by its probability given the sensor and the goal: shape (actors, 2, 4, 3)."""
 
     probabilities: Any
 
@@ -66,7 +66,7 @@ ENVIRONMENT = WithoutNeurons(Telling(), (-1.0, 0.0, 1.0))
 
 
 def closed_form(probabilities: np.ndarray) -> float:
-    """Of goals and sensors that are equally likely, in bits."""
+    """For equally likely goals and sensor values, in bits."""
     joint = probabilities / 4
     mixture = probabilities.mean(axis=1, keepdims=True)
     terms = np.where(joint > 0, joint * np.log2(np.where(joint > 0, probabilities / mixture, 1.0)), 0.0)
@@ -74,7 +74,7 @@ def closed_form(probabilities: np.ndarray) -> float:
 
 
 def of_both(base: np.ndarray) -> np.ndarray:
-    """As much is told at either of what is sensed."""
+    """The information is the same at both sensor values."""
     return np.stack([base, base[::-1]])
 
 
@@ -100,7 +100,7 @@ def test_the_information_of_a_constructed_policy_is_that_of_the_closed_form(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(information, "PERMUTATIONS", 99)
-    # The goals of an actor's episodes are a sample of the four: more of them than usual, so that they tell less of it.
+    # The goals of an actor's episodes are a sample of the four: more episodes than usual make it more even.
     monkeypatch.setattr(information, "EPISODES", 384)
     actors = Choosing(jnp.asarray(np.tile(CASES[case], (4, 1, 1, 1)), jnp.float32))
     found = goal_information(ENVIRONMENT, None, actors, 4, draws=32)
@@ -112,7 +112,7 @@ def test_the_information_of_a_constructed_policy_is_that_of_the_closed_form(
 
 
 def test_few_draws_and_few_goals_are_corrected_for() -> None:
-    """A goal among infinitely many, of which half ask for each action: 1 bit with certainty, 0 where it is blind."""
+    """Infinitely many goals, half of which need each action: 1 bit for a certain policy, 0 for a blind one."""
     rng = np.random.default_rng(1)
     certain = np.repeat(rng.integers(2, size=(10_000, 10, 1)), 2, axis=2)
     assert conditional_information(certain, 2).mean() == pytest.approx(1.0, abs=0.01)

@@ -23,7 +23,7 @@ from animat.evaluation.rollouts import Constant, roll_out
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.goals.robot import with_goal
-from animat.reality_gap.answered import outcomes
+from animat.reality_gap.session_responses import outcomes
 from animat.responses.condition import Condition
 from animat.robots import Cartpole, Navigation
 from animat.studies.episodes import read_episodes, tabulated, write_episodes

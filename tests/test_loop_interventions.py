@@ -24,7 +24,7 @@ from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Robot, Shuttle
 from fake_culture import FakeCulture
 from test_closed_loop import loop_of
-from test_whose_work import linear_networks
+from test_interventions import linear_networks
 
 POOL_HZ = np.array([1.5, 2.5, 3.5, 60.0])
 POLICIES = {"p0": AnyCondition(5), "p1": OneCondition(3)}
@@ -33,7 +33,7 @@ SIMULATOR = synthetic_simulator()
 
 
 def changed(robot: Robot[Any]) -> list[Agent]:
-    """The interventions that a culture has a part in, as agents."""
+    """The interventions that involve a culture, as agents."""
     environment, networks = Animat(robot, Thresholds(1), 5), linear_networks(np.zeros((len(robot.observation_spec), 5)))
     found = interventions_of(environment, SIMULATOR, networks, 1, switch_at=5)
     asked = ("random spikes", "yoked", "turned round", "goal switched")
@@ -94,7 +94,7 @@ def test_a_goal_is_switched_once_to_that_of_another_start(session: Session) -> N
     starts = [e.start[2] for e in session.episodes if e.agent == "goal switched"]
     assert all(cue[:4] == [start] * 4 for cue, start in zip(cues, starts, strict=True))
     assert all(len(set(cue[4:])) == 1 for cue in cues)
-    # Another start has the same cue half of the time: one that has not is looked for.
+    # Another start has the same cue half of the time: find one with the other cue.
     assert all(cue[3] != cue[4] for cue in cues)
     for name in ("p0", "yoked"):
         assert all(len({t.observation[2] for t in ticks}) == 1 for ticks in ticks_of(session, name))

@@ -1,4 +1,4 @@
-"""What a culture could do before any training. Oracles: the optimum itself, constants and random stimuli run apart."""
+"""What a culture could achieve, before training. Oracles: the optimum, and separate runs of constants and random."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_st
 
 
 @pytest.mark.oracle
-def test_inspect_tells_the_optimum(
+def test_inspect_reports_the_optimum(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rough = partial(optimal_returns, resolution=0.25, episodes=20, resamples=4)
@@ -69,12 +69,12 @@ def test_inspect_tells_the_optimum(
     direct = best_return(Animat(Cartpole(), Thresholds(1), 5), simulator, resolution=0.25, episodes=0)
     assert one["best"]["value"] == pytest.approx(direct.value, abs=0.5)
     assert one["best"]["interval"]["low"] <= one["best"]["value"] <= one["best"]["interval"]["high"]
-    told = next(line for line in said if "1-threshold: random" in line)
-    assert f"optimal return {one['best']['value']:.1f}" in told
+    line = next(line for line in said if "1-threshold: random" in line)
+    assert f"optimal return {one['best']['value']:.1f}" in line
     assert any("on a histogram of these responses, without memory: " in line for line in said)
 
 
-def test_where_there_is_no_optimum_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_optimum_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_nwb(synthetic_recording(1, patterns=5, channels=16), tmp_path / "a.nwb")
     command = ["inspect", str(tmp_path / "a.nwb"), "--conditions", "frequency:5,7", "--optimum", "navigation", "--json"]
     assert main(command) == 1
@@ -83,7 +83,7 @@ def test_where_there_is_no_optimum_it_is_said(tmp_path: Path, capsys: pytest.Cap
     assert json.loads(said.splitlines()[-1])["recordings"][0]["optima"] is None
 
 
-def test_a_robot_that_is_not_known_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_robot_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", "a.nwb", "--optimum", "submarine"]) != 0
     assert "submarine" in capsys.readouterr().err
 
@@ -112,22 +112,22 @@ def answers(n: Sequence[int], seed: int, spread: Sequence[float] = SPREAD) -> Re
 
 
 def test_three_responses_promise_nothing() -> None:
-    with pytest.raises(UnusableData, match="expected 30 non-burst responses or more to some condition, got 3 at most"):
+    with pytest.raises(UnusableData, match="expected at least 30 non-burst ones to some condition, got at most 3"):
         optimal_returns(answers([3] * 5, 1), SHORT)
 
 
 @pytest.mark.oracle
 def test_a_condition_of_few_responses_is_left_out_by_name() -> None:
     responses = answers([60, 60, 60, 60, 3], 2)
-    # The three responses to 80 Hz are lucky: believed, they would make the best condition there is.
+    # The three responses to 80 Hz are lucky: taken at face value, they would make the best condition.
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))
-    told: list[float] = []
-    progress = SimpleNamespace(update=lambda done, total, note="": told.append(done / total))
+    parts: list[float] = []
+    progress = SimpleNamespace(update=lambda done, total, note="": parts.append(done / total))
     few = {"resolution": 0.25, "episodes": 2, "resamples": 3}
     (found,) = optimal_returns(lucky, SHORT, [Thresholds(1)], progress=progress, **few)  # type: ignore[arg-type]
     # Every iteration of each grid, and every generation of the search, which may end early.
-    assert told == sorted(told) and len(told) > 3 * 24 + 60 and 2 / 3 < told[-1] <= 1
-    # Of the four others, at the median of all responses: that is the threshold that commands are made by.
+    assert parts == sorted(parts) and len(parts) > 3 * 24 + 60 and 2 / 3 < parts[-1] <= 1
+    # Of the four others, at the median of all responses, which is the threshold of commands.
     without = fit_histogram(lucky.only([0, 1, 2, 3]))
     held = replace(without, percentiles=jnp.asarray(np.percentile(lucky.rate_hz, np.arange(0, 101, 10)), jnp.float32))
     plain = best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=2)
@@ -166,7 +166,7 @@ def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None
 
 @pytest.mark.oracle
 def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_bootstrapped() -> None:
-    """That is what 95 % of 39 are: a value drawn anew falls outside of so many once in twenty."""
+    """The 95 % interval of 39: another draw falls outside of them once in twenty."""
     environment, responses = Animat(SHORT, Thresholds(1), 5), answers([40] * 5, 3)
     best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
     (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25)
@@ -201,5 +201,5 @@ def test_the_interval_holds_the_optimum_of_the_true_distributions(
         assert known.interval is not None
         held += known.interval.low <= true <= known.interval.high
     print(f"{mapping.name}, {len(spread)} conditions, n = {n}: {held} of {trials}")
-    # Were it 85 %, fewer would be held by chance once in a thousand.
+    # If coverage were 85 %, fewer would be covered by chance once in a thousand.
     assert held >= binom.ppf(0.001, trials, 0.85)

@@ -1,4 +1,4 @@
-"""The optimal return against closed forms, games tried to the end, and the environments themselves."""
+"""The optimal return against closed forms, exhaustive searches, and the environments themselves."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIMULATOR = synthetic_simulator()
 
 
 def coins(*heads: int) -> EmpiricalSimulator:
-    """Neurons that pass the only threshold in so many of ten responses, for each condition."""
+    """Neurons that pass the only threshold in a given number of ten responses, for each condition."""
     values = np.array([[0.0] * (10 - n) + [1.0] * n for n in heads])
     return EmpiricalSimulator(
         jnp.asarray(values, jnp.float32), jnp.full(len(heads), 10), jnp.linspace(0, 1, 11, dtype=jnp.float32)
@@ -118,7 +118,7 @@ def test_noise_of_the_robot_is_averaged_over() -> None:
 
 
 def expectimax(environment: Animat[Any], simulator: Any) -> float:
-    """All that can happen, tried out: every command at every iteration, folded back by the best action."""
+    """Exhaustive search: every command at every iteration, solved backwards by the best action."""
     robot = environment.robot
     commands = commands_of(environment, simulator)
     noise = jnp.full(robot.noise_size, 0.5)
@@ -139,8 +139,8 @@ def expectimax(environment: Animat[Any], simulator: Any) -> float:
 
 
 @pytest.mark.oracle
-def test_navigation_tried_to_the_end() -> None:
-    """Nine iterations by two commands, from a start near the goal, which some ways reach."""
+def test_navigation_against_exhaustive_search() -> None:
+    """Nine iterations with two commands, from a start near the goal, which some paths reach."""
     robot = Navigation(episode_limit=9, goal_x_m=0.2, goal_y_m=0.12, goal_radius_m=0.06)
     environment = Animat(robot, Thresholds(1), 5)
     truth = expectimax(environment, SIMULATOR)
@@ -150,15 +150,15 @@ def test_navigation_tried_to_the_end() -> None:
 
 
 @pytest.mark.oracle
-def test_navigation_with_ten_levels_tried_to_the_end() -> None:
+def test_navigation_with_ten_levels_against_exhaustive_search() -> None:
     environment = Animat(Navigation(episode_limit=4), Thresholds(9), 5)
     found = best_return(environment, SIMULATOR, resolution=0.5, episodes=0)
     assert found.value == pytest.approx(expectimax(environment, SIMULATOR), abs=0.003)
 
 
 @pytest.mark.oracle
-def test_cartpole_tried_to_the_end() -> None:
-    """Twelve pushes, too strong and without noise: many ways fall."""
+def test_cartpole_against_exhaustive_search() -> None:
+    """Twelve pushes, too strong and without noise: many sequences fall."""
     robot = Cartpole(force_n=4.0, force_noise=0.0, episode_limit=12)
     environment = Animat(robot, Thresholds(1), 5)
     truth = expectimax(environment, SIMULATOR)
@@ -170,7 +170,7 @@ def test_cartpole_tried_to_the_end() -> None:
 @pytest.mark.oracle
 @pytest.mark.parametrize(("robot", "resolution"), [(Cartpole(), 0.75), (Navigation(), 0.5)])
 def test_where_nothing_can_be_chosen_the_optimum_is_the_mean_return(robot: Robot[Any], resolution: float) -> None:
-    """With the delivered condition drawn at random all policies are the same one, whose mean return is measured."""
+    """With the delivered condition drawn at random all policies are equivalent; their mean return is measured."""
     environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
     found = best_return(environment, SIMULATOR, resolution=resolution, episodes=0)
     returns = roll_out(environment, SIMULATOR, Uniform(), 1, episodes=8000, seed=5).returns
@@ -201,7 +201,7 @@ def test_more_separated_conditions_allow_more() -> None:
 @pytest.mark.oracle
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9), Linear()])
-def test_the_controller_gets_what_was_promised(robot: Robot[Any], mapping: Any) -> None:
+def test_the_controller_reaches_the_value(robot: Robot[Any], mapping: Any) -> None:
     environment = Animat(robot, mapping, 5)
     found = best_return(environment, SIMULATOR)
     assert not found.findings()
@@ -221,27 +221,27 @@ def test_without_running_the_controller_only_the_value_is_known() -> None:
     assert not alone.findings()
 
 
-def test_a_value_that_its_controller_does_not_get_is_told() -> None:
-    """3 standard errors and the grid's error apart is chance and grid; more is a bracket, or a grid too rough."""
+def test_a_value_that_its_controller_does_not_reach_is_reported() -> None:
+    """A difference of 3 standard errors plus the grid's error is chance; a larger one a bracket or a coarse grid."""
     assert not bracket_findings(100.0, 0.5, 98.1, 0.5)
-    assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # nothing is drawn: the two are alike as they are printed
+    assert not bracket_findings(23.904, 0.001, 23.902, 0.0)  # deterministic: the two look the same when printed
     (above,) = bracket_findings(100.0, 0.5, 97.9, 0.5)
     assert "between the two" in above.message and above.value == pytest.approx(2.1)
     (below,) = bracket_findings(100.0, 0.5, 102.1, 0.5)
-    assert "too rough" in below.message
+    assert "too coarse" in below.message
 
 
 @pytest.mark.oracle
-def test_a_grid_too_rough_is_noticed() -> None:
-    """Nine places for an arena in which the goal is a tenth of it."""
+def test_a_too_coarse_grid_is_reported() -> None:
+    """Nine places for an arena of which the goal is a tenth."""
     grid = grid_for(Navigation()).scaled(0.12)
     found = best_return(WithoutNeurons(Navigation(), None), None, grid=grid, episodes=200)
-    (told,) = found.findings()
-    assert told.name == "optimum"
+    (finding,) = found.findings()
+    assert finding.name == "optimum"
 
 
-def test_the_grid_error_looks_at_headings_too() -> None:
-    """A resolution keeps the headings that turns lead to; the grid that the value is compared with does not."""
+def test_the_grid_error_includes_headings() -> None:
+    """A resolution keeps the headings that turns lead to; the comparison grid does not."""
     grid = grid_for(Navigation()).scaled(0.3)
     assert grid.scaled(0.75).rows[1].nodes == 100
     assert grid.scaled(0.75, periodic=True).rows[1].nodes == 75
@@ -313,7 +313,7 @@ def test_refusals_say_what_to_do() -> None:
     environment = Animat(Navigation(), Thresholds(1), 5)
     with pytest.raises(InvalidArgument, match="cases"):
         best_returns([])
-    with pytest.raises(Mismatch, match="one robot"):
+    with pytest.raises(Mismatch, match="the same robot in all"):
         best_returns([(environment, SIMULATOR), (Animat(Cartpole(), Thresholds(1), 5), SIMULATOR)])
     with pytest.raises(InvalidArgument, match="simulator"):
         best_return(environment, None)

@@ -1,4 +1,4 @@
-"""How long a session will be and can be, told beforehand: sums by hand and closed forms."""
+"""How long a session will be and can be, computed beforehand: sums by hand and closed forms."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def responses(start_min: float, rate_hz: np.ndarray) -> Responses:
     )
 
 
-def test_a_steady_fall_is_told_exactly() -> None:
-    """P50 = 10 exp(-0.01 t), of recordings whose responses are all the same: no error."""
+def test_a_steady_fall_is_estimated_exactly() -> None:
+    """P50 = 10 exp(-0.01 t), with recordings whose responses are all the same: no error."""
     series = [responses(t, np.full(40, 10.0 * math.exp(-0.01 * t))) for t in (0.0, 10.0, 25.0)]
     found = median_drift(series)
     assert found is not None
@@ -55,7 +55,7 @@ def test_the_error_of_a_drift_is_that_of_medians() -> None:
     assert rates.std() == pytest.approx(expected, rel=0.35)
 
 
-def test_the_minutes_to_a_change_are_fewer_the_less_is_known() -> None:
+def test_the_minutes_to_a_change_are_fewer_with_more_uncertainty() -> None:
     likely, least = MedianDrift(-0.01, 0.005).minutes_to(0.25)
     assert (likely, least) == pytest.approx((-100 * math.log(0.75), -50 * math.log(0.75)))
     assert MedianDrift(0.01, 0.0).minutes_to(0.25)[0] == pytest.approx(100 * math.log(1.25))
@@ -83,24 +83,24 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     assert longer.budget_min == pytest.approx(longer_s / 60 * 94 / (4 * 94 + 36))
 
 
-def test_one_line_tells_it() -> None:
+def test_the_outlook_is_one_line() -> None:
     line = str(Outlook(26.2, (24.0, 11.0), math.inf))
     assert line == (
-        "the session is planned for about 26 min of the culture's time; by the recordings' drift the median response "
-        "has changed by 25 % in 24 min (11 min at least), beyond which adaptive thresholds may not help; the plan is "
-        "longer: ask for fewer --episodes"
+        "the session is planned for about 26 min of the culture's time; at the drift of the recordings the median "
+        "response will have changed by 25 % in 24 min (at least 11 min), beyond which adaptive thresholds may not "
+        "help; the plan is longer: ask for fewer --episodes"
     )
     assert str(Outlook(26.2, (24.0, -9.0), 20.0)).endswith("the plan is longer: ask for fewer --episodes")
-    assert "in 24 min (0 min at least)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
+    assert "in 24 min (at least 0 min)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
     assert str(Outlook(26.2, (-5.0, -9.0), math.inf)) == (
-        "the session is planned for about 26 min of the culture's time; by the recordings' drift the median response "
-        "had changed by 25 % already 5 min ago, beyond which adaptive thresholds may not help; take newer recordings, "
-        "with --at-min or by recording again"
+        "the session is planned for about 26 min of the culture's time; at the drift of the recordings the median "
+        "response had already changed by 25 % 5 min ago, beyond which adaptive thresholds may not help; use newer "
+        "recordings, with --at-min or by recording again"
     )
     drifted = str(Outlook(26.2, (-5.0, -9.0), 20.0))
     assert drifted.endswith("--at-min or by recording again; the plan is longer: ask for fewer --episodes")
-    assert "in more than 10 h (40 min at least)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
+    assert "in more than 10 h (at least 40 min)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
     assert str(Outlook(6.0, None, 7.0)) == (
-        "the session is planned for about 6 min of the culture's time; how the culture drifts is known from two "
-        "recordings on; the budget of pulses lasts for about 7 min"
+        "the session is planned for about 6 min of the culture's time; at least two recordings are needed to estimate "
+        "the culture's drift; the budget of pulses lasts for about 7 min"
     )

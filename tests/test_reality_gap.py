@@ -29,20 +29,20 @@ from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.coupling import Coupling
-from animat.evaluation.heuristic import heuristic_policy
+from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.table import evaluate
-from animat.evaluation.verdict import Beside
+from animat.evaluation.verdict import EpisodeComparison
 from animat.neurons.kinds import Kind
 from animat.neurons.remembering import Remembered
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
-from animat.reality_gap.answered import answered
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
+from animat.reality_gap.session_responses import read_responses
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import RecordedCulture, Recording
@@ -108,11 +108,11 @@ Ran = tuple[RealityGap, dict[str, Policy], list[str]]
 
 @pytest.fixture(scope="module")
 def without_controls(tmp_path_factory: pytest.TempPathFactory, series: list[Responses]) -> Ran:
-    """A run with random stimuli as its only control, its policies and what was told."""
-    told: list[str] = []
+    """A run with random stimuli as its only control, its policies and the reported lines."""
+    lines: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 4)
-        return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=told.append), told
+        return *run(tmp_path_factory.mktemp("run"), series, with_controls=False, report=lines.append), lines
 
 
 @pytest.mark.oracle
@@ -153,17 +153,17 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     anew = np.array([each.returns.mean(axis=1) for each in rolled[ROLL_OUTS:]])
     for i, name in enumerate(policies):
         np.testing.assert_array_equal(rows[name].predicted, predicted[i])
-        np.testing.assert_allclose(rows[name].predicted_anew, anew[:, i])
-        # Who watches the session has it beforehand.
-        told, found = gap.session.log.header["predicted"][name], rows[name].prediction
-        assert told == {"mean": found.value, "low": found.low, "high": found.high}
+        np.testing.assert_allclose(rows[name].bootstrap_means, anew[:, i])
+        # A viewer of the session has the prediction beforehand.
+        logged, prediction = gap.session.log.header["predicted"][name], rows[name].prediction
+        assert logged == {"mean": prediction.value, "low": prediction.low, "high": prediction.high}
     np.testing.assert_array_equal(rows["policies"].predicted, predicted.ravel())
-    np.testing.assert_allclose(rows["policies"].predicted_anew, anew.mean(axis=1))
+    np.testing.assert_allclose(rows["policies"].bootstrap_means, anew.mean(axis=1))
     for each in rolled[:ROLL_OUTS]:
         np.testing.assert_array_equal(each.presented.sum(axis=1), each.lengths.sum(axis=1))
     low, high = rows["policies"].prediction.low, rows["policies"].prediction.high
     assert np.sum((anew.mean(axis=1) < low) | (anew.mean(axis=1) > high)) == 2
-    # Under the controls of the policies all of them act in turn, and no choice of theirs is delivered.
+    # In the policies' controls all of them act in turn, and their choices are not delivered.
     for name, in_, on in (
         ("silent", environment, silenced(calibration.simulator)),
         ("shuffled", ShuffledDelivery(environment), calibration.simulator),
@@ -184,10 +184,10 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
 
     for row in gap.rows[3:]:
         expected = mannwhitneyu(rows["policies"].measured, row.measured, alternative="two-sided", method="asymptotic")
-        assert row.beside is not None
-        assert row.beside.p == pytest.approx(min(1.0, expected.pvalue))
+        assert row.comparison is not None
+        assert row.comparison.p == pytest.approx(min(1.0, expected.pvalue))
         pairs = len(rows["policies"].measured) * len(row.measured)
-        assert row.beside.wins == pytest.approx(expected.statistic / pairs)
+        assert row.comparison.wins == pytest.approx(expected.statistic / pairs)
     for row in gap.rows:
         assert row.gap.value == pytest.approx(row.measured.mean() - row.predicted.mean())
         assert row.gap.low <= row.gap.value + 1e-9
@@ -203,9 +203,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
-    tmp_path: Path, series: list[Responses]
-) -> None:
+def test_with_few_responses_to_a_condition_there_is_no_optimal_return(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     of_each = calibration.responses_hz
     few = replace(calibration, adjusted=replace(calibration.adjusted, responses_hz=(*of_each[:4], of_each[4][:3])))
@@ -220,7 +218,7 @@ def test_where_a_condition_has_few_responses_no_best_possible_return_is_told(
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
+def test_a_session_on_a_simulation_is_not_lost_if_the_optimal_return_fails(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
@@ -228,7 +226,7 @@ def test_a_session_on_a_simulation_is_not_lost_with_the_best_possible_return(
 
     monkeypatch.setattr("animat.reality_gap.optimum.rough_values", fail)
     of = {"p0": policy_of(0, series)}, FakeCulture(), Calibration.of_series(series)
-    # On a device it is known before the loop begins.
+    # On a device the optimal return is computed before the loop begins.
     with of[1], pytest.raises(MemoryError):
         run_policies(*of, tmp_path / "device", episodes=1, with_controls=False)
     assert not (tmp_path / "device").exists()
@@ -247,7 +245,7 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     policies, *each, random = gap.rows
 
     def verdict(p: float, wins: float, measured: float) -> str:
-        control = replace(random, beside=Beside(p, wins, 20, 20))
+        control = replace(random, comparison=EpisodeComparison(p, wins, 20, 20))
         rows = (replace(policies, measured=np.full(20, measured)), *each, control)
         return replace(gap, rows=rows).verdict()
 
@@ -255,8 +253,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.001, 0.9, high).startswith("the policies outperform every control (p < 0.01; ")
     assert verdict(0.02, 0.6, high).startswith("the policies do not outperform random (p = 0.02; ")
     at = float(policies.predicted.mean())
-    assert verdict(0.001, 0.9, at).endswith("of the pairs of episodes or more)")
-    looked = "another presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
+    assert verdict(0.001, 0.9, at).endswith("larger in at least 90 % of the pairs of episodes)")
+    looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
     for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         told = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
@@ -265,8 +263,8 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
         assert f"{told}{looked} commands)" in verdict(0.001, 0.9, measured)
     uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
-        f"; their measured return is 20.0 less than predicted, within what the recording's responses ({gap.responses}) "
-        "and the episodes (10) can tell"
+        "; their measured return is 20.0 less than predicted, within the uncertainty due to the number of responses in "
+        f"the recording ({gap.responses}) and of episodes (10)"
     )
     reasons = (Finding("a", "note", "it rained"), Finding("b", "note", "it snowed"))
     explained = replace(gap, rows=(replace(policies, measured=np.full(20, -1e3)), *gap.rows[1:]), reasons=reasons)
@@ -274,10 +272,10 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert [each["name"] for each in explained.to_dict()["reasons"]] == ["a", "b"]
 
 
-def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_it(without_controls: Ran) -> None:
-    gap, policies, told = without_controls
+def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(without_controls: Ran) -> None:
+    gap, policies, lines = without_controls
     warned = [f"warning: {each}" for each in warnings_once(gap.findings)]
-    assert told == [*warned, "each pulse: -200 mV 500 us, then +200 mV 400 us", str(gap.outlook)]
+    assert lines == [*warned, "each pulse: -200 mV 500 us, then +200 mV 400 us", str(gap.outlook)]
     assert gap.loop.adaptive_from is not None
     thresholds, commands = AdaptiveThresholds(gap.loop.adaptive_from), []
     mapping = next(iter(policies.values())).mapping
@@ -286,9 +284,9 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
         if tick.agent in policies:
             commands.append(float(mapping.command(np.float32(tick.rate_hz), thresholds.percentiles())))
         if not tick.is_burst:
-            # Two pulses a trial: neurons remember nothing.
+            # Two pulses per trial: neurons have no memory.
             thresholds.add(tick.delivered, Remembered(), np.array(tick.rate_hz))
-    found = answered(gap.session, gap.loop, tuple(policies))
+    found = read_responses(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
     np.testing.assert_array_equal(found.responses.rate_hz, [tick.rate_hz for tick in ticks])
@@ -299,7 +297,7 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
     np.testing.assert_allclose(rewards, found.returns)
     assert found.commanded.presented.sum() == len(ticks)
     np.testing.assert_allclose(found.commanded.total.sum(), sum(commands))
-    # What the culture was presented between is there too, for what it may remember.
+    # What was presented in between is there too, as the culture may remember it.
     assert len(found.responses.presentations[0].condition) == len(list(gap.session.ticks))
 
 
@@ -328,17 +326,19 @@ def test_what_was_not_measured_is_named(without_controls: Ran) -> None:
     gap = without_controls[0]
     policies, *others = gap.rows
     none = np.empty(0)
-    no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, beside=None) for row in others)))
-    assert no_controls.verdict().startswith("no control ran to its end")
-    no_policy = replace(gap, rows=(replace(policies, measured=none), *(replace(row, beside=None) for row in others)))
-    assert no_policy.verdict().startswith("no episode of a policy ran to its end")
+    no_controls = replace(gap, rows=(policies, *(replace(row, measured=none, comparison=None) for row in others)))
+    assert no_controls.verdict().startswith("no control completed an episode")
+    no_policy = replace(
+        gap, rows=(replace(policies, measured=none), *(replace(row, comparison=None) for row in others))
+    )
+    assert no_policy.verdict().startswith("no policy completed an episode")
 
 
 @pytest.mark.oracle
-def test_a_prediction_with_memory_is_told_to_lack_a_warm_up(tmp_path: Path, series: list[Responses]) -> None:
+def test_a_missing_warm_up_is_reported_for_a_prediction_with_memory(tmp_path: Path, series: list[Responses]) -> None:
     remembering = Calibration.of_series(series, kind="memory")
     policies = {"p0": policy_of(0, series)}
-    for pulses, warm_up, told in ((1, 0, True), (1, 1, False), (2, 0, False)):
+    for pulses, warm_up, is_reported in ((1, 0, True), (1, 1, False), (2, 0, False)):
         with FakeCulture() as culture:
             gap = run_policies(
                 policies,
@@ -350,10 +350,10 @@ def test_a_prediction_with_memory_is_told_to_lack_a_warm_up(tmp_path: Path, seri
                 pulses=pulses,
                 warm_up=warm_up,
             )
-        assert ("no-warm-up" in {finding.name for finding in gap.findings}) == told
+        assert ("no-warm-up" in {finding.name for finding in gap.findings}) == is_reported
 
 
-def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> None:
+def test_one_episode_gives_no_interval_of_the_gap(without_controls: Ran) -> None:
     gap = without_controls[0]
     row = replace(gap.rows[0], measured=gap.rows[0].measured[:1] - 100)
     assert (row.gap.low, row.gap.high) == (-np.inf, np.inf)
@@ -365,7 +365,7 @@ def test_of_one_episode_nothing_is_said_about_the_gap(without_controls: Ran) -> 
 
 
 @pytest.mark.oracle
-def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, series: list[Responses]) -> None:
+def test_fixed_percentiles_are_the_same_in_all_bootstraps(tmp_path: Path, series: list[Responses]) -> None:
     calibration = Calibration.of_series(series)
     moving = {tuple(np.asarray(each.percentiles).tolist()) for each in calibration.bootstraps}
     assert len(moving) > 50
@@ -375,7 +375,7 @@ def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, 
     policy = policy_of(0, series, provenance={"training": {"percentiles": "first"}})
     for adaptive in (True, False):
         first = Calibration.of_series(series, policy, at_min=series[-1].start_min, adaptive=adaptive)
-        # Thresholds that adapt are the culture's own, however the policy was trained.
+        # Adaptive thresholds are the culture's own, however the policy was trained.
         held = {tuple(np.asarray(each.percentiles).tolist()) for each in (first.simulator, *first.bootstraps)}
         assert (held == {tuple(pooled_percentiles(series[0]).tolist())}) == (not adaptive)
         np.testing.assert_array_equal(first.percentiles, pooled_percentiles(series[-1 if adaptive else 0]))
@@ -390,14 +390,12 @@ def test_held_percentiles_are_the_same_whatever_is_bootstrapped(tmp_path: Path, 
     rolled = roll_out(environment, recorded, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, 0))
     np.testing.assert_array_equal(gap.rows[1].predicted[:EPISODES], rolled.returns[0])
     other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
-    assert not np.array_equal(gap.rows[0].predicted_anew, other.rows[0].predicted_anew)
+    assert not np.array_equal(gap.rows[0].bootstrap_means, other.rows[0].bootstrap_means)
 
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
-    tmp_path: Path, series: list[Responses]
-) -> None:
+def test_a_prediction_without_the_cultures_memory_is_reported(tmp_path: Path, series: list[Responses]) -> None:
     remembers = Finding("memory", "note", "the culture remembers: 66 % and 36 %", 0.3)
     found = [replace(each, findings=(*each.findings, remembers)) for each in series]
     for kind, warned in (("histogram", True), ("memory", False)):
@@ -433,7 +431,7 @@ def test_a_prediction_that_knows_nothing_of_the_cultures_memory_says_so(
 def test_what_the_loop_refuses_is_refused_before_anything_is_predicted(
     series: list[Responses], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever refuses while an optimum is computed in another thread ends the program with it."""
+    """A refusal while an optimum is computed in another thread would end the program."""
 
     def predict(*_: object, **__: object) -> None:
         raise AssertionError("predicted")
@@ -488,7 +486,7 @@ def test_no_two_roll_outs_have_the_same_draws() -> None:
 def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     mapping: Mapping, fixed: bool, series: list[Responses], tmp_path: Path
 ) -> None:
-    """A culture that does answer as its recording's distribution says, and 100 responses of it in each recording."""
+    """A culture that responds exactly by its recording's distribution, with 100 responses in each recording."""
     gap, _ = run(tmp_path, series, with_controls=False)
     assert [row.name for row in gap.rows] == ["policies", "p0", "p1", "random"]
     rng = np.random.default_rng(5)
@@ -509,7 +507,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
         row = replace(
             gap.rows[0],
             predicted=returns(calibration.simulator, ROLL_OUTS * EPISODES, seed),
-            predicted_anew=np.array(
+            bootstrap_means=np.array(
                 [returns(each, EPISODES, 10_000 + seed + i).mean() for i, each in enumerate(calibration.bootstraps)]
             ),
             measured=returns(living, 40, 1000 + seed),
@@ -520,7 +518,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
 
 
 @pytest.mark.long
-def test_a_prediction_is_surer_the_more_responses_were_recorded() -> None:
+def test_a_prediction_is_more_certain_with_more_recorded_responses() -> None:
     rng, widths = np.random.default_rng(3), []
     environment = Animat(Cartpole(), Thresholds(1), 5)
     rule = heuristic_policy(environment, fit_empirical(drawn_responses(rng, 5_000)))
@@ -546,6 +544,7 @@ def test_the_heuristic_policy_is_the_same_on_simulator_and_culture(series: list[
     ):
         environment: Animat[Any] = Animat(robot, Thresholds(1), 5)
         rule = heuristic_policy(environment, simulator)
+        assert isinstance(rule, HeuristicPolicy)
         assert int(np.argmax(rule.means)) == 4
         observed = rng.uniform(low, high, (500, len(low)))
         one = jax.tree.map(lambda x: x[0], rule)
@@ -584,7 +583,7 @@ def test_whose_work_it_is_in_a_loop(tmp_path: Path, series: list[Responses]) -> 
         assert found[name].lost.value == pytest.approx(measured.mean() - rows[name].measured.mean())
         assert found[name].lost.low <= found[name].lost.value <= found[name].lost.high
     assert found["its simulator"].lost == gap.rows[0].gap
-    # Predicted as in simulation alone.
+    # As in simulation alone.
     simulated = evaluate(policies, fit_timeline(series), episodes=100, seed=1, interventions=True).whose_work
     assert simulated is not None
     for row in simulated.rows:
@@ -598,7 +597,7 @@ def test_whose_work_it_is_in_a_loop(tmp_path: Path, series: list[Responses]) -> 
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("few_bootstraps")
-def test_the_best_coupling_runs_beside_the_policies(
+def test_the_best_coupling_runs_with_the_policies(
     tmp_path: Path, series: list[Responses], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 2)
@@ -606,7 +605,7 @@ def test_the_best_coupling_runs_beside_the_policies(
     coupling = {row.name: row for row in gap.rows}["coupling"]
     rewards = [tick.reward or 0.0 for tick in read_session(tmp_path).ticks if tick.agent == "coupling"]
     assert len(coupling.measured) == 4 and coupling.measured.sum() == pytest.approx(sum(rewards))
-    assert len(coupling.predicted) and coupling.beside is not None
+    assert len(coupling.predicted) and coupling.comparison is not None
 
 
 @pytest.mark.oracle
@@ -628,7 +627,7 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
     assert calibrated().burst_threshold == series[1].threshold
     assert Calibration.of_series(series).start_min == last
     assert Calibration.of_series(series, at_min=first).start_min == first
-    # What a closed loop compares with is, bit for bit, what the simulator was trained with.
+    # The percentiles of a closed loop are, bit for bit, those of the training simulator.
     np.testing.assert_array_equal(
         np.float32(calibrated().percentiles), np.percentile(series[1].non_burst_rate_hz, range(0, 101, 10)).astype("f4")
     )
@@ -636,7 +635,7 @@ def test_the_percentiles_are_those_of_the_last_simulator_in_training(series: lis
 
 @pytest.mark.usefixtures("few_bootstraps")
 @pytest.mark.parametrize(("rest_min", "warned"), [pytest.param(20.0, False, marks=pytest.mark.oracle), (45.0, True)])
-def test_a_recording_much_older_than_the_culture_is_said_to_be(
+def test_a_recording_much_older_than_the_culture_is_reported(
     tmp_path: Path, series: list[Responses], rest_min: float, warned: bool
 ) -> None:
     with FakeCulture() as culture:
@@ -683,7 +682,7 @@ def test_a_budget_that_ends_early_leaves_what_was_measured(tmp_path: Path, serie
 
 @pytest.mark.usefixtures("few_bootstraps")
 class TestCommand:
-    """`animat run` and `animat recover`, on a replay of recordings: quick, and with no culture but theirs."""
+    """`animat run` and `animat recover`, on a replay of recordings: fast, and without any other culture."""
 
     @pytest.fixture(scope="class")
     def written(self, tmp_path_factory: Any, recordings: list[Recording], series: list[Responses]) -> Path:
@@ -721,14 +720,14 @@ class TestCommand:
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == told["session"]["ticks"]
         assert main(["inspect", str(folder / "session" / "session.nwb")]) == 0
 
-    def test_a_session_that_is_there_is_not_overwritten(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_an_existing_session_is_not_overwritten(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--controls", "random") == 0
         before = (folder / "session" / "session.log").read_bytes()
         assert self.command(folder) == 1
         assert "a session is there already; choose another folder" in capsys.readouterr().err
         assert (folder / "session" / "session.log").read_bytes() == before
 
-    def test_of_a_session_that_was_killed_it_says_how_to_recover_it_and_touches_nothing(
+    def test_for_a_killed_session_it_says_how_to_recover_it_and_changes_nothing(
         self, folder: Path, capsys: pytest.CaptureFixture[str], never_opened: None
     ) -> None:
         session = folder / "session"
@@ -782,7 +781,7 @@ class TestCommand:
         assert "is its recording" in printed.out
 
     @pytest.mark.oracle
-    def test_other_electrodes_than_in_the_recordings_are_told(
+    def test_electrodes_that_differ_from_the_recordings_are_reported(
         self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         class Rewired(FakeCulture):
@@ -798,7 +797,7 @@ class TestCommand:
             assert "no pattern of this culture" in said if words else "pattern" not in said
             assert (words or "") in said
 
-    def test_a_spent_budget_is_told_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_spent_budget_is_reported_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--budget-pulses", "50", "--controls", "random") == 1
         printed = capsys.readouterr()
         assert "budget.pulses: 50 of 50 pulses are spent, and 2 more were wanted" in printed.err
@@ -844,7 +843,7 @@ class TestCommand:
         said = capsys.readouterr().err.splitlines()[-1]
         assert words in said
 
-    def test_what_does_not_belong_together_is_told_before_a_culture_is_opened(
+    def test_mismatches_are_reported_before_a_culture_is_opened(
         self, folder: Path, series: list[Responses], capsys: pytest.CaptureFixture[str], never_opened: None
     ) -> None:
         other = policy_of(3, series, conditions=(Condition("90 Hz", 90.0, "Hz"), *series[0].conditions[1:]))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from animat.reality_gap.answered import Answered, Commanded
-from animat.reality_gap.predicting import Predicted
+from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
+from animat.reality_gap.session_responses import CommandSums, SessionResponses
 from animat.responses.condition import Condition
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Presented, Responses
@@ -27,8 +27,8 @@ EVERY = np.arange(EPISODES * ACTIONS)
 def session(
     seed: int, *, gap: int = -1, thresholds: int = 1, means_hz: np.ndarray = MEANS_HZ, **changed: Any
 ) -> Evidence:
-    """A synthetic one: independent responses, normal about each condition's mean, in episodes of a policy that prefers
-    one condition more or less; what is told of it is changed by functions of the arrays."""
+    """A synthetic session: independent responses, normal about each condition's mean, in episodes of a policy that
+    prefers one condition more or less; functions of the arrays change its data."""
     rng = np.random.default_rng(seed)
     recorded = rng.normal(means_hz[:, None], 4.0, (2, RECORDED))
 
@@ -44,11 +44,11 @@ def session(
     drawn = rng.integers(0, RECORDED, (100, 2, RECORDED))
     anew = summed(np.take_along_axis(np.broadcast_to(recorded, drawn.shape), drawn, axis=-1))
     everywhere = np.full(2, RECORDED)
-    predicted = Predicted(
+    predicted = Prediction(
         np.zeros(1),
         np.zeros(1),
-        Commanded(everywhere, summed(recorded)),
-        Commanded(everywhere + 0 * drawn[..., 0], anew),
+        CommandSums(everywhere, summed(recorded)),
+        CommandSums(everywhere + 0 * drawn[..., 0], anew),
     )
     calibration: Any = SimpleNamespace(
         responses_hz=tuple(recorded),
@@ -64,14 +64,14 @@ def session(
     is_burst = rng.random(len(EVERY)) < 0.02
     late_s = np.where(rng.random(len(EVERY)) < 0.02, 0.0002, 0.0)
     returns = rng.normal(0.0, 30.0, EPISODES)
-    told = {"rate_hz": rate_hz, "is_burst": is_burst, "late_s": late_s, "returns": returns}
-    told |= {name: change(condition, rate_hz) for name, change in changed.items()}
+    data = {"rate_hz": rate_hz, "is_burst": is_burst, "late_s": late_s, "returns": returns}
+    data |= {name: change(condition, rate_hz) for name, change in changed.items()}
     time_s = EVERY * 1.0
     responses = Responses(
         condition,
-        told["rate_hz"],
+        data["rate_hz"],
         np.zeros(len(EVERY)),
-        told["is_burst"],
+        data["is_burst"],
         CONDITIONS,
         (2.0, 10.0),
         16,
@@ -79,12 +79,13 @@ def session(
         float("nan"),
         presentation=Presentation("mixed", 1),
         time_s=time_s,
-        presented=Presented(condition, told["rate_hz"], told["is_burst"], np.zeros(len(EVERY), bool)),
+        presented=Presented(condition, data["rate_hz"], data["is_burst"], np.zeros(len(EVERY), bool)),
         place=EVERY,
     )
-    command = commands(told["rate_hz"][None], recorded)[0]
-    answered = Answered(responses, episode, told["late_s"], np.ones(len(EVERY), bool), command, told["returns"])
-    return Evidence(answered, calibration, predicted, gap)  # type: ignore[arg-type]
+    command = commands(data["rate_hz"][None], recorded)[0]
+    moved = np.ones(len(EVERY), bool)
+    read = SessionResponses(responses, episode, data["late_s"], moved, command, data["returns"])
+    return Evidence(read, calibration, predicted, gap)  # type: ignore[arg-type]
 
 
 def falling(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
@@ -97,14 +98,14 @@ def worse(*_: np.ndarray) -> np.ndarray:
 
 
 def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
-    """An answer is larger after a large one."""
+    """A response is larger after a large one."""
     return rate_hz + 1.5 * np.sign(np.concatenate([[0.0], rate_hz[:-1] - 12.0]))
 
 
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "presentation": (
         {"calibration": {"presentation": Presentation("blocked", 1)}},
-        "the recording was presented blocked, 1 pulse per trial, the loop mixed, 1 pulse per trial",
+        "the presentation in the recording was blocked, 1 pulse per trial, in the loop mixed, 1 pulse per trial",
     ),
     "few-samples": (
         {"calibration": {"responses_hz": (np.ones(7), np.full(200, 14.0))}},
@@ -122,7 +123,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "memory": ({"rate_hz": remembering}, "the culture remembers: after a response that passes the median"),
     "answers": (
         {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
-        "conditions lead to other mean commands than predicted: 80 Hz to ",
+        "conditions lead to different mean commands than predicted: 80 Hz to ",
     ),
 }
 
@@ -152,7 +153,7 @@ def test_where_there_is_no_reason_hardly_one_is_named() -> None:
 
 
 def test_what_differs_between_episodes_is_no_reason() -> None:
-    """Each episode's responses are larger or smaller as a whole: that is no trend, and no other command in all."""
+    """Each episode's responses are larger or smaller as a whole: that is neither a trend nor a different command."""
 
     def uneven(seed: int) -> Any:
         offsets = np.random.default_rng([seed, 1]).normal(0.0, 2.0, EPISODES)
@@ -176,14 +177,14 @@ def test_a_trend_is_a_reason_only_where_the_returns_have_it_too() -> None:
         assert found["trend"].value == pytest.approx(-0.25, abs=0.15)
 
 
-def test_a_simulator_that_remembers_is_not_told_that_it_does_not() -> None:
+def test_memory_is_no_reason_where_the_simulator_has_one() -> None:
     knows = {"simulator": SimpleNamespace(has_memory=True)}
     assert "memory" not in {f.name for f in reasons(session(1, rate_hz=remembering, calibration=knows))}
 
 
-def test_of_few_episodes_no_trend_and_no_command_is_told() -> None:
+def test_few_episodes_show_no_trend_and_no_difference_in_commands() -> None:
     evidence = session(1, **CASES["answers"][0])
-    answered = evidence.answered
+    answered = evidence.session
     kept = answered.episode < 7
     few = replace(
         answered,
@@ -197,10 +198,10 @@ def test_of_few_episodes_no_trend_and_no_command_is_told() -> None:
         **{name: getattr(answered, name)[kept] for name in ("episode", "late_s", "moved", "command")},
         returns=answered.returns[:7],
     )
-    assert reasons(replace(evidence, answered=few)) == ()
+    assert reasons(replace(evidence, session=few)) == ()
 
 
-def test_of_nine_thresholds_commands_tell_what_the_median_alone_does_not() -> None:
+def test_commands_of_nine_thresholds_show_what_the_median_alone_does_not() -> None:
     """80 Hz passes the median always, and less of the thresholds above it: its responses fall, and stay above."""
 
     def lower(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
@@ -221,22 +222,24 @@ def test_of_nine_thresholds_commands_tell_what_the_median_alone_does_not() -> No
         assert of_nine["answers"].value == pytest.approx(2 * of_each.sum() / 9, abs=0.15)
 
 
-def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
+def test_of_two_readouts_the_one_that_differs_is_named() -> None:
     def on_halves(left: Evidence, right: Evidence) -> Evidence:
-        each = [evidence.answered for evidence in (left, right)]
+        each = [evidence.session for evidence in (left, right)]
         responses = replace(
             each[0].responses,
             readouts=Readouts(("left", "right"), ((1,), (2,))),
             readout_hz=np.stack([one.responses.rate_hz for one in each], axis=1),
         )
         answered = replace(each[0], responses=responses, command=np.stack([one.command for one in each], axis=1))
-        told = left.predicted
-        once, anew = (
-            Commanded(each.presented, np.stack([each.total] * 2, -1)) for each in (told.commanded, told.commanded_anew)
+        predicted = left.predicted
+        once, bootstrapped = (
+            CommandSums(each.presented, np.stack([each.total] * 2, -1))
+            for each in (predicted.commanded, predicted.commanded_bootstraps)
         )
         recorded = tuple(np.stack([x, x], axis=1) for x in left.calibration.responses_hz)
         calibration: Any = SimpleNamespace(**{**vars(left.calibration), "responses_hz": recorded})
-        return Evidence(answered, calibration, told._replace(commanded=once, commanded_anew=anew), -1)
+        doubled = predicted._replace(commanded=once, commanded_bootstraps=bootstrapped)
+        return Evidence(answered, calibration, doubled, -1)
 
     check = CHECKS["mean commands"]
     same, other = session(3), session(3, rate_hz=lambda condition, rate_hz: rate_hz - 3.0)
@@ -244,5 +247,5 @@ def test_of_two_readouts_the_one_that_answers_otherwise_is_named() -> None:
     found, alone = check(on_halves(same, other)), check(other)
     assert found is not None and alone is not None
     assert "80 Hz on right to " in found.message and "on left" not in found.message
-    # What is told of it is what would be told of it alone.
+    # The message is the same as for this readout alone.
     assert found.message.replace(" on right", "") == alone.message

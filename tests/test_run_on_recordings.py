@@ -394,5 +394,7 @@ def test_recordings_that_lack_a_frequency_are_refused_with_what_they_have(
 ) -> None:
     assert run(tmp_path / "session", policy_of(0, (5.0, 30.0)), series) == 1
     said = capsys.readouterr().err
-    assert "conditions: expected 5 Hz, 30 Hz, which the policies pick from, got recordings with 5 Hz, 10 Hz, 20" in said
+    assert (
+        "conditions: expected 5 Hz, 30 Hz, from which the policies choose, got recordings with 5 Hz, 10 Hz, 20" in said
+    )
     assert not (tmp_path / "session").exists()

@@ -87,16 +87,16 @@ def test_exact_p_with_ties_goes_through_all_ways() -> None:
     assert compared.p_exact == pytest.approx(np.mean(ways))
 
 
-def test_equal_samples_tell_nothing() -> None:
+def test_equal_samples_show_no_difference() -> None:
     compared = compare([3.0] * 4, [3.0] * 5)
     assert (compared.p_normal, compared.p_exact, compared.effect.value) == (1.0, 1.0, 0.0)
 
 
 def test_interquartile_mean_is_rliables() -> None:
     x = np.random.default_rng(2).normal(size=30)
-    told = interquartile_mean(x)
-    assert told.value == pytest.approx(scipy.stats.trim_mean(x, 0.25))
-    assert told.low < told.value < told.high
+    interval = interquartile_mean(x)
+    assert interval.value == pytest.approx(scipy.stats.trim_mean(x, 0.25))
+    assert interval.low < interval.value < interval.high
     assert interquartile_mean(range(12)).value == pytest.approx(5.5)
     alone = interquartile_mean([3.0])
     assert (alone.low, alone.value, alone.high) == (-np.inf, 3.0, np.inf)
@@ -109,8 +109,8 @@ def test_intervals_cover_what_they_say(n: int) -> None:
     """95 % intervals of symmetric samples, whose interquartile mean is 0, for few samples too; tails light or heavy."""
     rng = np.random.default_rng(3)
     for draw in (rng.normal, lambda size: rng.standard_t(3, size=size)):
-        told = [interquartile_mean(draw(size=n)) for _ in range(1000)]
-        assert 0.92 <= np.mean([each.low <= 0 <= each.high for each in told]) <= 0.975
+        intervals = [interquartile_mean(draw(size=n)) for _ in range(1000)]
+        assert 0.92 <= np.mean([each.low <= 0 <= each.high for each in intervals]) <= 0.975
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_intervals_cover_what_they_say(n: int) -> None:
     ],
 )
 def test_effect_intervals_cover_the_true_effect(n: int, apart: float) -> None:
-    """Normal samples so many standard deviations apart: P(second > first) = Phi(apart / sqrt 2), up to 0.98.
+    """Normal samples some standard deviations apart: P(second > first) = Phi(apart / sqrt 2), up to 0.98.
 
     Near complete separation the percentile bootstrap of ten and ten holds the true effect half of the time.
     """

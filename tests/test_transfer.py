@@ -1,4 +1,4 @@
-"""What evaluation says that a closed loop would not meet, and that recordings are read as in training."""
+"""Reasons why a closed loop would not reach evaluated returns, and that recordings are read as in training."""
 
 from __future__ import annotations
 
@@ -70,26 +70,28 @@ def test_policies_of_blocks_are_reported_by_training_and_evaluation(
     assert "other-presentation" in evaluated["not_met_in_a_closed_loop"]
     assert main(["evaluate", str(tmp_path / "b"), "--recordings", blocked]) == 0
     assert (
-        "a closed loop on the culture would not meet these returns: see the warnings (other-presentation)"
+        "a closed loop on the culture would not reach these returns: see the warnings (other-presentation)"
         in capsys.readouterr().out
     )
 
     mixed = series(tmp_path / "mixed", a_recording(0), a_recording(10))
     trained = ran(capsys, "train", "cartpole", "--recordings", mixed, *QUICK, "--out", str(tmp_path / "m"))
     assert not warned(trained)
-    # What was recorded in blocks predicts for policies of mixed recordings no more than theirs do for a loop.
+    # Recordings in blocks predict as little for policies of mixed recordings as for a loop.
     assert ran(capsys, "evaluate", str(tmp_path / "m"), "--recordings", blocked)["not_met_in_a_closed_loop"] == [
         "other-calibration"
     ]
 
 
 @pytest.mark.oracle
-def test_an_unknown_presentation_is_not_told_as_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_presentation_is_not_reported_as_different(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recordings = series(tmp_path / "r", replace(a_recording(0), presentation=None))
     train = ["train", "cartpole", "--recordings", recordings, *QUICK, "--out", str(tmp_path / "p")]
     assert {f["name"] for f in ran(capsys, *train)["findings"]} >= {"unknown-presentation"}
     assert main(["evaluate", str(tmp_path / "p"), "--recordings", recordings]) == 0
-    said = "whether a closed loop on the culture would meet these returns is not known: see the warnings (unknown-pres"
+    said = "it is not known whether a closed loop on the culture would reach these returns: see the warnings (unknown-"
     assert said in capsys.readouterr().out
     # Another robot's folder is refused by the robot, not by what follows from it.
     assert main(["train", "navigation", *train[2:]]) == 1
@@ -140,7 +142,7 @@ def test_recordings_are_read_as_in_training(tmp_path: Path, capsys: pytest.Captu
         out,
     )
     evaluate = ["evaluate", out, "--recordings", recordings]
-    # Without an option repeated, on the very simulator: 100 episodes of the same seed are the same episodes.
+    # Without repeating an option, on the same simulator: 100 episodes of the same seed are the same episodes.
     alike = ran(capsys, *evaluate)
     assert alike["policies"] == trained["returns"]
     assert not {f["name"] for f in alike["findings"]} & {"other-simulator", "other-window"}

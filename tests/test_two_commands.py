@@ -34,7 +34,7 @@ from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.simulator import fit_empirical
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.reality_gap import Calibration, run_policies
-from animat.reality_gap.answered import answered
+from animat.reality_gap.session_responses import read_responses
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.responses.extraction import extract_responses
@@ -142,7 +142,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     assert "command" not in table[0]
 
     # Each condition's commands, as the reasons of a gap ask.
-    read = answered(session, loop, ["random"])
+    read = read_responses(session, loop, ["random"])
     used = [tick for tick in session.ticks if tick.handled == "used" and tick.agent == "random"]
     np.testing.assert_array_equal(read.command, [tick.command for tick in used])
     np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in used])

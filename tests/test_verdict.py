@@ -1,4 +1,4 @@
-"""Whether policies outperform controls: the rank test counted by hand, and what is said of it."""
+"""Whether policies outperform controls: the rank test counted by hand, and its message."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from animat.evaluation.verdict import Beside, Verdict, beside
+from animat.evaluation.verdict import EpisodeComparison, Verdict, compare_episodes
 
 returns = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=12)
 
 
 @given(ours=returns, theirs=returns)
 def test_pairs_and_p_are_as_counted_by_hand(ours: list[float], theirs: list[float]) -> None:
-    found = beside(ours, theirs)
+    found = compare_episodes(ours, theirs)
     pairs = [(a > b) + (a == b) / 2 for a in ours for b in theirs]
     assert found.wins == pytest.approx(np.mean(pairs))
     # The normal approximation with continuity correction and tied ranks, from its textbook formula.
@@ -39,16 +39,16 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     assert said.count("worse") == 1
     every = str(Verdict.of(policies, {"worse": policies - 9}))
     assert every.startswith("the policies outperform every control (p < 0.01; ")
-    assert every.endswith("larger in 100 % of the pairs of episodes or more)")
+    assert every.endswith("larger in at least 100 % of the pairs of episodes)")
 
 
 def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
-    # Of four and four even the clearest difference has p = 0.03; of six and six it has 0.005.
+    # With four and four even the clearest difference has p = 0.03; with six and six it has 0.005.
     four, six = Verdict.of([9.0] * 4, {"a": [0.0] * 4}), Verdict.of(np.arange(6) + 9.0, {"a": np.arange(6.0)})
-    assert "4 episodes of the policies beside 4 of a control are too few to tell" in str(four)
+    assert "4 episodes of the policies and 4 of a control are too few to show" in str(four)
     assert str(six).startswith("the policies outperform every control (p < 0.01; ")
-    # What is known of one control is said, though another was broken off.
+    # The result for one control is reported even if another was broken off.
     both = Verdict.of(np.arange(20.0), {"broken off": [0.0], "better": np.arange(20) + 90.0})
     assert str(both).startswith("the policies do not outperform better (p = ")
-    assert str(both).endswith("too few to tell (p < 0.01) whether the policies outperform broken off")
-    assert not Beside(0.03, 1.0, 4, 4).can_tell
+    assert str(both).endswith("too few to show (p < 0.01) whether the policies outperform broken off")
+    assert not EpisodeComparison(0.03, 1.0, 4, 4).has_enough_episodes

@@ -14,7 +14,7 @@ from animat.coding.decoder import Decoder, expect_fit
 from animat.coding.encoder import Encoder
 from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
 from animat.errors import InvalidArgument, UnusableData
-from animat.evaluation.transfer import in_window, other_presentation
+from animat.evaluation.transfer import describe_window, other_presentation
 from animat.goals.robot import body_and_goal
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.remembering import Remembering
@@ -224,7 +224,7 @@ class Loop:
 def _differences(policy: Policy, loop: Loop) -> tuple[Finding, ...]:
     findings = list(other_presentation(policy.presentation, loop.presentation))
     if policy.window_ms is not None and policy.window_ms != loop.window_ms:
-        trained, read = in_window(policy.window_ms), in_window(loop.window_ms)
+        trained, read = describe_window(policy.window_ms), describe_window(loop.window_ms)
         message = f"the policy was trained on responses {trained}, the loop reads those {read}"
         findings.append(Finding("other-window", "warning", message))
     return tuple(findings)

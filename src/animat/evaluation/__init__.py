@@ -1,1 +1,1 @@
-"""How good policies are: episodes, controls beside them, statistics, and the optimal return."""
+"""How good policies are: episodes, controls, statistics, and the optimal return."""

@@ -1,4 +1,4 @@
-"""The commands that an action leads to, as a distribution: what an expectation over the neurons is taken over."""
+"""The distribution of commands that an action leads to, for expectations over the neurons."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from animat.neurons.simulator import NeuronSimulator, Stored, placed
 from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
 
 CONTINUOUS_ACTIONS = 21
-"""How many evenly spaced commands stand for a continuous action."""
+"""Number of evenly spaced commands that represent a continuous action."""
 
 _QUANTILES = 2048
-"""How many responses of equal probability stand for a condition's distribution, where the mapping is continuous."""
+"""Number of responses of equal probability that represent a condition's distribution, for a continuous mapping."""
 
 _MOST_LEVELS = 12
 
 CLASSES = 6
-"""In how many classes a history is remembered."""
+"""Number of classes of the history state."""
 
-_PASTS = 8
-"""How many histories stand for each of their classes."""
+_HISTORIES_PER_CLASS = 8
+"""Number of histories that represent a class."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,9 @@ class Commands:
     """For each action, the commands u it can lead to, with their probabilities.
 
     Attributes:
-        actions: what an environment is handed for each action: an index, or a command, shape (actions,).
+        actions: the environment's input for each action: an index, or a command, shape (actions,).
         levels: the commands of each action, in [-1, 1], shape (actions, levels).
-        probabilities: of each of them; every row adds up to 1, shape (actions, levels).
+        probabilities: of each of these commands; every row adds up to 1, shape (actions, levels).
     """
 
     actions: np.ndarray
@@ -50,9 +50,9 @@ class Commands:
     probabilities: Float64[np.ndarray, "actions levels"]
 
     def with_noise(self, largest: float) -> Commands:
-        """The same with each command changed by noise evenly distributed in [-largest, largest].
+        """The same with uniform noise in [-largest, largest] added to each command.
 
-        Two points at +-largest / sqrt(3) stand for it: the mean of a cubic polynomial over them is the right one.
+        Two points at +-largest / sqrt(3) represent it: the mean of a cubic polynomial over them is exact.
         """
         shift = largest / np.sqrt(3)
         if shift == 0:
@@ -60,22 +60,21 @@ class Commands:
         levels = np.concatenate([self.levels - shift, self.levels + shift], axis=1)
         return Commands(self.actions, levels, np.concatenate([self.probabilities, self.probabilities], axis=1) / 2)
 
-    def that(self, likely: Float64[np.ndarray, "actions levels"]) -> Commands:
-        """The part of each action's commands that comes with something else, by how likely it is with each of them."""
+    def weighted(self, likely: Float64[np.ndarray, "actions levels"]) -> Commands:
+        """The commands with their probabilities multiplied by that of an event, given each command."""
         return replace(self, probabilities=self.probabilities * likely)
 
     def onto(self, nodes: Float64[np.ndarray, " nodes"], *, smooth: bool) -> Float64[np.ndarray, "actions nodes"]:
-        """Weights that take a function's values at a few commands to its mean over each action's commands.
+        """Weights that give the mean of a function over each action's commands from its values at a few commands.
 
             E[f(u) | action] = sum_k w_k f(u_k),    w_k = E[l_k(u) | action]
 
-        with l_k the polynomials (smooth) or the hats (not) that are 1 at node k and 0 at the others. Where all
+        with l_k the polynomials (smooth) or hat functions (otherwise) that are 1 at node k and 0 at the others. If all
         commands are nodes, the weights are their probabilities.
 
         Args:
             nodes: the commands at which the function is known, rising.
-            smooth: whether the function is well told by one polynomial through all nodes; a weight may then be
-                negative.
+            smooth: whether one polynomial through all nodes describes the function well; weights may then be negative.
         """
         if smooth:
             basis = np.ones((*self.levels.shape, len(nodes)))
@@ -93,14 +92,14 @@ class Commands:
 
 
 def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> Commands:
-    """What each action of an environment leads to.
+    """The commands that each action of an environment leads to.
 
     For thresholds the probabilities are exact: where a condition's distribution passes each threshold is found by
-    bisection, to the last bit of a float32. For a continuous mapping a condition is stood for by 2048 responses of
-    equal probability; a continuous action by 21 evenly spaced commands.
+    bisection, to the last bit of a float32. For a continuous mapping 2048 responses of equal probability represent a
+    condition; 21 evenly spaced commands represent a continuous action.
 
     Args:
-        simulator: the neurons' answers; None without neurons.
+        simulator: None without neurons.
 
     Raises:
         InvalidArgument: for an Animat without a simulator.
@@ -113,9 +112,9 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
         leads_to = step(jnp.zeros(environment.noise_size), start, actions, simulator).info["command"]
         return Commands(np.asarray(actions), np.asarray(leads_to, np.float64)[:, None], np.ones((len(actions), 1)))
     if simulator is None:
-        raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
+        raise InvalidArgument("simulator: expected a simulator, as an Animat acts through neurons, got None")
     if isinstance(animat.mapping, Thresholds):
-        # Every level's probability, from the shares of responses below each level.
+        # The probability of every level, from the shares of responses below each level.
         below = np.asarray(_shares_below(animat.mapping, simulator), np.float64)
         probabilities = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
         levels = np.tile(np.array(animat.mapping.levels), (len(below), 1))
@@ -125,7 +124,7 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
         probabilities = np.full(levels.shape, 1 / _QUANTILES)
     n_actions = animat.n_conditions
     if is_shuffled(environment):
-        # Whatever is chosen, any condition is delivered: every action leads to the mixture of all.
+        # The delivered condition does not depend on the choice: every action leads to the mixture of all.
         levels = np.tile(levels.reshape(1, -1), (n_actions, 1))
         probabilities = np.tile(probabilities.reshape(1, -1) / n_actions, (n_actions, 1))
     return Commands(np.arange(n_actions), levels, probabilities)
@@ -134,9 +133,10 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 def mean_commands(
     environment: Environment[Any], simulator: NeuronSimulator | None
 ) -> tuple[np.ndarray, Float64[np.ndarray, "actions *commands"]]:
-    """What an environment is handed for each action, and the mean command that it leads to.
+    """The environment's input for each action, and the mean command that it leads to.
 
-    Args and errors: as `commands_of`. Several commands are averaged over 2048 responses of equal probability.
+    Arguments and errors are those of `commands_of`. Several commands are averaged over 2048 responses of equal
+    probability.
     """
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
@@ -147,43 +147,43 @@ def mean_commands(
 
 
 def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
-    """How many classes of the history make a difference: one where nothing is remembered.
+    """Number of classes of the history that are distinguished: one without memory.
 
     Raises:
-        InvalidArgument: for a simulator of one's own that remembers: its histories are not known.
+        InvalidArgument: for a custom simulator with memory: its histories are not known.
     """
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return 1
     if not isinstance(simulator, MemorySimulator):
         raise InvalidArgument(
-            f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: which "
-            "history states it comes through is not known, and the optimal return is not known without"
+            f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: the optimal "
+            "return cannot be computed, as its history states are not known"
         )
     return CLASSES
 
 
 def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"]) -> Int[np.ndarray, "*histories"]:
-    """Which class of histories each is remembered in, by its trace: of the recording's own, equally many are in each.
+    """The class of each history, by its trace; each class has equally many of the recording's own histories.
 
-    The load is not told apart: in each class there are the loads that were recorded with such traces.
+    Loads are not distinguished: each class has the loads that were recorded with such traces.
     """
     ends, traces = placed(np.arange(1, CLASSES) / CLASSES), placed(_recorded(simulator)[:, 0])
     return np.asarray(np.sum(np.asarray(history)[..., :1] >= np.asarray(jnp.quantile(traces, ends)), axis=-1))
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
-    """What each action leads to after a history of each class, and of which class the history is then.
+    """The commands that each action leads to after a history of each class, and the class of the next history.
 
-    A memory in six steps (`class_of`): 8 histories stand for all of a class, and 2048 draws after each of them for
-    what is answered.
+    Memory is approximated by six classes (`class_of`): 8 histories represent a class, and 2048 draws after each of them
+    its responses.
 
     Args:
         environment, simulator: as in `commands_of`.
 
     Returns:
-        For each class of the history, for each class of the history to come: the commands, with the probabilities
-        that they come with it; over all of these they add up to 1. Where nothing is remembered, one class and the
-        commands of `commands_of`.
+        For each class of the history, for each class of the next history: the commands, with the joint probabilities of
+        commands and next class, which add up to 1 over both. Without memory, one class and the commands of
+        `commands_of`.
     """
     is_one, animat = layers_of(environment, simulator) == 1, unwrapped(environment)
     if is_one or not (isinstance(animat, Animat) and isinstance(simulator, MemorySimulator)):
@@ -191,35 +191,35 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
     levels, histories = _answers(animat, simulator, _histories(simulator))
     levels, classes = np.asarray(levels), class_of(simulator, histories)
     if is_shuffled(environment):
-        # Whatever is chosen, any condition is delivered: one action stands for all.
+        # The delivered condition does not depend on the choice: one action represents all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
     actions, even = np.arange(levels.shape[1]), np.full(levels.shape[1:], 1 / levels.shape[-1])
     after = [Commands(actions, of_class.astype(np.float64), even) for of_class in levels]
     return [
-        [commands.that(likely=then == of) for of in range(len(levels))]
+        [commands.weighted(likely=then == of) for of in range(len(levels))]
         for commands, then in zip(after, classes, strict=True)
     ]
 
 
 def is_shuffled(environment: Environment[Any]) -> bool:
-    """Whether any condition is delivered whatever is chosen."""
+    """Whether the delivered condition is drawn at random, whatever is chosen."""
     if isinstance(environment, ShuffledDelivery):
         return True
     return isinstance(environment, Wrapper) and is_shuffled(environment.inside)
 
 
 def _recorded(simulator: MemorySimulator) -> Float[np.ndarray, "responses 2"]:
-    """The histories of all recorded responses, by rising trace."""
+    """The histories of all recorded responses, sorted by trace."""
     histories = np.asarray(simulator.histories)[np.isfinite(np.asarray(simulator.before))]
     return np.asarray(histories[np.argsort(histories[:, 0], kind="stable")])
 
 
 def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histories 2"]:
-    """A few histories of each class, evenly spaced in rank among those that were recorded."""
+    """A few histories of each class, evenly spaced in rank among the recorded ones."""
     recorded = _recorded(simulator)
     ends = np.searchsorted(class_of(simulator, recorded), np.arange(CLASSES + 1))
-    within = (np.arange(_PASTS) + 0.5) / _PASTS
-    # In a class that none is in, only an episode's start can be: those next to it stand for it.
+    within = (np.arange(_HISTORIES_PER_CLASS) + 0.5) / _HISTORIES_PER_CLASS
+    # A class without recorded histories can only contain an episode's start; the nearest histories represent it.
     rows = (ends[:-1, None] + within * np.diff(ends)[:, None]).astype(np.int64)
     return recorded[np.minimum(rows, len(recorded) - 1)]
 
@@ -228,7 +228,7 @@ def _histories(simulator: MemorySimulator) -> Float[np.ndarray, "classes histori
 def _answers(
     environment: Animat[Any], simulator: MemorySimulator, history: Float[Array, "classes histories 2"]
 ) -> tuple[Float[Array, "classes conditions draws"], Float[Array, "classes conditions draws 2"]]:
-    """The commands, and what is remembered then, at evenly spaced quantiles of each condition after each history."""
+    """The commands and the next histories, at evenly spaced quantiles of each condition after each history."""
     uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
@@ -240,11 +240,11 @@ def _answers(
 
 
 def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[np.ndarray, " nodes"], bool]:
-    """The fewest commands from which the means over all cases' commands can be had, and whether by polynomials.
+    """The fewest commands from which the means over all cases' commands can be computed, and whether by polynomials.
 
     Args:
-        cases: what is to be averaged over.
-        n_smooth: how many Chebyshev nodes tell a function of the command well; None: it is not smooth.
+        cases: the distributions to average over.
+        n_smooth: number of Chebyshev nodes that describe a function of the command well; None: it is not smooth.
     """
     levels = np.unique(np.concatenate([np.ravel(case.levels[case.probabilities > 0]) for case in cases]))
     levels = levels[np.concatenate([[True], np.diff(levels) > 1e-6])]
@@ -258,7 +258,7 @@ def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[
 
 @partial(jax.jit, static_argnums=0)
 def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Array, "conditions thresholds"]:
-    """The quantiles at which the command steps up to each level but the lowest, by bisection."""
+    """The quantiles at which the command steps up to each level except the lowest, by bisection."""
 
     def is_below(condition: Array, level: Array, quantile: Array) -> Array:
         # Levels are 0.2 apart.

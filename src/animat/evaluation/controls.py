@@ -1,6 +1,6 @@
-"""Controls that ask whether it is the culture that does the work: what is run beside trained policies.
+"""Controls and interventions that test whether the culture contributes to the return of trained policies.
 
-Each is defined once: a simulator runs it as it is here, and a closed loop makes its agents of it
+Each is defined once: on a simulator it is run as defined here, and a closed loop makes an agent from it
 (`animat.closed_loop.agents.agent_of`).
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from animat.environment import Animat, Environment
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
@@ -31,24 +31,24 @@ from animat.wrappers import (
 )
 
 Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
-"""What neurons are given; a training (`animat.wrappers.Delivery`) has the first two alone."""
+"""What neurons are given; in training (`animat.wrappers.Delivery`) only the first two exist."""
 
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """Somebody who acts in place of the policies, or the policies with one thing changed.
+    """An actor in place of the policies, or the policies with one change.
 
     Attributes:
-        name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or an intervention's.
-        meaning: what it does, in a few words.
-        actor: who chooses: one, or the policies side by side.
-        n_actors: how many they are.
-        delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn anew at each iteration;
+        name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or the name of an intervention.
+        meaning: a short description.
+        actor: one actor, or the policies side by side.
+        n_actors: their number.
+        delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn at random in each iteration;
             `"silent"`: nothing; `"yoked"`: the stimuli of another episode.
-        is_drawn: whether any recorded response is drawn in place of the neurons' own.
-        is_turned_round: whether every command is turned into its opposite.
-        switch_at: after how many iterations the robot is given another goal; None: never.
-        commands: of each condition, by which the robot is moved in place of the response; None: by the response.
+        is_drawn: whether a random recorded response replaces the neurons' own.
+        is_turned_round: whether every command is reversed.
+        switch_at: number of iterations after which the robot's goal is switched; None: never.
+        commands: of each condition, which move the robot in place of the response; None: the response moves it.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Control:
     def within(
         self, environment: Environment[Any], simulator: NeuronSimulator | None
     ) -> tuple[Environment[Any], NeuronSimulator | None]:
-        """What it is run in on a simulator, of what the policies are run in; the very same where nothing is changed."""
+        """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
             animat = unwrapped(environment)
             assert isinstance(animat, Animat)
@@ -76,7 +76,7 @@ class Control:
         elif self.delivery == "yoked":
             environment = YokedDelivery(environment)
         elif self.delivery == "silent" and simulator is not None:
-            # Whatever reaches neurons whose responses are drawn makes no difference.
+            # What is delivered makes no difference to neurons whose responses are drawn.
             simulator = indifferent(simulator) if self.is_drawn else silenced(simulator)
         if self.switch_at is not None:
             environment = GoalSwitch(environment, self.switch_at)
@@ -95,32 +95,29 @@ def controls_of(
 ) -> list[Control]:
     """The controls of an environment.
 
-    *random*, an action drawn at random; *constant*, one action always, for each of them; *heuristic*, the robot's
-    `heuristic`, where it has one; and through neurons, with policies: *silent*, on a culture without stimuli;
-    *shuffled*, with the delivered condition drawn anew at each iteration, whatever they chose.
+    *random*, an action drawn at random; *constant*, always the same action, one control for each; *heuristic*, the
+    robot's `heuristic`, if it has one; and, through neurons, with policies: *silent*, on a culture without stimuli;
+    *shuffled*, with the delivered condition drawn at random in each iteration, whatever they choose.
 
     Args:
         environment, simulator: what the policies are evaluated in (no simulator without neurons).
         labels: of discrete actions.
-        policies: several side by side; None leaves out what needs them.
+        policies: several side by side; None leaves out the controls that need them.
     """
     controls = [RANDOM]
     for i, label in enumerate(labels):
-        controls.append(Control(f"constant {label}", "this one always", Constant(jnp.array([i]))))
+        controls.append(Control(f"constant {label}", "always this one", Constant(jnp.array([i]))))
     if hasattr(environment.robot, "heuristic"):
-        rule: Actor = Heuristic()
-        meaning = "no learning: the command of the robot's heuristic"
-        if environment.n_actions is not None:
-            rule = heuristic_policy(environment, simulator)
-            meaning = "no learning: the stimulus nearest to the command of the robot's heuristic"
-        controls.append(Control("heuristic", meaning, rule))
+        action = "the command" if environment.n_actions is None else "the stimulus nearest to the command"
+        meaning = f"no learning: {action} of the robot's heuristic"
+        controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
     if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
-        controls += _without_effect(policies, n_policies)
+        controls += _without_influence(policies, n_policies)
     return controls
 
 
 def coupling_of(environment: Environment[Any], simulator: NeuronSimulator | None, *, seed: int) -> Control:
-    """The best coupling as a control; arguments and errors as of `best_coupling`, whose search takes seconds."""
+    """The best coupling as a control; arguments and errors as in `best_coupling`, whose search takes seconds."""
     reflex = best_coupling(environment, simulator, seed=seed)
     return Control("coupling", "the best reflex: no memory, no goal", reflex)
 
@@ -133,26 +130,26 @@ def interventions_of(
     *,
     switch_at: int | None = None,
 ) -> list[Control]:
-    """The same policies with one thing changed each, to see whose work it is.
+    """The same policies with one change each, to find out what the culture contributes.
 
     *ideal actuator*, each condition's mean command, stretched to the full range, in place of the response; *random
-    spikes*, the culture's rates, whatever is chosen; *silent* and *shuffled* as among the controls; *yoked*, the
-    stimuli of another episode; *turned round*, the opposite command; *goal switched*, another goal in mid-episode.
+    spikes*, the culture's rates, whatever is chosen; *silent* and *shuffled*, as in the controls; *yoked*, the stimuli
+    of another episode; *turned round*, the opposite command; *goal switched*, a different goal in mid-episode.
 
     Args:
         environment, simulator: what the policies are evaluated in.
-        switch_at: the iteration at which the goal is switched; None leaves that out, as a robot with one goal does.
+        switch_at: the iteration at which the goal is switched; None leaves it out, as does a robot with one goal.
     """
-    # Mean commands from -1 to 1, of each command; 0 where all are equal.
+    # Mean commands stretched to -1 to 1, each dimension separately; 0 where all are equal.
     means = mean_commands(environment, simulator)[1]
     low, high = means.min(axis=0), means.max(axis=0)
     stretched = np.where(high > low, 2 * (means - low) / np.where(high > low, high - low, np.inf) - 1, 0.0)
     ideal = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
 
-    def control(name: str, meaning: str, **changed: Any) -> Control:
-        return Control(name, meaning, policies, n_policies, **changed)
+    def control(name: str, meaning: str, **change: Any) -> Control:
+        return Control(name, meaning, policies, n_policies, **change)
 
-    found = [
+    changed = [
         control(
             "ideal actuator",
             "each condition's mean command, stretched to the full range, in place of the response",
@@ -160,24 +157,24 @@ def interventions_of(
         ),
         control(
             "random spikes",
-            "no pulse; any recorded response in place of the neurons' own",
+            "no pulse; a random recorded response in place of the neurons' own",
             delivery="silent",
             is_drawn=True,
         ),
-        *_without_effect(policies, n_policies),
+        *_without_influence(policies, n_policies),
     ]
     if not isinstance(environment.robot, HostRobot):
-        found.append(control("yoked", "the stimuli of another episode", delivery="yoked"))
-    found.append(control("turned round", "the opposite of every command", is_turned_round=True))
+        changed.append(control("yoked", "the stimuli of another episode", delivery="yoked"))
+    changed.append(control("turned round", "the opposite of every command", is_turned_round=True))
     if switch_at is not None and hasattr(environment.robot, "with_goal_of"):
-        found.append(control("goal switched", f"another goal after {switch_at} actions", switch_at=switch_at))
-    return found
+        changed.append(control("goal switched", f"a different goal after {switch_at} actions", switch_at=switch_at))
+    return changed
 
 
-def _without_effect(policies: Networks, n_policies: int) -> list[Control]:
-    """Policies whose choices decide nothing."""
-    silent = "no pulse; what is there without stimuli is read (0 on a simulator)"
+def _without_influence(policies: Networks, n_policies: int) -> list[Control]:
+    """Policies whose choices have no effect."""
+    silent = "no pulse; only spontaneous activity is read (0 on a simulator)"
     return [
         Control("silent", silent, policies, n_policies, "silent"),
-        Control("shuffled", "the delivered condition is drawn anew", policies, n_policies, "shuffled"),
+        Control("shuffled", "the delivered condition is drawn at random", policies, n_policies, "shuffled"),
     ]

@@ -1,4 +1,4 @@
-"""The best coupling: what a reflex could do, a fixed rule from what is sensed to a stimulus, without memory or goal."""
+"""The best coupling: the best reflex, a fixed rule from sensors to stimuli, without memory or knowledge of the goal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scipy.stats import t as student_t
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.rollouts import Actor, Seen, Uniforms, nearest_action, roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
@@ -30,37 +30,37 @@ from animat.robots.host import HostRobot
 Kind = Literal["graded", "switch"]
 KINDS: tuple[Kind, ...] = ("graded", "switch")
 LARGEST_WEIGHT = 12.0
-"""Of a quantity in units of its scale: beyond, a graded command is nearly a switch."""
+"""Of a quantity in units of its scale: beyond this, a graded command is nearly a switch."""
 GENERATIONS, EPISODES = 60, 32
-"""Of a search; episodes of each coupling, the same starts and chances for all of them."""
+"""Generations of a search, and episodes of each coupling, with the same starts and random numbers for all of them."""
 RESTARTS = 2
-"""Of each kind."""
+"""Searches of each kind."""
 STEEPER = (1.0, 2.0, 4.0, 8.0)
-"""Times the couplings that come nearest to a heuristic: its commands end at -1 and 1, and so a fit is too flat."""
+"""Factors for the couplings closest to a heuristic: its commands saturate at -1 and 1, so a linear fit is too flat."""
 FRESH_EPISODES = 512
-"""In which the best of the last generations is chosen: those that it was found in flatter it."""
+"""Episodes in which the best of the last generations is chosen: returns in those of the search are biased upwards."""
 REFLEX_GAP = 0.05
-"""A context gap that does not surely exceed this is none: a coupling does what the best controller does."""
+"""A task needs context only if its context gap surely exceeds this; else a coupling is as good as any controller."""
 
 
 @final
 @partial(jax.tree_util.register_dataclass, data_fields=["weights", "actions", "means"], meta_fields=["kind", "seen"])
 @dataclass(frozen=True)
 class Coupling(Actor):
-    """A coupling from sensors to stimuli: the stimulus whose mean command is the nearest to
+    """A coupling from sensors to stimuli: the stimulus whose mean command is nearest to
 
         graded: tanh(W o + b),    switch: sign(W o + b)
 
-    with o the robot's observation, each number divided by its scale, without those that tell of the goal. Braitenberg's
-    vehicles, crossed and uncrossed, are among them.
+    with o the robot's observation, each number divided by its scale, without those of the goal. Braitenberg's vehicles,
+    crossed and uncrossed, are couplings of this kind.
 
     Attributes:
-        weights: W and b as its last column, shape (actors, commands, seen + 1).
-        actions: what the environment is handed for each action, shape (actors, actions).
-        means: the mean command of each, shape (actors, actions), or (actors, actions, commands); None where any
+        weights: W, with b as its last column, shape (actors, commands, seen + 1).
+        actions: the environment's input for each action, shape (actors, actions).
+        means: the mean command of each action, shape (actors, actions), or (actors, actions, commands); None where any
             command can be given.
-        kind: of the two above.
-        seen: which numbers of the observation it sees.
+        kind: which of the two above.
+        seen: indices of the observation that it sees.
     """
 
     weights: Float[Array, "*actors commands weights"]
@@ -85,24 +85,24 @@ def best_coupling(
 ) -> Coupling:
     """The best coupling for an environment and the neurons in it, as one actor for `roll_out`.
 
-    Differential evolution, twice for each kind, over weights from -12 to 12: once from random ones alone, and once with
-    couplings among them that come nearest to the robot's heuristic, where it has one. All couplings of a search meet
-    the same starts and chances. The best of the four last generations is chosen in fresh episodes.
+    Differential evolution, twice for each kind, over weights from -12 to 12: once from random weights only, and once
+    also with couplings closest to the robot's heuristic, if it has one. All couplings of a search have the same starts
+    and random numbers. The best of the last generations is chosen in fresh episodes.
 
     Args:
-        simulator: the neurons' answers; None without neurons.
+        simulator: None without neurons.
         seed: decides every random draw.
         progress: what to report to.
 
     Raises:
-        InvalidArgument: for a robot that is stepped outside of JAX: the search takes thousands of episodes.
+        InvalidArgument: for a robot that is stepped outside JAX: the search takes thousands of episodes.
 
     Source: Storn & Price 1997, doi:10.1023/A:1008202821328.
     """
     if isinstance(environment.robot, HostRobot):
         raise InvalidArgument(
-            f"robot: {environment.robot.name} is stepped in Python, and the search for the best coupling takes "
-            "thousands of episodes: only robots in JAX have one"
+            f"robot: expected one in JAX, as the search for the best coupling takes thousands of episodes, got "
+            f"{environment.robot.name}, which is stepped in Python"
         )
     spec = environment.robot.observation_spec
     seen = tuple(i for i, quantity in enumerate(spec) if not quantity.of_goal)
@@ -130,7 +130,7 @@ def best_coupling(
     near_heuristic = _near_heuristic(environment, simulator, seen, seed)
     seeds = np.random.default_rng([seed, 31]).integers(2**31, size=(len(KINDS), RESTARTS, 2)).tolist()
     fresh = seeds[0][0][0] + 1
-    found = []
+    best = []
     for kind, of_kind in zip(KINDS, seeds, strict=True):
         last = []
         for restart, (draws, episodes) in enumerate(of_kind):
@@ -153,24 +153,24 @@ def best_coupling(
             last.append(search.population)
         candidates = np.concatenate(last)
         returns = mean_returns(actor(kind, candidates), FRESH_EPISODES, fresh)
-        found.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
-    return max(found, key=lambda each: each[0])[1]
+        best.append((float(returns.max()), actor(kind, candidates[[returns.argmax()]])))
+    return max(best, key=lambda each: each[0])[1]
 
 
 def _near_heuristic(
     environment: Environment[Any], simulator: NeuronSimulator | None, seen: tuple[int, ...], seed: int
 ) -> Float64[np.ndarray, "starts weights"]:
-    """Couplings that come nearest to the robot's heuristic, by least squares over its episodes, and steeper ones.
+    """The coupling closest to the robot's heuristic, by least squares over its episodes, and steeper ones.
 
-    None where it has no heuristic.
+    Empty if it has no heuristic.
     """
     robot = environment.robot
     if "heuristic" in lacking(robot):
         return np.zeros((0, 0))
-    policy = Heuristic() if environment.n_actions is None else heuristic_policy(environment, simulator)
+    policy = heuristic_policy(environment, simulator)
     ran = trace(environment, simulator, policy, 1, episodes=EPISODES, seed=seed)
-    under_way = np.arange(robot.episode_limit) < ran.lengths[..., None]
-    observed = ran.observations[..., :-1, : len(robot.observation_spec)][under_way]
+    running = np.arange(robot.episode_limit) < ran.lengths[..., None]
+    observed = ran.observations[..., :-1, : len(robot.observation_spec)][running]
     wanted = np.asarray(jax.vmap(capability(robot, "heuristic"))(observed), np.float64).reshape(len(observed), -1)
     scales = np.array([quantity.scale for quantity in robot.observation_spec])
     design = np.column_stack([(observed / scales)[:, seen], np.ones(len(observed))])
@@ -180,21 +180,20 @@ def _near_heuristic(
 
 @dataclass(frozen=True)
 class ContextGap:
-    """How much of a task a reflex leaves undone.
+    """How much of the achievable return the best reflex leaves unused.
 
         gap = (optimum - best coupling) / (optimum - random)
 
-    Where no optimal return is known (`least_context_gap`), both the gap and the score are the least that they can be.
+    Where no optimal return is known (`least_context_gap`), both gap and score are lower bounds.
 
     Attributes:
         coupling: mean return of the best coupling.
-        standard_error: of that.
-        gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and the optimum's
-            grid or the episodes of what is in its place. None where the optimum is not above random stimuli, or of one
-            episode.
-        best_known: mean return of the best agent that is known, in the optimum's place; None where the optimum is
-            known.
-        highest: where it is not, the highest return that any episode can have.
+        standard_error: of `coupling`.
+        gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and for the
+            optimum's grid or the episodes of the agent that replaces it. None if the optimum is not above random
+            stimuli, or with one episode.
+        best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.
+        highest: if it is not, the highest possible return of an episode.
     """
 
     coupling: float
@@ -205,7 +204,7 @@ class ContextGap:
 
     @property
     def is_least(self) -> bool:
-        """Whether gap and score are the least that they can be, as the optimum is not known."""
+        """Whether gap and score are lower bounds, as the optimum is not known."""
         return self.best_known is not None
 
     @property
@@ -214,17 +213,17 @@ class ContextGap:
         return self.gap is not None and self.gap.low > REFLEX_GAP
 
     def score(self, returns: Float64[np.ndarray, " policies"], optimum: Optimum | None) -> Interval | None:
-        """The context score of policies, with its interval: 0 is what a coupling does, 1 the optimum.
+        """The context score of policies, with its interval: 0 is the best coupling, 1 the optimum.
 
             score = (mean return - best coupling) / (optimum - best coupling)
 
-        Where the optimum is not known, it is between the best agent that is known and the highest return of an episode.
-        The score is then at least what it is with the latter, and where policies are below the coupling with the
-        former. None where the task is not known to need context, or of one policy alone.
+        An unknown optimum is between the best known agent and the highest possible return of an episode. The lower
+        bound of the score then uses the latter, or the former if the policies are below the coupling. None if the task
+        is not known to need context, or with a single policy.
 
         Args:
             returns: mean return of each policy.
-            optimum: on the same simulator; None where it is not known.
+            optimum: on the same simulator; None if it is not known.
         """
         if not self.needs_context or len(returns) < 2:
             return None
@@ -233,8 +232,8 @@ class ContextGap:
         if not np.isfinite(best):
             return None
         span, over = best - self.coupling, mean - self.coupling
-        # Of a ratio whose denominator is known much better than 0: the half widths of all parts, in quadrature. Few
-        # policies have wide tails, so theirs is Student's.
+        # For a ratio whose denominator is far from 0 relative to its error: the half widths of all parts, in
+        # quadrature. With few policies tails are wide, so theirs is Student's.
         value = over / span
         of_policies = student_t.ppf((1 + CONFIDENCE) / 2, len(returns) - 1) * error
         spread = float(np.linalg.norm([of_policies, _Z * (1 - value) * self.standard_error, value * grid_error]))
@@ -254,17 +253,17 @@ class ContextGap:
         }
 
     def to_text(self, score: Interval | None = None) -> str:
-        """In a line, with the policies' context score where it is known."""
-        told = f"best coupling {self.coupling:.1f} ± {self.standard_error:.1f}"
+        """One line, with the policies' context score if it is known."""
+        coupling = f"best coupling {self.coupling:.1f} ± {self.standard_error:.1f}"
         if not np.isfinite(self.standard_error):
-            return f"best coupling {self.coupling:.1f}; no context gap of one episode"
+            return f"best coupling {self.coupling:.1f}; no context gap with one episode"
         if self.gap is None:
-            best = "the optimal return" if self.best_known is None else f"the best agent known ({self.best_known:.1f})"
-            return f"{told}; no context gap, as {best} is not above that of random stimuli"
+            best = "the optimal return" if self.best_known is None else f"the best known agent ({self.best_known:.1f})"
+            return f"{coupling}; no context gap, as {best} is not above that of random stimuli"
         least = "at least " if self.is_least else ""
         gap = f"context gap {least}{self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
         if self.best_known is not None:
-            gap += f", as the best agent known returns {self.best_known:.1f}"
+            gap += f", as the best known agent returns {self.best_known:.1f}"
         if self.needs_context:
             needs = ""
         elif self.is_least or self.gap.high > REFLEX_GAP:
@@ -274,11 +273,11 @@ class ContextGap:
         scored = ""
         if score is not None:
             scored = f"; context score {least}{score.value:.2f} ({score.low:.2f} to {score.high:.2f})"
-        return f"{told}; {gap}{needs}{scored}"
+        return f"{coupling}; {gap}{needs}{scored}"
 
 
 _Z = 1.959964
-"""The normal distribution's quantile of the interval's ends."""
+"""The normal quantile for the ends of a 95 % interval."""
 
 
 def context_gap(
@@ -290,7 +289,7 @@ def context_gap(
     gap = None
     if span > 0 and np.isfinite(errors).all():
         value = (best - means[0]) / span
-        # d gap: by the coupling -1, by random stimuli gap, by the optimum 1 - gap, each over the span.
+        # Derivatives of the gap: by coupling -1, by random stimuli gap, by optimum 1 - gap, each divided by the span.
         parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
         spread = float(_Z * np.linalg.norm(parts) / span)
         gap = Interval(value, value - spread, value + spread, CONFIDENCE)
@@ -303,16 +302,16 @@ def least_context_gap(
     known: Float64[np.ndarray, "agents episodes"],
     highest: float = np.inf,
 ) -> ContextGap:
-    """The least that the context gap of a task can be, where no optimal return is known.
+    """A lower bound of the context gap of a task without a known optimal return.
 
-    The optimum is not below what any agent returns, nor below the coupling. Where the coupling is above random stimuli,
-    the gap grows with the optimum, so with an agent in its place it is the least; else it is at least 1. Which of
-    several agents that is, is chosen by the first half of their episodes; its return is that of the other half.
+    The optimum is not below the return of any agent, nor below the coupling. If the coupling is above random stimuli,
+    the gap grows with the optimum, so an agent in its place gives a lower bound; else the gap is at least 1. The best
+    of several agents is chosen by the first half of their episodes; its return is that of the second half.
 
     Args:
         coupling, random: returns in the same episodes, with the same starts.
-        known: returns of agents of all kinds, policies and heuristics.
-        highest: return that any episode can have.
+        known: returns of all agents, policies and heuristics.
+        highest: the highest possible return of an episode.
     """
     half = known.shape[1] // 2 if len(known) > 1 else 0
     best = known[known[:, : max(half, 1)].mean(axis=1).argmax(), half:]
@@ -321,7 +320,7 @@ def least_context_gap(
     gap = None
     if span > 0 and np.isfinite([error, standard_error(coupling)]).all():
         value = (means[0] - means[1]) / span
-        # As above; coupling and random stimuli, which meet the same starts, pair by pair.
+        # As above; coupling and random stimuli have the same starts and are compared pair by pair.
         spread = _Z * float(np.hypot((1 - value) * error, standard_error(value * random - coupling)) / span)
         value, low, high = (float(np.clip(each, 0, 1)) for each in (value, value - spread, value + spread))
         gap = Interval(value, low, high, CONFIDENCE)

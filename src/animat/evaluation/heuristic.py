@@ -1,4 +1,4 @@
-"""A heuristic policy in place of a trained one: is learning needed, or do the robot and the mapping do it all?"""
+"""A heuristic policy as a control: is learning needed, or do the robot and the mapping suffice?"""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from animat.robots.base import capability
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class HeuristicPolicy(Actor):
-    """The action whose mean command is the nearest to the one that the robot's `heuristic` gives.
+    """The action whose mean command is nearest to that of the robot's `heuristic`.
 
     Attributes:
-        actions: what the environment is handed for each action, shape (1, actions), for one actor.
-        means: the mean command of each, the same shape; of several commands shape (1, actions, commands).
+        actions: the environment's input for each action, shape (1, actions), for one actor.
+        means: the mean command of each action, the same shape, or (1, actions, commands) for several commands.
     """
 
     actions: Array
@@ -34,31 +34,32 @@ class HeuristicPolicy(Actor):
         return nearest_action(self.actions, self.means, _wanted(environment, observation))
 
 
-# Not as a dataclass: of those without any field JAX takes one for another.
+# Static: JAX confuses registered dataclasses without fields.
 @final
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Heuristic(Actor):
-    """The very commands of the robot's `heuristic`, where any can be given: without neurons, continuous ones."""
+    """The commands of the robot's `heuristic` themselves, where any can be given: without neurons, continuous ones."""
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         return _wanted(environment, observation)
 
 
 def _wanted(environment: Environment[Any], observation: Seen) -> Array:
-    """The commands of the robot's `heuristic`, which sees the robot alone."""
+    """The commands of the robot's `heuristic`, which sees only the robot."""
     of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
     commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
     return commands
 
 
-def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
-    """The rule for an environment and the neurons in it, as one actor for `roll_out`.
+def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> Heuristic | HeuristicPolicy:
+    """The heuristic policy for an environment and the neurons in it, as one actor for `roll_out`.
 
     Raises:
         InvalidArgument: for a robot without a `heuristic`.
     """
-    # It raises for a robot without one.
-    capability(environment.robot, "heuristic")
+    capability(environment.robot, "heuristic")  # Raises if there is none.
+    if environment.n_actions is None:
+        return Heuristic()
     actions, means = mean_commands(environment, simulator)
     return HeuristicPolicy(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])

@@ -1,4 +1,4 @@
-"""Episodes with bodies that are stepped on the host: acting and the neurons compiled, the bodies in between."""
+"""Episodes with bodies that are stepped on the host; actors and neurons are compiled."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot
 
 AT_ONCE = 64
-"""Bodies side by side: each may take megabytes, and more would not make a step of them cheaper."""
+"""Bodies side by side: each may take megabytes, and more would not make a step cheaper."""
 
 _LAST = threading.local()
-"""The bodies of a thread's last wave: to make new ones takes longer than many an episode."""
+"""The bodies of a thread's last wave: creating new ones takes longer than many an episode."""
 
 
 class Acting(Protocol):
-    """Whoever picks actions (`animat.evaluation.rollouts.Actor`)."""
+    """What chooses actions (`animat.evaluation.rollouts.Actor`)."""
 
     def act(self, environment: Environment[Any], observation: Array, uniforms: Array) -> Array:
         """An action for each scaled observation."""
 
 
 class Counts(NamedTuple):
-    """What came of the episodes; shapes and meanings as in `animat.evaluation.rollouts.Episodes`."""
+    """Results of the episodes; shapes and meanings as in `animat.evaluation.rollouts.Episodes`."""
 
     returns: np.ndarray
     lengths: np.ndarray
@@ -48,17 +48,15 @@ def roll_out_on_host(
     keys: Key[Array, " actors"],
     seed: int,
 ) -> Counts:
-    """Run episodes of several actors, as many side by side as there is room.
+    """Run episodes of several actors, at most `AT_ONCE` side by side.
 
     Args:
         environment: with a robot that is stepped on the host.
         episodes, simulator, actors: as in `animat.evaluation.rollouts.roll_out`.
-        keys: of each actor's draws.
-        seed: of the episodes of the bodies.
+        keys: for each actor's random draws.
+        seed: of the bodies' episodes.
     """
-    robot = environment.robot
-    assert isinstance(robot, HostRobot)
-    counts = _nothing(environment, simulator, (len(keys), episodes))
+    counts = _zeros(environment, simulator, (len(keys), episodes))
     side_by_side = min(AT_ONCE, episodes)
     actors_at_once = max(1, AT_ONCE // side_by_side)
     for begin in range(0, len(keys), actors_at_once):
@@ -66,13 +64,13 @@ def roll_out_on_host(
         some = slice(numbers.start, numbers.stop)
         acting = jax.tree.map(lambda part, some=some: part[some], actors)
         for first in range(0, episodes, side_by_side):
-            # The last ones of a wave may be more than were asked for: the program is compiled for one number.
+            # The last wave may run more episodes than requested: the program is compiled for one number.
             seeds = [(seed, number, first + i) for number in numbers for i in range(side_by_side)]
-            here = slice(first, min(first + side_by_side, episodes))
+            columns = slice(first, min(first + side_by_side, episodes))
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
-            wave = _wave(environment, simulator, acting, folded, seeds, here.stop - first)
+            wave = _wave(environment, simulator, acting, folded, seeds, columns.stop - first)
             for whole, part in zip(counts[:3], wave[:3], strict=True):
-                whole[some, here] = part[:, : here.stop - first]
+                whole[some, columns] = part[:, : columns.stop - first]
             counts.presented[some] += wave.presented
             counts.commanded[some] += wave.commanded
     return counts
@@ -85,11 +83,10 @@ def paths_on_host(
     keys: Key[Array, " actors"],
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One episode of each actor with all that happened in it; arguments as in `roll_out_on_host`.
+    """One episode of each actor with its path; arguments as in `roll_out_on_host`.
 
     Returns:
-        observations before each iteration and after the last, commands, and lengths, as `animat.studies.paths.Paths`
-        has them.
+        Observations before each iteration and after the last, commands, lengths, as in `animat.studies.paths.Paths`.
     """
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)
@@ -121,7 +118,7 @@ def _wave(
     seeds: Sequence[tuple[int, ...]],
     counted: int,
 ) -> Counts:
-    """One episode of each of several bodies, as many for each actor; only the first `counted` ones of each count."""
+    """One episode of each of several bodies, equally many for each actor; only the first `counted` of each count."""
     robot, shape = environment.robot, (len(keys), len(seeds) // len(keys))
     assert isinstance(robot, HostRobot)
     bodies = _bodies(robot, seeds)
@@ -131,7 +128,7 @@ def _wave(
 
     state = _started(environment, keys, shape[1])._replace(robot=seen(bodies.begin()))
     going = np.broadcast_to(np.arange(shape[1]) < counted, shape).copy()
-    counts = _nothing(environment, simulator, shape)
+    counts = _zeros(environment, simulator, shape)
     of_actor = np.indices(shape)[0]
     for iteration in range(robot.episode_limit):
         command, state, delivered = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
@@ -147,14 +144,14 @@ def _wave(
         if not going.any():
             break
         if stepped.ended.any():
-            # What has ended moves on and counts no further: a body may not be stepped after its end.
+            # Ended episodes begin again and are no longer counted: a body must not be stepped after its end.
             bodies.begin(np.flatnonzero(stepped.ended).tolist())
         state = state._replace(robot=seen(bodies.observation))
     return counts
 
 
 def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
-    """Bodies that have not begun; those of the last wave, where what was before an episode does not count."""
+    """Bodies before their first episode; those of the last wave again, if earlier episodes leave no trace in them."""
     bodies: Bodies | None = getattr(_LAST, "bodies", None)
     if bodies is None or not robot.keeps_state or (bodies.robot, len(bodies)) != (robot, len(seeds)):
         bodies = _LAST.bodies = Bodies(robot, seeds)
@@ -162,8 +159,8 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
     return bodies
 
 
-def _nothing(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
-    """Of so many actors and episodes."""
+def _zeros(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
+    """Counts of 0, for `shape` = (actors, episodes)."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
     commands = () if environment.robot.n_commands == 1 else (environment.robot.n_commands,)
     return Counts(
@@ -189,7 +186,7 @@ def _iteration(
     iteration: Array,
     state: State,
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array]:
-    """Commands, the state that the neurons leave, and what was delivered."""
+    """Commands, the next state, and the delivered conditions."""
 
     def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn

@@ -1,4 +1,4 @@
-"""Goal information: how much the stimulus that is chosen tells of the goal, beside what the sensors tell."""
+"""Goal information: how much the chosen stimulus depends on the goal, given the sensors."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import capability
 
 EPISODES = 64
-"""Of each actor: a state of each, met with the goal of each other one."""
+"""Episodes of each actor: a state from each is combined with the goal of each other one."""
 DRAWS = 128
 """Actions drawn at each state with each goal."""
 PERMUTATIONS = 199
-"""Of two actions with each goal, at a state among the goals: p is 0.005 at least."""
+"""Permutations among the goals, of two actions with each goal at a state: p is at least 0.005."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class GoalInformation:
     """I(action; goal | sensors) in bits.
 
     Attributes:
-        bits: with its interval, for the states and the actors.
-        p: share of permutations of the actions at each state among the goals whose estimate is as large as that of the
-            actions as they are, or larger.
-        most: log2 of the number of actions, or of goals where these are fewer.
+        bits: with its interval, over states and actors.
+        p: share of permutations of the actions at each state among the goals whose estimate is at least as large as
+            that of the original actions.
+        most: log2 of the number of actions, or of goals if there are fewer.
     """
 
     bits: Interval
@@ -47,7 +47,7 @@ class GoalInformation:
         return asdict(self)
 
     def to_text(self) -> str:
-        """In a line."""
+        """One line."""
         bits = self.bits
         return (
             f"goal information {bits.value:.2f} of {self.most:.2f} bits ({bits.low:.2f} to {bits.high:.2f}; "
@@ -64,17 +64,17 @@ def goal_information(
     draws: int = DRAWS,
     seed: int = 1,
 ) -> GoalInformation:
-    """How much the chosen stimulus tells of the goal at the same sensors.
+    """How much information the chosen stimulus carries about the goal, given the sensors.
 
         I(A; G | S) = E_s[H(A | s) - E_g H(A | s, g)]
 
-    with s the states that the actors come through, one of each episode at a random iteration, and g the goals of the
-    other episodes, each put in place of the state's own: the sensors and all else are the same then. Goals do not
-    depend on s, as they would where an actor has been on its way to its own.
+    with s a state of each episode at a random iteration, and g the goals of the other episodes, each substituted for
+    the state's own: sensors and all else stay the same. So goals do not depend on s, as they would if an actor had
+    been moving towards its own goal.
 
     Args:
         actors: one kind of actor, its arrays with a leading axis of actors.
-        draws: actions drawn at each state with each goal; 2 are enough for actors that draw nothing.
+        draws: actions drawn at each state with each goal; 2 are enough for deterministic actors.
         seed: decides every random draw.
 
     Raises:
@@ -82,7 +82,7 @@ def goal_information(
     """
     switch = capability(environment.robot, "with_goal_of")
     if environment.n_actions is None:
-        raise InvalidArgument("environment: expected discrete actions for a goal information in bits")
+        raise InvalidArgument("environment: expected discrete actions for goal information, got continuous ones")
     rng = np.random.default_rng([seed, 41])
     traced = trace(environment, simulator, actors, n_actors, episodes=EPISODES, seed=seed)
     when = (rng.random(traced.lengths.shape) * traced.lengths).astype(np.int64)
@@ -90,35 +90,36 @@ def goal_information(
     states = jax.tree.map(lambda x: x[rows, columns, when], traced.states)
     key = jax.random.key(int(rng.integers(2**31)))
     actions = np.asarray(_at_each_goal(environment, draws, states, actors, jax.random.split(key, n_actors)))
-    # As samples, the actors; of one alone its states.
-    found = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)
-    of_each = found.reshape(when.shape).mean(axis=1) if n_actors > 1 else found
-    pairs = actions[..., :2].reshape(len(found), -1, 2)
+    # The samples are the actors, or the states of a single actor.
+    bits = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)
+    samples = bits.reshape(when.shape).mean(axis=1) if n_actors > 1 else bits
+    pairs = actions[..., :2].reshape(len(bits), -1, 2)
     null = [
-        _plug_in(rng.permuted(pairs.reshape(len(found), -1), axis=1).reshape(pairs.shape), environment.n_actions).mean()
+        _plug_in(rng.permuted(pairs.reshape(len(bits), -1), axis=1).reshape(pairs.shape), environment.n_actions).mean()
         for _ in range(PERMUTATIONS)
     ]
-    # Sums of the same numbers in another order may differ in the last bit.
+    # Sums of the same numbers in a different order may differ in the last bit.
     reached = np.sum(np.array(null) >= _plug_in(pairs, environment.n_actions).mean() - 1e-9)
     p = float((1 + reached) / (1 + PERMUTATIONS))
-    # Of the goals of all states, those that look different at one of them.
+    # The number of goals is that of different observations when each state's goal is substituted at the first state.
     robots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states.robot)
     switched = jax.vmap(switch, (None, 0))(jax.tree.map(lambda x: x[0], robots), robots)
     n_goals = len(np.unique(np.asarray(jax.vmap(environment.robot.observe)(switched)), axis=0))
     most = float(np.log2(min(environment.n_actions, n_goals)))
-    return GoalInformation(interval_of_mean(of_each), p, most)
+    return GoalInformation(interval_of_mean(samples), p, most)
 
 
 def conditional_information(
     actions: Int[np.ndarray, "states goals draws"], n_actions: int
 ) -> Float64[np.ndarray, " states"]:
-    """At each state H(A) - E_g H(A | g) in bits, corrected for few draws and few goals.
+    """H(A) - E_g H(A | g) at each state in bits, corrected for few draws and few goals.
 
-    The entropy of the actions with one goal is Miller and Madow's, that of the mixture of goals a jackknife over goals.
+    The entropy of the actions with one goal is Miller and Madow's; that of the mixture of goals is a jackknife over
+    goals.
 
     Args:
-        actions: drawn with each goal.
-        n_actions: they are from 0 to `n_actions` - 1.
+        actions: drawn with each goal, from 0 to `n_actions` - 1.
+        n_actions: number of actions.
 
     Source: Miller 1955, in Information Theory in Psychology, 95; Efron & Stein 1981, doi:10.1214/aos/1176345462.
     """
@@ -132,7 +133,7 @@ def conditional_information(
 
 
 def interval_of_mean(samples: Float64[np.ndarray, " samples"]) -> Interval:
-    """The mean with its interval by Student's t; infinite of one sample."""
+    """The mean with its interval by Student's t; infinite for one sample."""
     from scipy.stats import t
 
     mean, n = float(samples.mean()), len(samples)
@@ -172,8 +173,8 @@ def _at_each_goal(environment: Environment[Any], draws: int, states: Any, actors
             return jax.vmap(at, (None, 0, 0))(state, goals, jax.random.split(key, EPISODES - 1))
 
         each = jnp.arange(EPISODES), states, jax.random.split(key, EPISODES)
-        # State after state: those of all at once would take gigabytes.
-        found: Array = jax.lax.map(lambda one: with_others(*one), each)
-        return found
+        # State after state: all at once would take gigabytes.
+        actions: Array = jax.lax.map(lambda one: with_others(*one), each)
+        return actions
 
     return jax.vmap(of_actor)(states, actors, keys)

@@ -1,4 +1,4 @@
-"""Where one iteration leads from the nodes of a grid, or from any states, and what neurons remember then."""
+"""Where one iteration leads from the nodes of a grid or from any states, and the neurons' next history."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Landings(NamedTuple):
     """Where one iteration leads, for each of a few commands and draws of the robot's noise.
 
     Attributes:
-        rows: first of the rows around the state that follows; of a row's nodes all the same, as the first coordinate
-            has no part in how the others move; shape (landings, rows).
-        row_places: distances from it in steps, shape (landings, rows, axes).
+        rows: first of the rows around the next state; the same for all nodes of a row, as the first coordinate does not
+            influence how the others change; shape (landings, rows).
+        row_places: distances from that row in steps, shape (landings, rows, axes).
         nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next iteration will
             end it, shape (landings, rows, nodes).
-        places: distances from it in steps; for `ENDS_NEXT` the reward of the next iteration, shape
+        places: distances from that node in steps; for `ENDS_NEXT` the reward of the next iteration, shape
             (landings, rows, nodes).
         rewards: of the iteration, shape (landings, rows, nodes).
     """
@@ -42,7 +42,7 @@ class Landings(NamedTuple):
     rewards: Float32[np.ndarray, "landings rows nodes"]
 
     def bounds(self) -> Iterator[tuple[float, float]]:
-        """What a value can be at least and at most, with 1, 2, 3, ... iterations left."""
+        """The lowest and the highest possible value, with 1, 2, 3, ... iterations left."""
         ended = self.nodes == ENDED
         last = np.concatenate([self.rewards[ended], self.places[self.nodes == ENDS_NEXT]])
         going = self.rewards[~ended]
@@ -63,7 +63,7 @@ class Motion:
         commands: Float[np.ndarray, " commands"],
         uniforms: Float[np.ndarray, "draws noise"],
     ) -> None:
-        """Set up the commands and the draws of noise; a landing is a pair of them, commands outer."""
+        """Set up the commands and the noise draws; a landing is a pair of them, commands outer."""
         self._grid = grid
         self._u = jnp.repeat(jnp.asarray(commands, jnp.float32), len(uniforms))
         self._noise = jnp.tile(jnp.asarray(uniforms, jnp.float32), (len(commands), 1))
@@ -89,16 +89,16 @@ class Motion:
                 x.reshape(*shape, *x.shape[2:]) for x in from_states(flat)
             )
             middle = len(along) // 2
-            parted = jnp.abs(positions - positions[:, :, middle : middle + 1])
-            # Where the task has ended it does not matter where.
-            parted = jnp.max(jnp.where((node >= 0)[..., None], parted, 0.0), initial=0.0)
-            return row[:, :, middle], row_places[:, :, middle], node, place, reward, parted
+            apart = jnp.abs(positions - positions[:, :, middle : middle + 1])
+            # Positions do not matter once the task has ended.
+            apart = jnp.max(jnp.where((node >= 0)[..., None], apart, 0.0), initial=0.0)
+            return row[:, :, middle], row_places[:, :, middle], node, place, reward, apart
 
         self._from_states = jax.jit(from_states)
         self._from_rows = jax.jit(from_rows)
 
     def from_states(self, states: Any) -> Landings:
-        """Landings from states (the robot's own tuple, each number with an axis of states), each a row of one node."""
+        """Landings from states (the robot's own tuple, each array with an axis of states): rows of one node each."""
         row, row_places, *along = (np.asarray(x) for x in self._from_states(states)[:-1])
         return Landings(row, row_places, *(x[:, :, None] for x in along))
 
@@ -106,7 +106,7 @@ class Motion:
         """Landings from every node of the grid.
 
         Raises:
-            InvalidArgument: if the grid's first coordinate has a part in how the others move.
+            InvalidArgument: if the grid's first coordinate influences how the others change.
         """
         grid, n = self._grid, len(self._u)
         at_once = max(1, min(grid.n_rows, _NODES_AT_ONCE // (grid.along.stored * n)))
@@ -114,13 +114,14 @@ class Motion:
         kinds = (rows, np.int32), ((*rows, len(grid.rows)), np.float32), (nodes, np.int32), (nodes, np.float32)
         landings = Landings(*(np.empty(shape, kind) for shape, kind in (*kinds, kinds[-1])))
         for start in range(0, grid.n_rows, at_once):
-            # The last block starts earlier instead of being shorter: one shape is compiled.
+            # The last block starts earlier instead of being shorter, so that only one shape is compiled.
             start = min(start, grid.n_rows - at_once)
-            *parts, parted = self._from_rows(jnp.arange(start, start + at_once, dtype=jnp.int32))
-            # Rounding may part the nodes of a row by the last bits, not more.
-            if parted > 0.01:
+            *parts, apart = self._from_rows(jnp.arange(start, start + at_once, dtype=jnp.int32))
+            # Rounding may separate the nodes of a row by the last bits, but not more.
+            if apart > 0.01:
                 raise InvalidArgument(
-                    f"grid: expected a first coordinate that has no part in how the others move, got {grid.along.name}"
+                    f"grid: expected a first coordinate that does not influence how the others change, got "
+                    f"{grid.along.name}"
                 )
             for whole, part in zip(landings, parts, strict=True):
                 whole[:, start : start + at_once] = part
@@ -129,11 +130,11 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
-    """Pairs of a landing of the robot and a layer of values, and how they weigh in each action's mean.
+    """Pairs of a landing of the robot and a layer of values, and their weights in each action's mean.
 
     Attributes:
         pairs: a landing and a layer, shape (outcomes, 2).
-        weights: of each pair, for each layer that an iteration starts in and each action, shape
+        weights: of each pair, for each action and each layer in which an iteration starts, shape
             (layers, actions, outcomes).
     """
 
@@ -149,17 +150,18 @@ class Outcomes:
         smooth: bool,
         n_draws: int,
     ) -> Outcomes:
-        """Of one case.
+        """The outcomes of one case.
 
         Args:
-            after: the commands, as `commands_after` tells them.
+            after: the commands, as returned by `commands_after`.
             nodes, smooth: the commands whose landings are known, as in `Commands.onto`.
-            n_draws: of the robot's noise, all equally likely; a landing is a pair of a node and a draw, nodes outer.
+            n_draws: number of equally likely draws of the robot's noise; a landing is a pair of a node and a draw,
+                nodes outer.
         """
         spread = np.array([[commands.onto(nodes, smooth=smooth) for commands in row] for row in after])
         weights = np.moveaxis(np.repeat(spread / n_draws, n_draws, axis=-1), 1, 2).astype(np.float32)
         then, landings = np.nonzero(np.any(weights != 0, axis=(0, 1)))
-        # Laid out alike whatever their shape: for each layout that it is called with numba compiles a loop anew.
+        # The same memory layout for all shapes: numba compiles a loop again for each layout.
         of_pairs = np.ascontiguousarray(weights[:, :, then, landings])
         return cls(np.stack([landings, then], axis=1).astype(np.int32), of_pairs)
 
@@ -167,9 +169,9 @@ class Outcomes:
 def side_by_side(
     cases: Sequence[Outcomes],
 ) -> tuple[Int32[np.ndarray, "layers outcomes 2"], Float32[np.ndarray, "layers actions outcomes"]]:
-    """Pairs and weights of several cases, the layers of one after those of another.
+    """Pairs and weights of several cases, their layers concatenated.
 
-    A case of fewer actions has its last one again, one of fewer outcomes has some that weigh nothing.
+    A case with fewer actions is padded with its last one, one with fewer outcomes with weights of 0.
     """
     most_actions, most_outcomes = (max(case.weights.shape[axis] for case in cases) for axis in (1, 2))
     pairs, weights = [], []

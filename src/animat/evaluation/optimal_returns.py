@@ -1,4 +1,4 @@
-"""What a culture could do at a task, before any training: the optimal return beside that of random stimuli."""
+"""What a culture could achieve at a task, before any training: the optimal return and that of random stimuli."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from animat.robots.base import Robot
 
 @dataclass(frozen=True)
 class OptimalReturn:
-    """What could be had through one mapping.
+    """The achievable return with one mapping.
 
     Attributes:
         random: mean return of random stimuli.
         best: the optimal return of any controller.
-        context: how much of that a coupling from sensors to stimuli leaves undone.
+        context: how much of it a coupling from sensors to stimuli leaves unused.
     """
 
     robot: str
@@ -41,7 +41,7 @@ class OptimalReturn:
         return vars(self) | {"best": self.best.to_dict(), "context": self.context.to_dict()}
 
     def to_text(self) -> str:
-        """In a line."""
+        """One line."""
         random = f"random {self.random:.1f} ± {self.random_standard_error:.1f}"
         return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}; {self.context.to_text()}"
 
@@ -57,27 +57,27 @@ def optimal_returns(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> tuple[OptimalReturn, ...]:
-    """What the culture of one recording could do at a robot's task, through some mappings.
+    """What the culture of one recording could achieve at a robot's task, with several mappings.
 
     Args:
         responses: of the recording; the simulator is the default one, a histogram of 20 bins. Conditions with fewer
             than 30 non-burst responses are left out, also for the random stimuli.
-        resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by 0.8 at most.
+        resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by at most 0.8.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`with_intervals`).
         seed: decides every random draw.
-        progress: what to report to; the optima, how well they are known, and the couplings take about as long each.
+        progress: what to report to; optima, their intervals, and couplings take about as long each.
 
     Raises:
         UnusableData: if no condition has 30 non-burst responses.
     """
-    every = responses
+    all_responses = responses
     responses, left_out = with_enough_samples(responses)
 
     def fit(these: Responses) -> HistogramSimulator:
-        made = fit_histogram(these)
-        # The mapping's thresholds are those of all responses, also where some of them are left out.
-        return replace(made, percentiles=pooled_percentiles(every)) if left_out else made
+        simulator = fit_histogram(these)
+        # The mapping's thresholds are those of all responses, even if some of them are left out.
+        return replace(simulator, percentiles=pooled_percentiles(all_responses)) if left_out else simulator
 
     simulator = fit(responses)
     cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
@@ -86,13 +86,12 @@ def optimal_returns(
     environments = [environment for environment, _ in cases]
     options: dict[str, Any] = {"resolution": resolution, "resamples": resamples, "seed": seed}
     best = with_intervals(best, environments, responses, fit, progress=resampling, **options)
-    found: list[OptimalReturn] = []
-    for mapping, case, of_mapping in zip(mappings, cases, best, strict=True):
-        returns = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
-        error = standard_error(returns)
-        coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(found), 1, len(cases)))
+    optima: list[OptimalReturn] = []
+    for mapping, case, optimum in zip(mappings, cases, best, strict=True):
+        random = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
+        coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(optima), 1, len(cases)))
         of_coupling = roll_out(*case, coupling, 1, episodes=episodes, seed=seed).returns[0]
-        gap = context_gap(of_coupling, returns, of_mapping)
-        told = replace(of_mapping, left_out=left_out)
-        found.append(OptimalReturn(robot.name, mapping.name, float(returns.mean()), error, told, gap))
-    return tuple(found)
+        gap = context_gap(of_coupling, random, optimum)
+        means = float(random.mean()), standard_error(random)
+        optima.append(OptimalReturn(robot.name, mapping.name, *means, replace(optimum, left_out=left_out), gap))
+    return tuple(optima)

@@ -1,4 +1,4 @@
-"""The optimal return: what no controller can beat, with these neurons, this mapping and this robot."""
+"""The optimal return: the return that no controller can exceed with these neurons, this mapping and this robot."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from animat.robots.grid import Grid, grid_for
 from animat.wrappers import TrialCosts, net_reward
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
-"""What an optimum is asked for: an environment, and the simulator in it (None without neurons)."""
+"""An environment, and the simulator in it (None without neurons)."""
 
 COARSER = 0.75
-"""Steps along each axis of the grid that the value is compared with, as a part of those of the grid in use."""
+"""Steps along each axis of the comparison grid, as a share of those of the grid in use."""
 
-_ALIKE = 0.01
-"""Returns nearer than this are alike: without any chance in an environment the standard error is 0."""
+_SAME = 0.01
+"""Returns that differ by less count as equal: the standard error is 0 in a deterministic environment."""
 
 _MOST_MIB = 16_384
 _TABLES_AT_ONCE_MIB = 400
@@ -45,21 +45,21 @@ class Optimum:
     """The optimal mean return of any controller, and how well it is known.
 
     Attributes:
-        value: by dynamic programming, of a controller that knows the time left, and where neurons remember it the class
-            of the history (one of six: `animat.evaluation.commands.class_of`). What the grid cannot resolve raises it
-            more often than it lowers it, as the best of several values is taken: the upper end of a bracket.
-        grid_error: how far the value moved from a grid with 3/4 of the steps along each axis to the one in use.
-        monte_carlo: mean return of that controller, run on the environment itself: a return that can be had, the lower
-            end of the bracket; NaN where it was not run, as the three that follow.
+        value: by dynamic programming, for a controller that knows the time left and, with memory, the class of the
+            history (one of six: `animat.evaluation.commands.class_of`). What the grid cannot resolve raises it more
+            often than it lowers it, as the best of several values is taken: the upper end of a bracket.
+        grid_error: difference from the value on a grid with 3/4 of the steps along each axis.
+        monte_carlo: mean return of that controller, run on the environment itself: an achievable return, the lower end
+            of the bracket. NaN if it was not run, as are the next three.
         standard_error: of `monte_carlo`.
-        without_clock: mean return of the same controller if it acts as if all of the episode lay ahead, always: what
-            can be had without knowing the time, as a policy does not. A better one may exist, not above `value`.
+        without_clock: mean return of the same controller if it always acts as if the whole episode lay ahead: what is
+            achievable without knowing the time, like a policy. A better one may exist, not above `value`.
         without_clock_standard_error: of `without_clock`.
-        episodes: that both were measured in; 0 where the controller was not run.
+        episodes: in which both were measured; 0 if the controller was not run.
         nodes: of the grid.
-        interval: of the value, for how few responses the simulator was made of (`animat.evaluation.resampling`); None
-            where that was not asked for.
-        left_out: conditions with too few responses to count, with their number.
+        interval: of the value, given the number of responses (`animat.evaluation.resampling`); None if it was not
+            computed.
+        left_out: conditions with too few responses, with their number.
     """
 
     value: float
@@ -75,11 +75,10 @@ class Optimum:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data; None where the controller was not run."""
-        told = asdict(self)
-        return {name: None if value != value else value for name, value in told.items()}
+        return {name: None if value != value else value for name, value in asdict(self).items()}
 
     def to_text(self) -> str:
-        """In a line: the value and how well it is known."""
+        """One line: the value and how well it is known."""
         text = f"optimal return {self.value:.1f}"
         if self.interval is not None:
             text += (
@@ -96,29 +95,32 @@ class Optimum:
         return text
 
     def findings(self) -> tuple[Finding, ...]:
-        """A warning where the value and its controller's return part by more than chance and the grid's error."""
+        """A warning if the value and its controller's return differ by more than chance and the grid's error."""
         return bracket_findings(self.value, self.grid_error, self.monte_carlo, self.standard_error)
 
 
 def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
-    """A warning where a value parts from its controller's return by more than 3 standard errors and the grid's error.
+    """A warning if a value and its controller's return differ by more than 3 standard errors plus the grid's error.
 
     Args:
         value, grid_error, monte_carlo: as in `Optimum`.
-        error: its `standard_error`.
+        error: the `standard_error` of `monte_carlo`.
     """
-    apart = value - monte_carlo
-    if not abs(apart) > max(_ALIKE, 3 * error + grid_error):
-        return ()  # Neither has NaN, where the controller was not run, anything to tell.
-    told = f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± {error:.2f}"
-    if apart > 0:
-        told += " differ: the optimal return lies between the two"
+    difference = value - monte_carlo
+    # No warning for NaN, where the controller was not run.
+    if not abs(difference) > max(_SAME, 3 * error + grid_error):
+        return ()
+    message = (
+        f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± {error:.2f}"
+    )
+    if difference > 0:
+        message += " differ: the optimal return lies between the two"
     else:
-        told += (
-            ", which is achievable, differ: the grid is too rough, take a higher resolution (or "
-            f"the {CLASSES} classes of what a memory simulator remembers are)"
+        message += (
+            f", which is achievable, differ: the grid is too coarse (or the {CLASSES} history classes of a memory "
+            "simulator are); use a higher resolution"
         )
-    return (Finding("optimum", "warning", told, apart),)
+    return (Finding("optimum", "warning", message, difference),)
 
 
 def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
@@ -139,18 +141,18 @@ def best_returns(
 
         V_0 = 0,    V_n(s) = max_a E[r + (1 - end) V_(n-1)(s') | s, a],    value = V_limit(start)
 
-    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. Where
-    trials cost something (`animat.wrappers.TrialCosts`) r is the reward less the cost of a. Where the
-    neurons remember, s holds the class of the history too (`commands_after`). V is kept
-    at the nodes of a grid and interpolated by cubic polynomials along each axis, so the value is an approximation:
-    `grid_error` tells how good. The controller that takes the maximising action, run on the environment itself, gives
-    a return that can be had and cannot lie above the true optimum by more than chance.
+    with the expectation over the command that action a leads to (`commands_of`) and over the robot's noise. If trials
+    have a cost (`animat.wrappers.TrialCosts`), r is the reward less the cost of a. With memory, s also contains the
+    class of the history (`commands_after`). V is stored at the nodes of a grid and interpolated by cubic polynomials
+    along each axis, so the value is an approximation; `grid_error` shows how good. The controller that takes the
+    maximising action, run on the environment itself, gives an achievable return, which exceeds the true optimum only by
+    chance.
 
     Args:
         cases: environments, all of the same robot, each with its simulator (None without neurons).
         grid: over the robot's states; None: `grid_for(robot)`.
-        resolution: steps of the grid along each axis, as a multiple; 0.6 is fast and rough.
-        episodes: to run the controller in; 0: not at all, which is quicker.
+        resolution: factor for the steps of the grid along each axis; 0.6 is fast and coarse.
+        episodes: of the controller; 0: it is not run, which is faster.
         seed: decides every random draw.
         progress: what to report to.
 
@@ -161,13 +163,13 @@ def best_returns(
     if not cases:
         raise InvalidArgument("cases: expected at least one environment, got none")
     if episodes < 2 and episodes != 0:
-        raise InvalidArgument(f"episodes: expected at least 2, or 0 to run no controller, got {episodes}")
+        raise InvalidArgument(f"episodes: expected at least 2, or 0 not to run the controller, got {episodes}")
     if not (math.isfinite(resolution) and resolution > 0):
         raise InvalidArgument(f"resolution: expected a positive number, got {resolution!r}")
     robot = cases[0][0].robot
     for environment, _ in cases:
         if environment.robot != robot:
-            raise Mismatch(f"cases: expected all of one robot, got {robot} and {environment.robot}")
+            raise Mismatch(f"cases: expected the same robot in all, got {robot} and {environment.robot}")
     fine = (grid_for(robot) if grid is None else grid).scaled(resolution)
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
@@ -175,8 +177,8 @@ def best_returns(
     kept_mib = 2 * fine.size * max(layers_of(*case) for case in cases) * robot.episode_limit / 2**20
     if episodes and kept_mib > _MOST_MIB:
         raise InvalidArgument(
-            f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, of which "
-            f"they take {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations per episode): take a smaller one"
+            f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, which "
+            f"takes {kept_mib / 1024:.3g} GiB ({robot.episode_limit:,} iterations per episode): use a smaller one"
         )
     at_once = max(1, int(_TABLES_AT_ONCE_MIB / kept_mib))
     optima: list[Optimum] = []
@@ -201,7 +203,7 @@ def best_returns(
 def rough_values(
     cases: Sequence[Case], grid: Grid, seed: int, progress: Progress | None = None
 ) -> tuple[Float64[np.ndarray, " cases"], tuple[float, float]]:
-    """The values alone, of many cases on a grid of one's own, and what a return can be at least and at most.
+    """Only the values, of many cases on a given grid, and the lowest and the highest possible return.
 
     Args:
         cases, grid, seed, progress: as in `best_returns`.
@@ -212,13 +214,13 @@ def rough_values(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, action: Any, simulator: Any) -> Any:
-    """An iteration of every episode; of the module, so that it is compiled once, with the clock and without."""
+    """An iteration of every episode; at module level, so that it is compiled once, with the clock and without."""
     uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
     return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
 
 
 def _costs_of(environment: Environment[Any], n_actions: int) -> Float32[np.ndarray, " actions"]:
-    """What the trial of each action costs; where any condition is delivered whatever is chosen, their mean."""
+    """The cost of each action's trial; with shuffled delivery, their mean."""
     if not isinstance(environment, TrialCosts):
         return np.zeros(n_actions, np.float32)
     costs = np.array(environment.costs, np.float32)
@@ -226,7 +228,7 @@ def _costs_of(environment: Environment[Any], n_actions: int) -> Float32[np.ndarr
 
 
 class _Tables:
-    """Values for every time left, for the controller to look up: in 16 bits each, as all of them must be kept."""
+    """Values for every time left, for the controller to look up; in 16 bits each, as all of them are kept."""
 
     def __init__(self, grid: Grid, n_layers: int, n_times: int) -> None:
         self._shape = (grid.n_rows, grid.along.stored)
@@ -235,17 +237,17 @@ class _Tables:
         self._step = np.empty((n_times, n_layers))
 
     def keep(self, remaining: int, values: Float32[np.ndarray, "rows layers nodes"]) -> None:
-        """Keep the values for a time left."""
+        """Store the values for a time left."""
         for layer in range(values.shape[1]):
             of_layer = values[:, layer].ravel()
             low, high = float(of_layer.min()), float(of_layer.max())
             step = max(high - low, 1e-6) / 65535
             self._low[remaining, layer], self._step[remaining, layer] = low, step
-            # Adding half and cutting off rounds, and is a pass less.
+            # Adding a half and truncating rounds, with one pass less.
             self._kept[remaining, layer] = (of_layer - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
 
     def values(self, remaining: int, layers: slice) -> Float32[np.ndarray, "rows layers nodes"]:
-        """Look them up."""
+        """The values for a time left."""
         kept: Float32[np.ndarray, "layers nodes"] = self._kept[remaining, layers].astype(np.float32)
         kept *= self._step[remaining, layers, None].astype(np.float32)
         kept += self._low[remaining, layers, None].astype(np.float32)
@@ -264,7 +266,7 @@ class _Programme:
         if (noise := grid.noise_in_command) is not None:
             after = [[[each.with_noise(noise) for each in row] for row in of_case] for of_case in after]
         elif robot.noise_size:
-            # Two points a number: exact for the mean of a cubic polynomial.
+            # Two points for each number: exact for the mean of a cubic polynomial.
             points = (0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12))
             uniforms = np.array(list(itertools.product(points, repeat=robot.noise_size)))
         every = [commands for of_case in after for row in of_case for commands in row]
@@ -278,11 +280,11 @@ class _Programme:
         self.bounds = -math.inf, math.inf
 
     def run(self, tables: _Tables | None, seed: int, progress: Progress) -> Float64[np.ndarray, " cases"]:
-        """Step back from the end of an episode to its start; the value there, and all values into the tables."""
+        """Step back from the end of an episode to its start; return the value there, store all values in the tables."""
         grid = self._grid
         landings = self._motion.from_grid()
         pairs, weights = side_by_side(self._outcomes)
-        # Of a case of fewer actions the last one is there again.
+        # A case with fewer actions is padded with its last one.
         costs = [np.pad(of_case, (0, weights.shape[1] - len(of_case)), mode="edge") for of_case in self._costs]
         costs_of_layers = np.repeat(costs, [len(each.weights) for each in self._outcomes], axis=0)
         dearest = float(np.max(costs_of_layers))
@@ -334,7 +336,7 @@ class _Programme:
         return returns
 
     def _layer(self, case: int, history: Float[Any, "episodes 2"]) -> Int32[np.ndarray, " episodes"]:
-        """In which of a case's layers episodes are, by their history."""
+        """The layer of each episode among those of a case, by its history."""
         simulator = self._cases[case][1]
         if layers_of(*self._cases[case]) == 1 or not isinstance(simulator, MemorySimulator):
             return np.zeros(len(history), np.int32)
@@ -343,7 +345,7 @@ class _Programme:
     def _interpolate(
         self, values: Float32[np.ndarray, "rows cases nodes"], states: Any
     ) -> Float64[np.ndarray, " cases"]:
-        """The mean value of some states, of each case."""
+        """The mean value over some states, of each case."""
         rows, row_places, _, nodes, places = (np.asarray(x) for x in jax.vmap(self._grid.locate)(states))
         weights = np.empty(len(self._grid.row_offsets), np.float32)
         total = np.zeros(values.shape[1])

@@ -1,4 +1,4 @@
-"""How well responses tell the optimal return: which conditions have enough, and what bootstrapping them changes."""
+"""How well responses determine the optimal return: conditions with enough of them, and bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from animat.robots.grid import Grid, grid_for
 from animat.wrappers import ShuffledDelivery
 
 RESAMPLES = 39
-"""The fewest whose smallest and largest are their 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
+"""The smallest number whose extremes are the 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
 ROUGH, ROUGH_SMOOTH = 0.5, 0.2
-"""Steps along each axis of the grid that bootstrapped responses are solved on, as a part of the usual ones: the latter
-where a command acts smoothly and never decides whether an episode ends: the quantiles are those of 0.5 within 0.1."""
+"""Steps along each axis of the grid for bootstrapped responses, as a share of the usual ones. The latter applies where
+a command acts smoothly and never decides whether an episode ends: its quantiles are those of 0.5 within 0.1."""
 
 
 @dataclass(frozen=True, eq=False)
-class Counted:
-    """What counts for the optimal return at a recording: the conditions with enough responses, alone.
+class WellSampled:
+    """The conditions of a recording with enough responses for an optimal return.
 
     Attributes:
-        environment: that chooses from these conditions.
+        environment: with only these conditions.
         simulator: of these responses.
         responses: to these conditions.
         left_out: the other conditions, with the number of their responses.
@@ -49,18 +49,18 @@ class Counted:
 
     @classmethod
     def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_fixed: bool) -> Self:
-        """Of a recording of a timeline.
+        """Select the conditions of one recording of a timeline.
 
         Args:
-            environment: with all of its conditions.
+            environment: with all conditions.
             are_fixed: whether the mapping's percentiles are those of the first recording.
 
         Raises:
-            UnusableData: where no condition has enough.
+            UnusableData: if no condition has enough responses.
         """
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
         simulator = (timeline.with_first_percentiles() if are_fixed else timeline).at(minute)
-        # The mapping's thresholds are those of all responses, also where some of them are left out.
+        # The mapping's thresholds are those of all responses, even if some of them are left out.
         percentiles, kind = simulator.percentiles, timeline.fitted["kind"]
         fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
 
@@ -70,44 +70,36 @@ class Counted:
 
         if left_out:
             environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)
-        # What is remembered changes the optimum, and little how well it is known: that is found without, in a sixth of
-        # the time.
+        # Memory changes the optimum, but hardly its uncertainty: the interval is computed without, in a sixth of the
+        # time.
         spread = "histogram" if simulator.has_memory else kind
         return cls(environment, simulator, responses, left_out, lambda these: fit(these, spread))
 
-    def known(self, optimum: Optimum, *, resolution: float, seed: int, progress: Progress | None = None) -> Optimum:
-        """The optimum in this environment with its interval, and with what was left out."""
-        known = with_intervals(
-            [optimum],
-            [self.environment],
-            self.responses,
-            self.fit,
-            resolution=resolution,
-            seed=seed,
-            progress=progress,
-        )
-        return replace(known[0], left_out=self.left_out)
+    def with_interval(self, optimum: Optimum, **options: Any) -> Optimum:
+        """The optimum in this environment with its interval and what was left out; options as in `with_intervals`."""
+        optima = with_intervals([optimum], [self.environment], self.responses, self.fit, **options)
+        return replace(optima[0], left_out=self.left_out)
 
 
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
-    """Responses to the conditions with 30 or more that are no bursts, and the labels of the other conditions.
+    """Responses to the conditions with 30 or more non-burst responses, and the labels of the other conditions.
 
-    The best of several values is the luckiest of them, so a condition of three responses promises what is not there:
-    from 30 on, nine of ten intervals hold the true optimum, at 10 three of four (docs/evidence/optimal-return.md).
+    The best of several values is likely a lucky one, so a condition with three responses promises too much. With 30 or
+    more, nine of ten intervals contain the true optimum, with 10 three of four (docs/evidence/optimal-return.md).
 
     Raises:
-        UnusableData: where no condition has as many.
+        UnusableData: if no condition has that many.
     """
-    n, few = _counts(responses), few_of(responses)
+    n, few = _counts(responses), undersampled(responses)
     if len(few) == len(n):
         raise UnusableData(
-            f"expected {FEW_SAMPLES} non-burst responses or more to some condition, got {max(n, default=0)} at most: "
-            "record more of them"
+            f"responses: expected at least {FEW_SAMPLES} non-burst ones to some condition, got at most "
+            f"{max(n, default=0)}: record more trials"
         )
     return responses.only([i for i, count in enumerate(n) if count >= FEW_SAMPLES]) if few else responses, few
 
 
-def few_of(responses: Responses) -> tuple[str, ...]:
+def undersampled(responses: Responses) -> tuple[str, ...]:
     """The conditions with fewer than 30 non-burst responses, each with their number."""
     return too_few(responses.conditions, _counts(responses))
 
@@ -132,23 +124,23 @@ def with_intervals(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> tuple[Optimum, ...]:
-    """Optimal returns with intervals for those that the distributions of all responses would give.
+    """Optimal returns with intervals for the optima of the true response distributions.
 
         low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
 
-    with v the optimum, v_0 the same on a rough grid and v_b that of responses bootstrapped, condition by condition, 39
-    times. The lower end is the lower one of the percentile and the reversed interval, as an optimum is the best of
-    several values and few responses raise it. Where the responses do not tell that conditions differ at all
-    (Kruskal-Wallis, p > 0.05), it reaches down to the return of stimuli drawn at random. e is the grid's error. Nothing
-    is outside of what returns can be.
+    with v the optimum, v_0 the same on a coarse grid, v_b that of responses bootstrapped, condition by condition, 39
+    times, and e the grid's error. The lower end is the lower of those of the percentile and the reversed interval, as
+    an optimum is the best of several values and few responses raise it. If conditions do not differ significantly
+    (Kruskal-Wallis, p > 0.05), it reaches down to the return of random stimuli. Neither end is outside the range of
+    possible returns.
 
     Args:
-        optima: as `best_returns` gave them.
-        environments: that they are of, all of one robot.
-        responses: that the simulator in them was made of.
-        resolution: of the optima's grid, which the rough one is not finer than.
-        resamples: how often responses are bootstrapped; 0: there are no intervals.
-        seed: decides what is drawn.
+        optima: as returned by `best_returns`.
+        environments: of the optima, all with one robot.
+        responses: from which the simulator in them was made.
+        resolution: of the optima's grid; the coarse one is not finer.
+        resamples: number of bootstrap samples; 0: no intervals.
+        seed: decides every random draw.
         progress: what to report to.
     """
     from scipy.stats import kruskal
@@ -160,9 +152,9 @@ def with_intervals(
     grid = _rough(grid_for(environments[0].robot), resolution)
     rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
     differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE
-    known: list[Optimum] = []
+    bounded: list[Optimum] = []
     for optimum, environment in zip(optima, environments, strict=True):
-        part = Part(progress or Silent(), len(known), 1, len(optima))
+        part = Part(progress or Silent(), len(bounded), 1, len(optima))
         values, (least, most) = rough_values([(environment, each) for each in simulators], grid, seed, part)
         low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
         low, high = min(low, -high, 0.0), max(high, 0.0)
@@ -171,12 +163,12 @@ def with_intervals(
             low = min(low, float(rough_values([(at_random, simulators[0])], grid, seed)[0][0] - values[0]))
         error = optimum.grid_error
         ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
-        known.append(replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE)))
-    return tuple(known)
+        bounded.append(replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE)))
+    return tuple(bounded)
 
 
 def _rough(grid: Grid, resolution: float) -> Grid:
-    """Fewer steps, three commands in place of five, and no noise of the robot: what differs is the responses."""
+    """A grid with fewer steps, three commands instead of five, and no robot noise: only the responses differ."""
     smooth = None if grid.smooth_commands is None else min(grid.smooth_commands, 3)
     noise = None if grid.noise_in_command is None else 0.0
     resolution = min(ROUGH if smooth is None else ROUGH_SMOOTH, resolution)

@@ -1,4 +1,4 @@
-"""Episodes of policies and of controls against a simulator, many at once."""
+"""Episodes of policies and controls on a simulator, many at once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Uniforms = Float[Array, "episodes drawn"]
 
 
 class Actor(abc.ABC):
-    """Whoever picks the actions of episodes: a pytree, so that several are run side by side."""
+    """What chooses the actions of episodes; a pytree, so that several can run side by side."""
 
     @abc.abstractmethod
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
@@ -42,10 +42,10 @@ class Actor(abc.ABC):
 @partial(jax.tree_util.register_dataclass, data_fields=["network", "scales"], meta_fields=["greedy"])
 @dataclass(frozen=True)
 class Networks(Actor):
-    """Trained policies: their networks, stacked; drawn from, or the most probable action taken.
+    """Trained policies: their stacked networks, which act greedily or by drawing.
 
     Attributes:
-        scales: what each was trained to see observations divided by, whatever robot it now drives.
+        scales: by which observations were divided in each policy's training, whatever robot it now drives.
         greedy: whether the most probable action is taken.
     """
 
@@ -61,12 +61,12 @@ class Networks(Actor):
         return likeliest_action(environment, self.network, observation)
 
 
-# Not as a dataclass: of those without any field JAX takes one for another.
+# Static: JAX confuses registered dataclasses without fields.
 @final
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Uniform(Actor):
-    """Every action equally likely, whatever is observed: the random control."""
+    """All actions equally likely, whatever is observed: the random control."""
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         if environment.n_actions is None:
@@ -78,7 +78,7 @@ class Uniform(Actor):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Constant(Actor):
-    """One action always: the constant control."""
+    """Always the same action: the constant control."""
 
     action: Int[Array, "*actors"]
 
@@ -89,9 +89,9 @@ class Constant(Actor):
 def nearest_action(
     actions: Array, means: Float[Array, "actions *commands"], wanted: Float[Array, "episodes *commands"]
 ) -> Array:
-    """The action whose mean command is the nearest to the one that is wanted; of several commands by the straight line.
+    """The action whose mean command is nearest to the wanted one; with several commands by Euclidean distance.
 
-    Both are without their axis of commands where there is one.
+    With a single command neither has an axis of commands.
     """
     apart = means - wanted[:, None]
     distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
@@ -100,18 +100,17 @@ def nearest_action(
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """What came of a number of episodes of each of several actors.
+    """Results of episodes of several actors.
 
     Attributes:
         returns: sum of rewards of each episode, in the task's own units, shape (actors, episodes).
         lengths: iterations of each, shape (actors, episodes).
-        terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
-        presented: how often the neurons got each condition, in all episodes together, shape (actors, conditions); no
+        terminated: whether it terminated before the episode limit, shape (actors, episodes).
+        presented: how often each condition was delivered, in all episodes together, shape (actors, conditions); no
             conditions without neurons.
-        commanded: the sum of the commands that each condition led to, the same shape; of several commands each on its
-            own, shape (actors, conditions, commands).
-        outcome: what each came to, of a robot with a goal; shapes (actors, episodes), and with a last axis of
-            objectives.
+        commanded: the sum of the commands that each condition led to, the same shape; with several commands separately,
+            shape (actors, conditions, commands).
+        outcome: outcome of each, for a robot with a goal; shape (actors, episodes), and with a last axis of objectives.
     """
 
     __repr__ = briefly
@@ -125,16 +124,16 @@ class Episodes:
 
 
 def check_seed(seed: int) -> None:
-    """Refuse a seed of more than 32 bits (InvalidArgument): JAX takes no more, and two would give the same draws."""
+    """Refuse a seed of more than 32 bits (InvalidArgument): JAX uses no more, so two could give the same draws."""
     if not 0 <= seed < 2**32:
         raise InvalidArgument(f"seed: expected a whole number from 0 to 4294967295, got {seed}")
 
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
-    """Refuse episodes that are none, or more than fit: all of them are run side by side.
+    """Refuse fewer than one episode, or more than fit side by side.
 
     Raises:
-        InvalidArgument: by the name of the argument or option.
+        InvalidArgument: with the name of the argument or option.
     """
     if episodes < 1:
         raise InvalidArgument(f"{name}: expected at least 1, got {episodes}")
@@ -156,7 +155,7 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
     first = policies[0]
     for policy in policies[1:]:
         if [w.shape for w in policy.weights] != [w.shape for w in first.weights]:
-            raise InvalidArgument("policies: expected networks of one shape, got several; evaluate them one by one")
+            raise InvalidArgument("policies: expected networks of one shape, got several: evaluate them one by one")
     layers = (
         Layer(stacked([p.weights[i] for p in policies]), stacked([p.biases[i][None] for p in policies]))
         for i in range(len(first.weights))
@@ -174,19 +173,17 @@ def roll_out(
     seed: int,
     alike: bool = False,
 ) -> Episodes:
-    """Run episodes of several actors against one simulator.
-
-    Every actor gets random numbers of its own, decided by `seed` and its place; or all meet the same.
+    """Run episodes of several actors on one simulator.
 
     Args:
-        simulator: the neurons' answers; None without neurons.
+        simulator: None without neurons.
         actors: one kind of actor, its arrays with a leading axis of actors.
-        episodes: of each.
-        seed: decides every random draw.
-        alike: whether all actors meet the same random numbers, so that they differ by what they do alone.
+        episodes: of each actor.
+        seed: decides every random draw, together with an actor's place.
+        alike: whether all actors get the same random numbers, so that only their actions differ.
 
     Raises:
-        InvalidArgument: for fewer episodes than one or more than fit, or a seed of more than 32 bits.
+        InvalidArgument: for fewer than one episode or more than fit, or a seed of more than 32 bits.
     """
     check_at_once("episodes", episodes, n_actors)
     check_seed(seed)
@@ -197,14 +194,13 @@ def roll_out(
     returns, lengths, presented, commanded, terminated, outcome = _roll_out(
         environment, episodes, simulator, actors, keys
     )
-    came_to = None if outcome is None else Outcome(*(np.asarray(each) for each in outcome))  # type: ignore[arg-type]
     return Episodes(
         np.asarray(returns, np.float64),
         np.asarray(lengths, np.int64),
         np.asarray(terminated),
         np.asarray(presented, np.int64),
         np.asarray(commanded, np.float64),
-        came_to,
+        None if outcome is None else Outcome(*(np.asarray(each) for each in outcome)),  # type: ignore[arg-type]
     )
 
 
@@ -239,7 +235,7 @@ def _roll_out(
         observation = jax.vmap(environment.observe)(state) / environment.scales
         action = actor.act(environment, observation, uniforms[:, :n_drawn])
         after = jax.vmap(environment.advance, (0, 0, 0, None))(uniforms[:, n_drawn:], state, action, simulator)
-        # An ended episode is carried along, and counts no further.
+        # An ended episode is carried along, but no longer counted.
         returns = returns + jnp.where(going, after.reward, 0.0)
         terminated = terminated | (going & after.ended.terminated)
         lengths = lengths + going
@@ -250,7 +246,7 @@ def _roll_out(
         going = going & ~jnp.logical_or(*after.ended)
         return after.carried, going, returns, lengths, presented, commanded, terminated
 
-    # The loop is outside of the `vmap`, and ends with the last episode: controls fail long before the limit.
+    # The loop is outside the `vmap` and ends with the last episode: controls fail long before the limit.
     first, of_iteration = jax.vmap(begin)(keys)
     each = jax.vmap(iteration)
     _, (last, _, *counted) = jax.lax.while_loop(

@@ -1,4 +1,4 @@
-"""A line of the table of policies and controls on a simulator."""
+"""A row of the table of policies and controls on a simulator."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from animat.evaluation.statistics import standard_error
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One line of the table: who acted, and the returns.
+    """A row of the table: an agent and its returns.
 
     Attributes:
         name: `policies`, or the control.
-        meaning: what the control takes away, in a few words.
-        episodes: one row an actor.
-        changed: whether it was run in something else than the policies: another culture, or another delivery.
-        electrode_pulses: that each actor gave in an episode, on average; None where conditions do not say.
-        pulse_cost: of one of them, in the units of the return.
+        meaning: a short description.
+        episodes: one row per actor.
+        changed: whether its environment differs from that of the policies: another culture, or another delivery.
+        electrode_pulses: mean number per episode, for each actor; None if the conditions' electrodes are not known.
+        pulse_cost: of one electrode pulse, in the units of the return.
     """
 
     name: str
@@ -34,20 +34,20 @@ class Row:
 
     @property
     def mean_returns(self) -> Float64[np.ndarray, " actors"]:
-        """Each actor's mean return over its episodes: what the paper calls a policy's performance."""
+        """Each actor's mean return over its episodes, which the paper calls a policy's performance."""
         return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
 
     @property
     def net_return(self) -> float | None:
-        """The mean return less the cost of pulses; None where these are not known."""
+        """The mean return less the cost of pulses; None if these are not known."""
         if self.electrode_pulses is None:
             return None
         return float(self.mean_returns.mean() - self.pulse_cost * self.electrode_pulses.mean())
 
     def to_dict(self) -> dict[str, Any]:
-        """The line as plain data."""
-        means, given = self.mean_returns, self.electrode_pulses
-        # Over actors, as each is one sample; a control has one actor, whose episodes are the samples.
+        """The row as plain data."""
+        means, pulses = self.mean_returns, self.electrode_pulses
+        # The samples are the actors; a control has one actor, whose episodes are the samples.
         samples = means if len(means) > 1 else self.episodes.returns[0]
         return {
             "name": self.name,
@@ -59,7 +59,7 @@ class Row:
             "mean_length": float(self.episodes.lengths.mean()),
             "terminated_share": float(self.episodes.terminated.mean()),
             "mean_returns": means.tolist(),
-            "electrode_pulses": None if given is None else float(given.mean()),
+            "electrode_pulses": None if pulses is None else float(pulses.mean()),
             "net_return": self.net_return,
             **self.met,
         }

@@ -1,4 +1,4 @@
-"""Comparisons of policies by rank, their sizes and their intervals; and the score between random and the optimum."""
+"""Rank comparisons of policies with effect sizes and intervals; and the score between random and the optimum."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """A number that samples gave, with an interval for what it stands for.
+    """An estimate with its confidence interval.
 
     Attributes:
-        value: of the samples themselves.
-        low, high: the interval's ends; infinite where the samples tell nothing of their spread.
-        confidence: how often such intervals hold the true number, nearly.
+        value: the estimate from the samples.
+        low, high: the interval's ends; infinite if the samples do not determine their spread.
+        confidence: approximate share of such intervals that contain the true value.
     """
 
     value: float
@@ -37,7 +37,7 @@ class Interval:
 
     @property
     def ends(self) -> str:
-        """From where to where it goes, for a table."""
+        """Both ends as text for a table."""
         return f"{self.low:.1f} to {self.high:.1f}" if math.isfinite(self.low) else "unknown"
 
 
@@ -46,11 +46,11 @@ class Comparison:
     """Two groups compared by rank, two-sided.
 
     Attributes:
-        u: Mann-Whitney's U as the paper gives it, the smaller of `u_first` and n1 n2 - `u_first`.
-        u_first: pairs in which the first group's is larger, ties half.
-        n_first, n_second: samples of each.
-        p_normal: by the normal approximation with continuity correction (and correction for ties): the paper's.
-        p_exact: over all ways to part the samples as they are, ties among them.
+        u: Mann-Whitney's U as in the paper, the smaller of `u_first` and n1 n2 - `u_first`.
+        u_first: number of pairs in which the first group's sample is larger, ties half.
+        n_first, n_second: number of samples.
+        p_normal: by the normal approximation with corrections for continuity and ties, as in the paper.
+        p_exact: over all ways to divide the samples, including ties.
         effect: rank-biserial correlation, share of pairs in which the second is larger less the share in which the
             first is, from -1 to 1, with its interval.
         ties: whether any two samples are equal.
@@ -71,21 +71,21 @@ class Comparison:
 
 
 def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
-    """The two-sided Mann-Whitney U test of two groups, by the normal approximation and exactly, and its effect size.
+    """The two-sided Mann-Whitney U test of two groups, by the normal approximation and exactly, with effect size.
 
         U_1 = #(first > second) + #(first = second) / 2,    U = min(U_1, n_1 n_2 - U_1),    effect = 1 - 2 U_1 / n_1 n_2
 
-    The normal approximation takes 1/2 off the distance of U from its mean (continuity) and uses the standard deviation
-    for tied ranks. If all samples are equal, p = 1. The effect's interval is Newcombe's (method 5): of all shares t of
-    pairs won, those with (t' - t)^2 <= z^2 V(t), t' the share seen and
+    The normal approximation subtracts 1/2 from the distance of U from its mean (continuity) and uses the standard
+    deviation for tied ranks. If all samples are equal, p = 1. The effect's interval is Newcombe's (method 5): all
+    shares t of pairs won with (t' - t)^2 <= z^2 V(t), where t' is the observed share and
 
         V(t) = t (1 - t) (1 + k ((1 - t) / (2 - t) + t / (1 + t))) / n_1 n_2,    k = (n_1 + n_2) / 2 - 1
 
-    As V is that of the share assumed, not of the one seen, the interval has a width where all pairs are won too: a
-    bootstrap, which can only repeat what was seen, has none there.
+    As V is that of the assumed share, not of the observed one, the interval has a width even if all pairs are won; a
+    bootstrap, which can only repeat the observations, has none there.
 
     Args:
-        first, second: one number a policy, such as its mean return.
+        first, second: one number per policy, such as its mean return.
 
     Raises:
         InvalidArgument: for an empty group, or numbers that are not finite.
@@ -102,7 +102,7 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     if np.ptp(pooled) == 0:
         p_normal = p_exact = 1.0
     else:
-        # scipy's can exceed 1 by its continuity correction where U is at its mean.
+        # With the continuity correction scipy's p can exceed 1 if U is at its mean.
         p_normal = min(1.0, float(mannwhitneyu(a, b, alternative="two-sided", method="asymptotic").pvalue))
         p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
 
@@ -127,7 +127,7 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
         p = min(1, 2 (1 - Phi(z)))
 
     Raises:
-        InvalidArgument: for a group of none, or a U that no groups of these sizes have.
+        InvalidArgument: for an empty group, or a U that is impossible for groups of these sizes.
     """
     if n_first < 1 or n_second < 1:
         raise InvalidArgument(f"n: expected at least 1 sample in each group, got {n_first} and {n_second}")
@@ -145,17 +145,17 @@ def interquartile_mean(
 ) -> Interval:
     """The mean of the middle half of samples, with its interval by Student's t.
 
-    A quarter of the samples, rounded down, is left out at each end. With g the samples left out at an end, h = n - 2 g,
+    A quarter of the samples, rounded down, is left out at each end. With g samples left out at each end, h = n - 2 g,
     and s the standard deviation of all samples with those g set to the nearest one kept, the interval's half width is
 
         t_(h-1) s sqrt((n - 1) / (h (h - 1)))
 
-    It holds what it should also for few samples, where a bootstrap of the middle ones is too narrow. With less than
-    two samples in the middle it is infinite.
+    Its coverage is right for few samples too, where a bootstrap of the middle ones is too narrow. With fewer than two
+    samples in the middle it is infinite.
 
     Args:
         samples: numbers, shape (samples,).
-        within: what the numbers can be at least and at most; the interval ends there.
+        within: the lowest and the highest possible number, which limit the interval.
 
     Raises:
         InvalidArgument: for no samples, numbers that are not finite, or a confidence outside 0 to 1.
@@ -179,7 +179,7 @@ def interquartile_mean(
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:
-    """Values of p corrected for how many comparisons were made: none is found by having asked often.
+    """Values of p corrected for the number of comparisons.
 
         p'_(i) = min(1, max_(j <= i) (m - j + 1) p_(j)),    p_(1) <= ... <= p_(m)
 
@@ -203,39 +203,39 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
 
 
 def normalised_score(policy: float, random: float, optimum: float) -> float:
-    """How far a policy has come from a random one to the optimal return: (policy - random) / (optimum - random).
+    """A policy's return on the scale from random to optimal: (policy - random) / (optimum - random).
 
-    0 is as good as random and 1 the optimum (`animat.evaluation.optimum`), which a measured mean can pass by chance.
+    0 is as good as random and 1 the optimum (`animat.evaluation.optimum`), which a measured mean can exceed by chance.
 
     Raises:
-        InvalidArgument: if the optimum is not above the random policy: nothing can be learned there.
+        InvalidArgument: if the optimum is not above the random policy: nothing can be learned.
     """
     if not optimum > random:
         raise InvalidArgument(
-            f"optimum: expected more than the random policy's {random:g}, got {optimum:g}: every controller is as good"
+            f"optimum: expected more than the random policy's {random:g}, got {optimum:g}: no controller is better"
         )
     return (policy - random) / (optimum - random)
 
 
 def standard_error(samples: Float64[np.ndarray, " samples"]) -> float:
-    """Of their mean; NaN of one."""
+    """The standard error of the mean; NaN for one sample."""
     return float(samples.std(ddof=1) / math.sqrt(len(samples))) if len(samples) > 1 else math.nan
 
 
 def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
     samples: Float64[np.ndarray, " samples"] = np.asarray(values, np.float64)
     if samples.ndim != 1 or not len(samples):
-        raise InvalidArgument(f"{name}: expected one number a sample, at least one, got shape {samples.shape}")
+        raise InvalidArgument(f"{name}: expected one number per sample, at least one, got shape {samples.shape}")
     if not np.all(np.isfinite(samples)):
         raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones")
     return samples
 
 
 def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
-    """The share of all ways to part the pooled samples in which U lies at least as far from its mean.
+    """The share of all ways to divide the pooled samples in which U is at least as far from its mean.
 
     Ways are counted by the sum of the first group's ranks, sample by sample; ties share a rank, which may be a half,
-    so ranks are doubled. (scipy's own exact test does not know ties, and its permutations take a second.)
+    so ranks are doubled. (scipy's exact test does not support ties, and its permutations take a second.)
     """
     from scipy.stats import rankdata
 
@@ -246,24 +246,24 @@ def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"])
     for seen, rank in enumerate(ranks, start=1):
         for size in range(min(n, seen), 0, -1):
             ways[size, rank:] += ways[size - 1, :-rank]
-        ways /= 2.0  # Keeps the counts of large groups from overflowing; only their shares are used.
+        ways /= 2.0  # So that the counts of large groups do not overflow; only their shares are used.
     distance = np.abs(np.arange(ways.shape[1]) - n * (len(ranks) + 1))
     return float(ways[n, distance >= distance[ranks[:n].sum()]].sum() / ways[n].sum())
 
 
 def _shares_within(share: float, n_first: int, n_second: int) -> tuple[float, float]:
-    """The smallest and the largest true share of pairs won that the share seen does not speak against."""
+    """The smallest and the largest true share of pairs won that are compatible with the observed share."""
     from scipy.optimize import brentq
     from scipy.stats import norm
 
     z = float(norm.ppf((1 + CONFIDENCE) / 2))
-    more = (n_first + n_second) / 2 - 1
+    k = (n_first + n_second) / 2 - 1
 
     def against(true: float) -> float:
-        spread = 1 + more * ((1 - true) / (2 - true) + true / (1 + true))
+        spread = 1 + k * ((1 - true) / (2 - true) + true / (1 + true))
         return (share - true) ** 2 - z**2 * true * (1 - true) * spread / (n_first * n_second)
 
-    # At 0 and 1 nothing varies: beside a share seen of 0 or 1 that is no end of the interval, but one of its zeros.
+    # At 0 and 1 the variance is 0: for an observed share of 0 or 1 that root is not an end of the interval.
     close = 1e-9
     low = 0.0 if share <= close else float(brentq(against, 0.0, share - close))
     high = 1.0 if share >= 1 - close else float(brentq(against, share + close, 1.0))

@@ -1,4 +1,4 @@
-"""The loops of dynamic programming that take the time, compiled: one step back in time, and a look ahead."""
+"""The compiled inner loops of dynamic programming: one step back in time, and a look ahead."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from animat.compilation import kept_njit
 f4 = np.float32
 ONE, TWO, HALF, SIXTH = f4(1), f4(2), f4(0.5), f4(1 / 6)
 
-# Without the interpreter's lock: `animat run` predicts and runs its loop meanwhile.
+# Without the interpreter's lock: `animat run` predicts and runs its loop at the same time.
 compiled = kept_njit(error_model="numpy", fastmath={"contract", "nsz"}, nogil=True)
 
 
@@ -59,25 +59,25 @@ def bellman_backup(
     highest: np.float32,
     best: Float32[np.ndarray, " nodes_of_all_rows_and_layers"],
 ) -> None:
-    """What each state is worth under its best action, given what the states that follow are worth.
+    """The value of each state under its best action, given the values of the next states.
 
         best_l(s) = max_a sum_o weights_l(a, o) (reward_k(s) + value_m(landing_k(s))) - costs_l(a),
         (k, m) = outcomes_l(o)
 
-    There is one layer of values for each case; for one whose neurons remember, a layer for each class of the
-    history. The rows around a landing are the same for all of a row's nodes, and for all layers: they are added up
-    once, node by node, which is fast, and what is left to do for each node is to interpolate along the row.
+    Each case has one layer of values or, with memory, one for each class of the history. The rows around a landing are
+    the same for all nodes of a row and for all layers. They are summed once, node by node, which is fast; what remains
+    for each node is the interpolation along the row.
 
     Args:
-        values: of the states that follow, at the grid's nodes: row by row, in a row layer by layer.
+        values: of the next states, at the grid's nodes: row by row, and layer by layer within a row.
         rows, row_places, nodes, places, rewards: the landings, as in `animat.evaluation.landings.Landings`.
         row_offsets: of the rows around a landing.
-        outcomes: what an action can lead to in each layer: which landing, and which layer then.
+        outcomes: of the actions in each layer: the landing, and the next layer.
         weights: of the outcomes, for each layer and action.
         costs: of the trial of each action.
         remaining: iterations left after this one.
-        lowest, highest: what no value can be outside of; interpolation near a cliff could pass them.
-        best: filled, as `values`.
+        lowest, highest: bounds of all values, which interpolation near a cliff could exceed.
+        best: output, as `values`.
     """
     n_landings, n_rows, n_nodes = nodes.shape
     n_layers, n_actions, n_outcomes = weights.shape
@@ -101,7 +101,7 @@ def bellman_backup(
                 fill_row_weights(row_places[k, row], tap_weights)
                 first = rows[k, row]
                 if n_taps == 1:
-                    # One by one: numba would compile a check that two slices are as long, which takes a third more.
+                    # One by one: for slices numba would compile a check of equal lengths, which takes a third more.
                     for j in range(width):
                         summed[j] = values[first * width + j]
                 else:
@@ -137,21 +137,21 @@ def bellman_backup(
                             )
         for layer in range(n_layers):
             start = row * width + layer * n_nodes
-            here = best[start : start + n_nodes]
-            here[:] = f4(-np.inf)
+            row_best = best[start : start + n_nodes]
+            row_best[:] = f4(-np.inf)
             for action in range(n_actions):
                 worth[:] = -costs[layer, action]
                 for outcome in range(n_outcomes):
                     weight = weights[layer, action, outcome]
                     if weight != f4(0):
                         k, then = outcomes[layer, outcome]
-                        there = landed[k, then * n_nodes : (then + 1) * n_nodes]
+                        row_landed = landed[k, then * n_nodes : (then + 1) * n_nodes]
                         for node in range(n_nodes):
-                            worth[node] += weight * there[node]
+                            worth[node] += weight * row_landed[node]
                 for node in range(n_nodes):
-                    here[node] = max(here[node], worth[node])
+                    row_best[node] = max(row_best[node], worth[node])
             for node in range(n_nodes):
-                here[node] = min(max(here[node], lowest), highest)
+                row_best[node] = min(max(row_best[node], lowest), highest)
 
 
 @compiled
@@ -170,17 +170,17 @@ def look_ahead(
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
-    """The best action of each of some states, by what the states that follow are worth (see `bellman_backup`).
+    """The best action in each of some states, by the values of the next states (see `bellman_backup`).
 
     Args:
-        values: of the states that follow, of one case.
+        values: of the next states, of one case.
         rows, row_places, nodes, places, rewards: the landings of the states.
         row_offsets: of the rows around a landing.
         layers: of the states.
         outcomes, weights: as in `bellman_backup`, of the case's layers.
         costs: of the trial of each action.
         remaining: iterations left after this one.
-        chosen: filled.
+        chosen: output.
     """
     n_states = nodes.shape[1]
     _, n_actions, n_outcomes = weights.shape

@@ -1,4 +1,4 @@
-"""Episodes with all that happened in them."""
+"""Episodes recorded step by step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from animat.neurons.simulator import NeuronSimulator
 
 
 class Traces(NamedTuple):
-    """Episodes of several actors; what comes after the end of an episode means nothing.
+    """Episodes of several actors; entries after the end of an episode are meaningless.
 
     Attributes:
         states: before each iteration and after the last (`State.carried`), each array with leading axes (actors,
@@ -42,7 +42,7 @@ def trace(
     episodes: int,
     seed: int,
 ) -> Traces:
-    """Run episodes of each actor; arguments as in `animat.evaluation.rollouts.roll_out`, of a robot in JAX."""
+    """Run episodes of each actor on a robot in JAX; arguments as in `animat.evaluation.rollouts.roll_out`."""
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
     traced: Traces = jax.device_get(_trace(environment, simulator, actors, keys))
     return traced

@@ -1,6 +1,6 @@
-"""What keeps a closed loop on the culture from the returns that a simulator predicts, as far as it is known beforehand.
+"""Findings known beforehand that keep a closed loop on the culture from reaching the returns that a simulator predicts.
 
-Whoever shows such a return says so in these words: training, evaluation, and the closed loop itself.
+Training, evaluation and the closed loop report them in the same words.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from animat.training.policy import Policy
 UNKNOWN = "unknown-presentation"
 
 OLD_MIN = 30.0
-"""Age of a recording from which on a warning says that the culture may be another by now."""
+"""Age of a recording above which a warning says that the culture may have drifted."""
 
 
 def other_presentation(recorded: Presentation | None, presented: Presentation) -> Iterator[Finding]:
-    """Where a loop presents stimuli otherwise than the recordings that its policies were trained on."""
+    """Warnings if a loop presents stimuli differently from the recordings on which its policies were trained."""
     if recorded is None:
         message = (
-            f"how the policy's recordings were presented is not known; a closed loop presents {presented}, and a "
-            "culture answers otherwise to another presentation"
+            f"it is not known how stimuli were presented in the policy's recordings; a closed loop presents "
+            f"{presented}, and a culture's responses depend on the presentation"
         )
         yield Finding(UNKNOWN, "warning", message)
         return
     if recorded.order != presented.order:
         message = (
             f"the policy's recordings were {recorded.order}: all stimuli of a frequency together; a closed loop "
-            "presents them mixed, and a culture answers otherwise then: expect less than predicted (record with "
-            "--order mixed, the default, for a closed loop)"
+            "presents them mixed, to which a culture responds differently: expect less than predicted (for a closed "
+            "loop record with --order mixed, the default)"
         )
         yield Finding("other-presentation", "warning", message)
     if recorded.pulses != presented.pulses:
         message = (
             f"the policy's recordings had {recorded.pulses} pulse(s) per trial, the loop has {presented.pulses}; "
-            "the response after another number of pulses is another"
+            "the response depends on the number of pulses"
         )
         yield Finding("other-presentation", "warning", message)
 
 
 def other_calibration(trained: Presentation | None, predicting: Presentation | None) -> Iterator[Finding]:
-    """Where the recording that predicts was presented otherwise than those that policies were trained on."""
+    """A warning if the presentation in the predicting recording differs from that in the training recordings."""
     if predicting is not None and predicting != trained:
         message = (
             f"the prediction is from a recording presented {predicting}, the policies' recordings were "
@@ -57,105 +57,105 @@ def other_calibration(trained: Presentation | None, predicting: Presentation | N
 
 
 def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Iterator[Finding]:
-    """Where a simulator is made otherwise than those that policies were trained on (`Policy.fitted`)."""
+    """A warning if a simulator was fitted differently from those in training (`Policy.fitted`)."""
 
     def rule(name: str, value: Any) -> Any:
-        # Which frequencies there are is in the conditions themselves; a tolerance is not.
+        # The conditions themselves contain their frequencies, but not a tolerance.
         return None if name == "by" and str(value).startswith("frequency") else value
 
     differing = [name for name in trained if rule(name, trained[name]) != rule(name, given.get(name))]
     if differing:
-        reported = ", ".join(f"{_WORDS.get(name, name)} {trained[name]}, here {given.get(name)}" for name in differing)
-        message = f"the policies were trained on simulators made otherwise: {reported}"
+        values = ", ".join(f"{_LABELS.get(name, name)} {trained[name]}, here {given.get(name)}" for name in differing)
+        message = f"the policies were trained on simulators that were fitted differently: {values}"
         yield Finding("other-simulator", "warning", message)
 
 
-_WORDS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}
+_LABELS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}
 
 
 def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Finding]:
-    """Where the culture is much older than the recording that predicts.
+    """A warning if the predicting recording is old.
 
     Args:
-        recorded_at_min: of the recording, on the culture's clock.
-        culture_min: of the culture, or of its newest recording.
+        recorded_at_min: time of the recording on the culture's clock.
+        culture_min: the culture's time, or that of its newest recording.
     """
     age_min = culture_min - recorded_at_min
     if age_min > OLD_MIN:
         message = (
-            f"percentiles and prediction are of {recorded_at_min:.0f} min, and the culture is at {culture_min:.0f} "
-            "min: cultures drift; take a later recording (--at-min), or train on later ones"
+            f"percentiles and prediction are from {recorded_at_min:.0f} min, but the culture is at {culture_min:.0f} "
+            "min: cultures drift; use a later recording (--at-min), or train on later ones"
         )
         yield Finding("old-calibration", "warning", message, age_min)
 
 
 def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, has_memory: bool) -> Iterator[Finding]:
-    """Where the recording shows that the culture remembers, and the simulator that predicts does not."""
+    """A warning if the recording shows that the culture has memory, but the predicting simulator has none."""
     remembers = next((finding for finding in noticed if finding.name == "memory"), None)
     if remembers is None or has_memory:
         return
     blocked = presentation is not None and presentation.order == "blocked"
     remedy = "record with --order mixed" if blocked else "--simulator memory"
-    message = f"{remembers.message}: a closed loop measures another return than is predicted ({remedy})"
+    message = f"{remembers.message}: the measured return will differ from the prediction ({remedy})"
     yield Finding("no-memory", "warning", message, remembers.value)
 
 
 def other_recording(trained_until_min: float, evaluated_at_min: float) -> Iterator[Finding]:
-    """Where policies are evaluated on another recording than the one that would calibrate their closed loop."""
+    """A warning if policies are not evaluated on the recording that would calibrate their closed loop."""
     if trained_until_min != evaluated_at_min:
         message = (
             f"this is the culture at {in_min(evaluated_at_min)}; the policies were last trained on the recording at "
-            f"{in_min(trained_until_min)}, which is the one that calibrates their closed loop"
+            f"{in_min(trained_until_min)}, which calibrates their closed loop"
         )
         yield Finding("other-recording", "warning", message, evaluated_at_min - trained_until_min)
 
 
 NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", "no-memory", "other-recording")
-"""Of the findings above that say why a culture would answer otherwise. Another simulator is not among them: which one
-predicts is asked for, and a loop has none."""
+"""Names of the findings because of which a culture would respond differently. `other-simulator` is not among them: the
+user chooses the simulator that predicts, and a loop has none."""
 
 
 def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts: Readouts) -> None:
-    """Raise unless a policy can act through these.
+    """Raise unless a policy can act through these conditions and readouts.
 
     Raises:
-        Mismatch: for other conditions, stimuli or readouts than it was trained on.
+        Mismatch: if conditions, stimuli or readouts differ from those in training.
     """
     if policy.conditions != tuple(conditions):
         raise Mismatch(
-            f"conditions: expected {some_of([c.label for c in policy.conditions])}, which the policies pick from, got "
-            f"recordings with {some_of([c.label for c in conditions])}: take those that the policies were trained on"
+            f"conditions: expected {some_of([c.label for c in policy.conditions])}, from which the policies choose, "
+            f"got recordings with {some_of([c.label for c in conditions])}: use those that the policies were trained on"
         )
     if others := other_stimulus(policy.conditions, conditions):
-        raise Mismatch(f"conditions: {others} in the recordings: take those that the policies were trained on")
+        raise Mismatch(f"conditions: {others} in the recordings: use those that the policies were trained on")
     if policy.readouts != readouts:
         raise Mismatch(
-            f"readouts: expected {', '.join(policy.readouts.names)}, of the electrodes that the policies were trained "
-            f"on, got {', '.join(readouts.names)} in the recordings"
+            f"readouts: expected {', '.join(policy.readouts.names)}, with the electrodes on which the policies were "
+            f"trained, got {', '.join(readouts.names)} in the recordings"
         )
 
 
-def other_timeline(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
-    """Where simulators are otherwise than those that a policy was trained on; errors as of `expect_conditions`."""
+def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> tuple[Finding, ...]:
+    """Differences between simulators and those that a policy was trained on; errors as in `expect_conditions`."""
     expect_conditions(policy, timeline.conditions, timeline.readouts)
-    found = []
+    findings = []
     if policy.window_ms != timeline.window_ms:
-        trained, these = in_window(policy.window_ms), in_window(timeline.window_ms)
-        message = f"the policies were trained on responses {trained}, these lie {these}"
-        found.append(Finding("other-window", "warning", message))
-    found += other_simulator(policy.fitted, timeline.fitted)
+        trained, these = describe_window(policy.window_ms), describe_window(timeline.window_ms)
+        message = f"the policies were trained on responses {trained}, but these are {these}"
+        findings.append(Finding("other-window", "warning", message))
+    findings += other_simulator(policy.fitted, timeline.fitted)
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         message = (
             f"the policies' percentiles were fixed from the recording at {in_min(first_min)}, which is not the first "
             f"of these: here they are fixed from {in_min(timeline.start_min[0])}"
         )
-        found.append(Finding("other-percentiles", "warning", message))
-    return tuple(found)
+        findings.append(Finding("other-percentiles", "warning", message))
+    return tuple(findings)
 
 
-def not_of_a_loop(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:
-    """Why returns on the simulator of a minute are not those of a closed loop on the culture."""
+def loop_differences(policy: Policy, timeline: SimulatorTimeline, minute: float) -> Iterator[Finding]:
+    """Why returns on the simulator of a minute would differ from those of a closed loop on the culture."""
     recorded = policy.presentation
     yield from other_presentation(recorded, Presentation("mixed", 1 if recorded is None else recorded.pulses))
     yield from other_calibration(recorded, timeline.presentation)
@@ -167,6 +167,6 @@ def not_of_a_loop(policy: Policy, timeline: SimulatorTimeline, minute: float) ->
         yield from other_recording(float(timeline.start_min[timeline.row_at(trained_until)]), minute)
 
 
-def in_window(window_ms: tuple[float, float] | None) -> str:
-    """Of responses, as messages say it."""
-    return "in a window that is not known" if window_ms is None else f"from {window_ms[0]:g} to {window_ms[1]:g} ms"
+def describe_window(window_ms: tuple[float, float] | None) -> str:
+    """A response window in words, for messages."""
+    return "in an unknown window" if window_ms is None else f"from {window_ms[0]:g} to {window_ms[1]:g} ms"

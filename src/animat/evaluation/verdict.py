@@ -1,4 +1,4 @@
-"""Whether policies outperform the controls beside them: one rule and the same words wherever both are shown."""
+"""Whether policies outperform controls: one rule and one wording wherever both are shown."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike
 from animat.evaluation.statistics import p_of_u
 
 OUTPERFORMED_P = 0.01
-"""The p below which policies count as better, as in the paper's comparisons."""
+"""Policies count as better if p is below this, as in the paper's comparisons."""
 
 
-class Beside(NamedTuple):
-    """Episodes of policies beside those of a control.
+class EpisodeComparison(NamedTuple):
+    """Episodes of policies compared with those of a control.
 
     Attributes:
         p: of the two-sided Mann-Whitney test (normal approximation).
         wins: share of pairs of episodes in which the policies' return is larger, ties half.
-        policies, control: episodes of each.
+        policies, control: number of episodes.
     """
 
     p: float
@@ -36,17 +36,17 @@ class Beside(NamedTuple):
 
     @property
     def is_worse(self) -> bool:
-        """Whether they are smaller."""
+        """Whether the policies' returns are smaller than the control's."""
         return is_worse(self.p, self.wins)
 
     @property
-    def can_tell(self) -> bool:
-        """Whether so many episodes could come to a small p at all: if each of the policies' were the larger one."""
+    def has_enough_episodes(self) -> bool:
+        """Whether this number of episodes could give a small p at all: if all of the policies' were larger."""
         return p_of_u(0.0, self.policies, self.control) < OUTPERFORMED_P
 
 
-def beside(policies: ArrayLike, control: ArrayLike) -> Beside:
-    """Compare the returns of policies with those of a control, episode by episode, all policies together.
+def compare_episodes(policies: ArrayLike, control: ArrayLike) -> EpisodeComparison:
+    """Compare the returns of policies with those of a control by their episodes, all policies together.
 
     Args:
         policies, control: returns, at least one of each, any shape.
@@ -55,14 +55,15 @@ def beside(policies: ArrayLike, control: ArrayLike) -> Beside:
 
     ours, theirs = np.ravel(policies), np.ravel(control)
     if np.ptp(np.concatenate([ours, theirs])) == 0:
-        return Beside(1.0, 0.5, len(ours), len(theirs))
+        return EpisodeComparison(1.0, 0.5, len(ours), len(theirs))
     test = mannwhitneyu(ours, theirs, alternative="two-sided", method="asymptotic")
-    # By its continuity correction p can exceed 1 where U is at its mean.
-    return Beside(min(1.0, float(test.pvalue)), float(test.statistic) / ours.size / theirs.size, len(ours), len(theirs))
+    # With the continuity correction p can exceed 1 if U is at its mean.
+    p, wins = min(1.0, float(test.pvalue)), float(test.statistic) / ours.size / theirs.size
+    return EpisodeComparison(p, wins, len(ours), len(theirs))
 
 
 def is_worse(p: float, wins: float) -> bool:
-    """Whether returns are smaller than a control's, by the test and the share of pairs of episodes that they win."""
+    """Whether returns are smaller than a control's, by the test's p and the share of pairs of episodes won."""
     return p < OUTPERFORMED_P and wins < 0.5
 
 
@@ -74,38 +75,38 @@ class Verdict:
         controls: by name, at least one.
     """
 
-    controls: Mapping[str, Beside]
+    controls: Mapping[str, EpisodeComparison]
 
     @classmethod
     def of(cls, policies: ArrayLike, controls: Mapping[str, ArrayLike]) -> Self:
         """From returns of episodes."""
-        return cls({name: beside(policies, returns) for name, returns in controls.items()})
+        return cls({name: compare_episodes(policies, returns) for name, returns in controls.items()})
 
     @property
     def not_outperformed(self) -> tuple[str, ...]:
-        """The controls than which the policies' returns are not shown to be larger (p < 0.01)."""
+        """The controls whose returns the policies' are not shown to exceed (p < 0.01)."""
         return tuple(name for name, each in self.controls.items() if not each.is_outperformed)
 
     def __str__(self) -> str:
-        few = {name: each for name, each in self.controls.items() if not each.can_tell}
-        reported = [
+        few = {name: each for name, each in self.controls.items() if not each.has_enough_episodes}
+        not_outperformed = [
             f"{name} (p = {each.p:.2g}; {'they are worse: ' if each.is_worse else ''}their return is larger in "
             f"{100 * each.wins:.0f} % of the pairs of episodes)"
             for name, each in self.controls.items()
-            if not each.is_outperformed and each.can_tell
+            if not each.is_outperformed and each.has_enough_episodes
         ]
-        said = [f"the policies do not outperform {', '.join(reported)}"] if reported else []
+        parts = [f"the policies do not outperform {', '.join(not_outperformed)}"] if not_outperformed else []
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
-            said.append(
-                f"{fewest.policies} episode{'' if fewest.policies == 1 else 's'} of the policies beside "
-                f"{fewest.control} of a control are too few to tell (p < {OUTPERFORMED_P:g}) whether the policies "
+            parts.append(
+                f"{fewest.policies} episode{'' if fewest.policies == 1 else 's'} of the policies and "
+                f"{fewest.control} of a control are too few to show (p < {OUTPERFORMED_P:g}) whether the policies "
                 f"outperform {', '.join(few)}"
             )
-        if not said:
+        if not parts:
             least = min(each.wins for each in self.controls.values())
-            said.append(
-                f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in "
-                f"{100 * least:.0f} % of the pairs of episodes or more)"
+            parts.append(
+                f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
+                f"{100 * least:.0f} % of the pairs of episodes)"
             )
-        return "; ".join(said)
+        return "; ".join(parts)

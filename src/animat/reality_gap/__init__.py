@@ -1,4 +1,4 @@
-"""Predicted against measured return: policies and controls on a simulator, then in closed loop on the culture."""
+"""Predicted against measured return of policies and controls: on a simulator, then in closed loop on the culture."""
 
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.row import Row

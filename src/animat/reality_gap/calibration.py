@@ -1,4 +1,4 @@
-"""What a closed loop takes from recordings: percentiles, the burst threshold, and the simulator that predicts."""
+"""What a closed loop takes from recordings: percentiles, the burst threshold, and the predicting simulator."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from animat.neurons.memory import MemorySimulator
 from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
-from animat.reality_gap.as_read import as_read
+from animat.reality_gap.rereading import reread
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
@@ -31,19 +31,19 @@ BOOTSTRAPS = 100
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a closed loop takes from a recording, and what its prediction is made with.
+    """What a closed loop takes from a recording, and the simulators of its prediction.
 
     Attributes:
         adaptive: whether the loop's thresholds adapt (`animat.closed_loop.adaptive`) or are fixed.
-        simulator: of the recording; where thresholds adapt, of its responses as these read them.
-        percentiles: P0, P10, ..., P100 of its non-burst responses, Hz, shape (11,), or (readouts, 11): those that the
-            loop begins with.
-        bootstraps: simulators of bootstrap samples of its responses: what so many could as well have been.
-        burst_threshold: ratio of active channels above which its responses were bursts.
-        drift: of the recordings up to it; None where one recording tells none.
+        simulator: of the recording; with adaptive thresholds, of its responses as these read them.
+        percentiles: P0, P10, ..., P100 of its non-burst responses, Hz, shape (11,), or (readouts, 11), with which the
+            loop begins.
+        bootstraps: simulators of bootstrap samples of its responses.
+        burst_threshold: ratio of active channels above which a response was a burst.
+        drift: over the recordings up to this one; None if it cannot be determined from one recording.
         start_min: of the recording on the culture's clock.
-        fitted: how the simulators were made, as `Policy.fitted`.
-        adjusted: its responses, which adaptive thresholds start from.
+        fitted: how the simulators were fitted, as in `Policy.fitted`.
+        adjusted: its responses, from which adaptive thresholds start.
     """
 
     adaptive: bool
@@ -64,12 +64,12 @@ class Calibration:
 
     @property
     def responses_hz(self) -> tuple[Float64[np.ndarray, "responses *readouts"], ...]:
-        """Non-burst responses of each condition, in the order of time, shape (responses,), or (responses, readouts)."""
+        """Non-burst responses of each condition, in order of time, shape (responses,), or (responses, readouts)."""
         return self.adjusted.responses_hz
 
     @property
     def remembering(self) -> Remembering:
-        """How a loop's responses become the history state, with the memory of the recording's own simulator."""
+        """How a loop's responses update the history state, with the memory of the recording's own simulator."""
         return self.adjusted.remembering
 
     @classmethod
@@ -84,20 +84,20 @@ class Calibration:
         bins: int = 20,
         range_hz: float | None = None,
     ) -> Self:
-        """From the responses of a culture's recordings.
+        """Calibrate by the responses of a culture's recordings.
 
         Args:
             series: in any order.
-            policy: its last simulator in training is the one that is taken. Where the loop's thresholds are fixed, they
-                are those that it was trained with.
-            at_min: the minute whose newest recording is taken instead; None without a policy: the last.
-            adaptive: whether the loop's thresholds will adapt, or are fixed. Of thresholds that adapt, simulators are
-                made of responses as these read them (`animat.reality_gap.as_read`), except for recordings in blocks and
-                for policies with other mappings than 1 and 9 thresholds.
+            policy: determines the recording, that of its last simulator in training. Fixed thresholds are those with
+                which it was trained.
+            at_min: the minute whose newest recording is used instead; None without a policy: the last.
+            adaptive: whether the loop's thresholds will adapt, or are fixed. With adaptive thresholds, simulators are
+                made of responses as these read them (`animat.reality_gap.rereading`), except for recordings in blocks
+                and for policies whose mapping is not thresholds.
             kind, bins, range_hz: of the simulator, see `fit_timeline`.
 
         Raises:
-            InvalidArgument, Mismatch, UnusableData: as `fit_timeline` does.
+            InvalidArgument, Mismatch, UnusableData: as in `fit_timeline`.
         """
         timeline = fit_timeline(series, kind=kind, bins=bins, range_hz=range_hz)
         fit: dict[str, Any] = {"kind": timeline.fitted["kind"], "bins": bins, "range_hz": range_hz}
@@ -110,16 +110,16 @@ class Calibration:
         rng = np.random.default_rng(0)
         recorded = simulator = timeline.at(start_min)
         adjusted = AdjustedRanks.of(responses, recorded)
-        # All of one shape: what runs on them is compiled once.
+        # All of the same shape, so that programs are compiled once.
         fit["room"] = room_for(series)
         answers = responses
         if adaptive and not responses.is_blocked and (policy is None or isinstance(policy.mapping, Thresholds)):
-            answers = as_read(responses, adjusted)
-            # The loop shows policies what the recording's own simulator remembers.
+            answers = reread(responses, adjusted)
+            # The loop shows policies the history state of the recording's own simulator.
             known = recorded.memory if isinstance(recorded, MemorySimulator) else None
             sees = policy is not None and policy.neural_observation
             simulator = fit_simulator(answers, **fit, memory=known if sees else None)
-        # A response that was drawn twice is no neighbour that tells of itself: what is remembered is as it was found.
+        # In a bootstrap sample a response can be its own neighbour: the memory is not fitted again.
         fit["memory"] = simulator.memory if isinstance(simulator, MemorySimulator) else None
         calibration = cls(
             adaptive=adaptive,
@@ -143,7 +143,7 @@ class Calibration:
         return calibration.with_percentiles(timeline.with_first_percentiles().at(start_min).percentiles)
 
     def with_percentiles(self, percentiles: Any) -> Self:
-        """The same with one set of percentiles in all simulators: they do not move with the responses."""
+        """The same with one set of percentiles in all simulators, independent of their responses."""
 
         def fixed(simulator: NeuronSimulator) -> NeuronSimulator:
             return replace(simulator, percentiles=percentiles)  # type: ignore[type-var]

@@ -1,4 +1,4 @@
-"""The optimal return of what a closed loop acts in, worked out beside it."""
+"""The optimal return on a closed loop's simulator, computed while the loop runs."""
 
 from __future__ import annotations
 
@@ -13,46 +13,42 @@ from animat.progress import Progress, in_phase
 from animat.robots.grid import grid_for
 
 RESOLUTION = 0.5
-"""Of the grid: fast and rough, 0.8 of the cartpole's 200."""
+"""Of the grid: fast and coarse, with an error of 0.8 on the range of 200 of the cartpole."""
 
 
-class OptimumBeside:
-    """The optimal return, computed in a thread: beside a loop that takes what time it takes, on another core."""
+class BackgroundOptimum:
+    """The optimal return, computed in a background thread, on another core than a loop that waits most of the time."""
 
     def __init__(self, environment: Animat[Any], simulator: NeuronSimulator) -> None:
-        self._found: Future[float] = Future()
+        self._value: Future[float] = Future()
 
         def work() -> None:
             try:
-                self._found.set_result(_best_return(environment, simulator))
+                # Only the value, which is reported as "about": its uncertainty would take a third longer.
+                grid = grid_for(environment.robot).scaled(RESOLUTION)
+                (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
+                self._value.set_result(float(value))
             except BaseException as error:
-                self._found.set_exception(error)
+                self._value.set_exception(error)
 
-        # A daemon: whoever stops while it computes need not wait for it.
+        # A daemon, so that a user who stops the program need not wait for it.
         threading.Thread(target=work, name="optimal return", daemon=True).start()
 
     @property
-    def is_known(self) -> bool:
-        """Whether nobody would wait for it; also where it could not be computed."""
-        return self._found.done()
+    def is_done(self) -> bool:
+        """Whether the computation has ended, with a value or an error."""
+        return self._value.done()
 
     def value(self, progress: Progress | None) -> float:
-        """Wait for it.
+        """Wait for the value.
 
         Raises:
-            Exception: what kept it from being computed.
+            Exception: if it could not be computed.
         """
-        if not self._found.done():
-            in_phase(progress, "optimal return").update(0, 1, "working it out on the simulator")
-        return self._found.result()
+        if not self.is_done:
+            in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
+        return self._value.result()
 
-    def let_end(self) -> None:
-        """Wait until it computes no more: a program that ends while JAX computes in a thread is ended by a signal."""
-        wait([self._found])
-
-
-def _best_return(environment: Animat[Any], simulator: NeuronSimulator) -> float:
-    """The value alone, which is told as "about": how well it is known would take a third as long again."""
-    grid = grid_for(environment.robot).scaled(RESOLUTION)
-    (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
-    return float(value)
+    def join(self) -> None:
+        """Wait until the computation has ended: a program that exits while JAX computes in a thread is killed."""
+        wait([self._value])

@@ -1,4 +1,4 @@
-"""How long a session will be, and how long it can be: told before the first pulse."""
+"""How long a session will be and can be, reported before the first pulse."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from animat.responses.quality.drift import LARGE
 
 @dataclass(frozen=True)
 class Outlook:
-    """What is known of a session's length beforehand; minutes are from its start.
+    """What is known beforehand of a session's length; minutes are from its start.
 
     Attributes:
-        planned_min: all episodes, as they are on the simulator.
-        drifted_min: until the recordings' drift has changed P50 by a quarter since the last of them, and how long it
-            takes at least; None where they tell no drift.
-        budget_min: until the budget of pulses is spent; infinite without one.
+        planned_min: duration of all episodes, as on the simulator.
+        drifted_min: time until the recordings' drift has changed P50 by a quarter since the last of them, and a lower
+            bound of it; None if the recordings do not determine the drift.
+        budget_min: time until the budget of pulses is spent; infinite without one.
     """
 
     planned_min: float
@@ -32,37 +32,36 @@ class Outlook:
 
     @property
     def has_drifted(self) -> bool:
-        """Whether the drift was so large already before the session."""
+        """Whether the drift was that large before the session."""
         return self.drifted_min is not None and self.drifted_min[0] <= 0
-
-    @property
-    def _lasts_min(self) -> float:
-        return min(np.inf if self.drifted_min is None else self.drifted_min[0], self.budget_min)
 
     def __str__(self) -> str:
         if self.drifted_min is None:
-            drift = "how the culture drifts is known from two recordings on"
+            drift = "at least two recordings are needed to estimate the culture's drift"
         else:
-            likely, least = self.drifted_min
-            drift = f"by the recordings' drift the median response {_when(likely, least)}, beyond which adaptive "
-            drift += "thresholds may not help"
-        said = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
+            drift = (
+                f"at the drift of the recordings the median response {_when(*self.drifted_min)}, beyond which adaptive "
+                "thresholds may not help"
+            )
+        text = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
         if np.isfinite(self.budget_min):
-            said += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
+            text += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
+        available_min = self.budget_min
         if self.has_drifted:
-            said += "; take newer recordings, with --at-min or by recording again"
-        lasts_min = self.budget_min if self.has_drifted else self._lasts_min
-        return said + ("; the plan is longer: ask for fewer --episodes" if self.planned_min > lasts_min else "")
+            text += "; use newer recordings, with --at-min or by recording again"
+        elif self.drifted_min is not None:
+            available_min = min(self.drifted_min[0], available_min)
+        return text + ("; the plan is longer: ask for fewer --episodes" if self.planned_min > available_min else "")
 
 
 def _when(likely: float, least: float) -> str:
     by = f"by {100 * LARGE:.0f} %"
     if likely <= 0:
-        return f"had changed {by} already {_words(-likely)} ago"
-    return f"has changed {by} in {_words(likely)} ({_words(max(0.0, least))} at least)"
+        return f"had already changed {by} {_duration(-likely)} ago"
+    return f"will have changed {by} in {_duration(likely)} (at least {_duration(max(0.0, least))})"
 
 
-def _words(minutes: float) -> str:
+def _duration(minutes: float) -> str:
     return f"{minutes:.0f} min" if minutes < 600 else "more than 10 h"
 
 
@@ -76,9 +75,9 @@ def outlook(
     """How long a session will be and can be.
 
     Args:
-        calibration: whose recordings' drift is gone on with.
-        episodes: of each agent how many, how often each condition is presented in one of them, and whether the
-            culture gets pulses then.
+        calibration: whose recordings' drift is extrapolated.
+        episodes: for each agent the number of episodes, how often each condition is presented in one of them, and
+            whether the culture gets pulses.
         now_min: on the culture's clock.
     """
     gives = np.array([condition.electrodes != RESTING for condition in loop.conditions])

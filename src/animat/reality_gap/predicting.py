@@ -1,4 +1,4 @@
-"""What the recording's simulator says that policies and controls will return, and how well it can know."""
+"""The returns of policies and controls that the recording's simulator predicts, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
 from animat.evaluation.rollouts import Episodes, Uniform, roll_out
 from animat.progress import Progress, Silent
-from animat.reality_gap.answered import Commanded
 from animat.reality_gap.calibration import Calibration
+from animat.reality_gap.session_responses import CommandSums
 from animat.robots.host import HostRobot
 
 EPISODES = 200
-"""Of each policy and control in one roll-out."""
+"""Episodes of each policy and control in one roll-out."""
 ROLL_OUTS = 5
-"""On the recording's simulator; one on each simulator of bootstrapped responses."""
+"""Roll-outs on the recording's simulator; there is one on each bootstrap simulator."""
 
 BOOTSTRAPS_ON_HOST = 40
-"""Fewer for a robot that is stepped on the host, where an episode takes a thousand times as long."""
+"""Bootstraps for a robot that is stepped on the host: fewer, as an episode takes a thousand times as long."""
 
 
-class Predicted(NamedTuple):
-    """What simulators say of one agent.
+class Prediction(NamedTuple):
+    """The predictions for one agent.
 
     Attributes:
-        returns: of its episodes on the simulator of the recording, shape (episodes,).
-        anew: its mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,): it spreads
-            as the recording's responses and, a little, as its episodes do.
-        commanded: in all its episodes on the simulator of the recording, shape (conditions,).
-        commanded_anew: on each simulator of bootstrapped responses, shape (bootstraps, conditions).
+        returns: of its episodes on the recording's simulator, shape (episodes,).
+        bootstrap_means: its mean return on each bootstrap simulator, shape (bootstraps,); their spread is due to the
+            recording's responses and, a little, to the episodes.
+        commanded: in all its episodes on the recording's simulator, shape (conditions,).
+        commanded_bootstraps: on each bootstrap simulator, shape (bootstraps, conditions).
     """
 
     returns: Float64[np.ndarray, " episodes"]
-    anew: Float64[np.ndarray, " bootstraps"]
-    commanded: Commanded
-    commanded_anew: Commanded
+    bootstrap_means: Float64[np.ndarray, " bootstraps"]
+    commanded: CommandSums
+    commanded_bootstraps: CommandSums
 
     @property
     def presented(self) -> Float64[np.ndarray, " conditions"]:
@@ -52,18 +52,18 @@ class Predicted(NamedTuple):
         return np.asarray(self.commanded.presented / len(self.returns))
 
 
-def together(predicted: Sequence[Predicted]) -> Predicted:
-    """Several policies as one agent."""
-    return Predicted(
+def pool(predicted: Sequence[Prediction]) -> Prediction:
+    """Pool the predictions of several policies."""
+    return Prediction(
         np.concatenate([each.returns for each in predicted]),
-        np.mean([each.anew for each in predicted], axis=0),
+        np.mean([each.bootstrap_means for each in predicted], axis=0),
         _stacked([each.commanded for each in predicted]).summed(0),
-        _stacked([each.commanded_anew for each in predicted]).summed(0),
+        _stacked([each.commanded_bootstraps for each in predicted]).summed(0),
     )
 
 
-def _stacked(commanded: Sequence[Commanded]) -> Commanded:
-    return Commanded(*(np.array(sums) for sums in zip(*commanded, strict=True)))
+def _stacked(commanded: Sequence[CommandSums]) -> CommandSums:
+    return CommandSums(*(np.array(sums) for sums in zip(*commanded, strict=True)))
 
 
 def predict(
@@ -75,70 +75,69 @@ def predict(
     *,
     seed: int = 1,
     progress: Progress | None = None,
-) -> dict[str, Predicted]:
-    """Run policies and controls on the simulator of a recording, and on those of its responses drawn anew.
+) -> dict[str, Prediction]:
+    """Run policies and controls on the simulator of a recording and on its bootstrap simulators.
 
     Args:
-        policies: as they act, side by side.
-        names: of each of them.
-        controls: beside them.
-        environment: robot and mapping, and what policies see besides.
+        policies: side by side.
+        names: of the policies.
+        environment: of the policies.
         seed: decides every random draw.
-        progress: told after the policies and each control.
+        progress: updated before the policies and each control.
 
     Returns:
-        By the name of the policy or control.
+        The prediction for each policy and control, by its name.
     """
     progress = progress or Silent()
     simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
     if isinstance(environment.robot, HostRobot):
         simulators = simulators[: ROLL_OUTS + BOOTSTRAPS_ON_HOST]
         episodes_each = episodes_on_host(environment.robot)
-    acting = [policies, *map(_by_anybody, controls)]
+    acting = [policies, *map(_with_random_actor, controls)]
 
-    def rolled(number: int, on: int) -> Episodes:
+    def run(number: int, on: int) -> Episodes:
         control, drawn = acting[number], roll_out_seed(seed, number, on)
         within = control.within(environment, simulators[on])
         return roll_out(*within, control.actor, control.n_actors, episodes=episodes_each, seed=drawn)
 
-    found: dict[str, Predicted] = {}
-    # A body on the host hangs in the first thread or is not noticed (`animat.robots.host.within`).
+    predictions: dict[str, Prediction] = {}
+    # A hanging body on the host is only noticed in the main thread (`animat.robots.host.within`).
     on_host = isinstance(environment.robot, HostRobot)
-    with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        side_by_side = map if pool is None else pool.map
-        # First one of each kind: two of a kind that start together would both be compiled.
+    with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as executor:
+        side_by_side = map if executor is None else executor.map
+        # First one of each kind: two of a kind that start at the same time would both be compiled.
         progress.update(0, len(acting), "compiling")
         kinds = {_program_of(control): number for number, control in enumerate(acting)}
-        list(side_by_side(rolled, kinds.values(), repeat(0)))
+        list(side_by_side(run, kinds.values(), repeat(0)))
         for number, control in enumerate(acting):
             progress.update(number, len(acting), control.name)
-            episodes = list(side_by_side(rolled, repeat(number), range(len(simulators))))
+            episodes = list(side_by_side(run, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
-            commanded = _stacked([Commanded(each.presented, each.commanded) for each in episodes])
+            commanded = _stacked([CommandSums(each.presented, each.commanded) for each in episodes])
             rows = {control.name: [*range(control.n_actors)]} if number else {name: [i] for i, name in enumerate(names)}
             for name, of in rows.items():
-                each = Commanded(*(sums[:, of] for sums in commanded)).summed(1)
-                found[name] = Predicted(
+                each = CommandSums(*(sums[:, of] for sums in commanded)).summed(1)
+                predictions[name] = Prediction(
                     returns[:ROLL_OUTS, of].ravel(),
                     returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
-                    Commanded(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
-                    Commanded(*(sums[ROLL_OUTS:] for sums in each)),
+                    CommandSums(*(sums[:ROLL_OUTS] for sums in each)).summed(0),
+                    CommandSums(*(sums[ROLL_OUTS:] for sums in each)),
                 )
-    return found
+    return predictions
 
 
 def episodes_on_host(robot: HostRobot) -> int:
-    """Of each policy on each simulator: twenty, or fewer of more than 200 iterations, but four at least."""
+    """Episodes of each policy on each simulator: 20, or fewer if longer than 200 iterations, but at least 4."""
     return max(4, min(20, 4_000 // robot.episode_limit))
 
 
 def roll_out_seed(seed: int, group: int, on: int) -> int:
-    """One of its own for each roll-out, and others for every `seed`: no interval is surer than its episodes are."""
+    """A different seed for each roll-out and each `seed`, so that intervals include the chance of their episodes."""
     return int(np.random.SeedSequence((seed, group, on)).generate_state(1)[0])
 
 
-def _by_anybody(control: Control) -> Control:
-    """With random choices, where they decide nothing: without stimuli, or where what is delivered is drawn anyway."""
+def _with_random_actor(control: Control) -> Control:
+    """With random choices if they have no effect: without stimuli, or if the delivered condition is random anyway."""
     if control.delivery not in ("silent", "shuffled"):
         return control
     delivery: Delivered = "silent" if control.delivery == "silent" else "chosen"
@@ -146,5 +145,5 @@ def _by_anybody(control: Control) -> Control:
 
 
 def _program_of(control: Control) -> tuple[Hashable, ...]:
-    """What decides which program its episodes run in."""
+    """What determines the compiled program of its episodes."""
     return type(control.actor), control.delivery, control.is_drawn, control.is_turned_round, control.switch_at

@@ -1,4 +1,4 @@
-"""Why policies live another return than was predicted: what the session's own data show, each with its number."""
+"""Why the measured return differs from the predicted one: reasons in the session's own data, each with its number."""
 
 from __future__ import annotations
 
@@ -8,60 +8,62 @@ from typing import Any, Literal
 
 import numpy as np
 
-from animat.reality_gap.answered import Answered
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.predicting import Predicted
+from animat.reality_gap.predicting import Prediction
+from animat.reality_gap.session_responses import SessionResponses
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.quality.memory import memory_findings
 from animat.responses.quality.responses import FEW_SAMPLES
 
 LEVEL = 0.01
-"""How often each check that tests something names a reason that is none, at most."""
+"""Highest rate of false reasons of each check that is a statistical test."""
 FEWEST_EPISODES = 8
-"""Of the policies, that a trend or a share is told from; of a condition in a trend's episode, `_FEWEST`."""
-_FEWEST = 3
+"""Fewest episodes of the policies from which a trend or a difference in commands is reported."""
+_FEWEST_RESPONSES = 3
+"""Fewest responses to a condition in an episode that counts for a trend."""
 LEAST_LATE = 0.05
-"""Of the interval between pulses, on average over a condition's trials."""
+"""Least lateness, as a share of the interval between pulses, on average over a condition's trials."""
 LEAST_BURSTS, _FEWEST_BURSTS = 0.05, 5
 LEAST_TREND = 0.1
-"""Change over the session, of a condition's mean response."""
+"""Least change over the session, as a share of a condition's mean response."""
 LEAST_COMMAND = 0.1
-"""Difference in a condition's mean command."""
+"""Least difference in a condition's mean command."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is known of policies whose measured return differs from the predicted one.
+    """Data on policies whose measured return differs from the predicted one.
 
     Attributes:
-        calibration: the recording that predicted.
+        session: responses to the policies.
+        calibration: of the predicting recording.
         predicted: of all policies together.
-        gap: the sign of their gap: -1 where less was measured.
+        gap: the sign of their gap: -1 if less was measured.
     """
 
-    answered: Answered
+    session: SessionResponses
     calibration: Calibration
-    predicted: Predicted
+    predicted: Prediction
     gap: Literal[-1, 1]
 
 
 def reasons(evidence: Evidence) -> tuple[Finding, ...]:
-    """What may have made the gap, as far as the data show it; none where they show nothing."""
-    return tuple(found for check in CHECKS.values() if (found := check(evidence)) is not None)
+    """Possible reasons for the gap that the data show; empty if they show none."""
+    return tuple(finding for check in CHECKS.values() if (finding := check(evidence)) is not None)
 
 
 def presentation(evidence: Evidence) -> Finding | None:
-    """The loop presented otherwise than the recording that predicted."""
-    recorded, presented = evidence.calibration.presentation, evidence.answered.responses.presentation
+    """The presentation in the loop differs from that in the predicting recording."""
+    recorded, presented = evidence.calibration.presentation, evidence.session.responses.presentation
     if recorded == presented:
         return None
-    message = f"the recording was presented {recorded or 'as is not known'}, the loop {presented}"
+    message = f"the presentation in the recording was {recorded or 'unknown'}, in the loop {presented}"
     return Finding("presentation", "note", message)
 
 
 def few_samples(evidence: Evidence) -> Finding | None:
-    """A condition has fewer responses in the recording than bootstrapping them tells the truth of."""
+    """A condition has too few responses in the recording for the bootstrap to be reliable."""
     n = [len(each) for each in evidence.calibration.responses_hz]
     if min(n) >= FEW_SAMPLES:
         return None
@@ -70,24 +72,24 @@ def few_samples(evidence: Evidence) -> Finding | None:
 
 
 def lateness(evidence: Evidence) -> Finding | None:
-    """Pulses came so late that a condition was at another frequency."""
-    answers, told, most = evidence.answered, [], 0.0
+    """Pulses came so late that a condition's frequency was different."""
+    session, conditions, most = evidence.session, [], 0.0
     for i, condition in enumerate(_conditions(evidence)):
-        late_s = answers.late_s[answers.responses.condition == i]
+        late_s = session.late_s[session.responses.condition == i]
         if not len(late_s) or (part := float(late_s.mean()) / condition.interval_s) < LEAST_LATE:
             continue
         most = max(most, part)
         share, late_ms = float(np.mean(late_s > 0)), 1000 * float(late_s[late_s > 0].mean())
-        told.append(
+        conditions.append(
             f"{condition.label} in {100 * share:.0f} % of its trials, by {late_ms:.2g} ms of its "
             f"{1000 * condition.interval_s:.3g} on average"
         )
-    return Finding("lateness", "note", f"pulses came late: {', '.join(told)}", most) if told else None
+    return Finding("lateness", "note", f"pulses came late: {', '.join(conditions)}", most) if conditions else None
 
 
 def bursts(evidence: Evidence) -> Finding | None:
-    """Many responses were bursts, which no simulator has."""
-    is_burst = evidence.answered.responses.is_burst
+    """Many responses were bursts, which simulators do not produce."""
+    is_burst = evidence.session.responses.is_burst
     count, n = int(is_burst.sum()), len(is_burst)
     if count < max(_FEWEST_BURSTS, LEAST_BURSTS * n):
         return None
@@ -101,101 +103,100 @@ def bursts(evidence: Evidence) -> Finding | None:
 def trend(evidence: Evidence) -> Finding | None:
     """Responses change over the session, and the returns with them.
 
-    For each condition least squares of the episodes' mean responses against their times; for the returns Kendall's
+    For each condition, linear regression of the episodes' mean responses on their times; for the returns, Kendall's
     rank correlation with time, in the direction of the gap.
     """
     from scipy.stats import kendalltau, linregress
 
-    answers = evidence.answered
-    responses, time_s, episodes = answers.responses, answers.responses.time_s, len(answers.returns)
+    session = evidence.session
+    responses, time_s, episodes = session.responses, session.responses.time_s, len(session.returns)
     if time_s is None or episodes < FEWEST_EPISODES:
         return None
-    with_time = kendalltau(np.arange(episodes), answers.returns, alternative="less" if evidence.gap < 0 else "greater")
+    with_time = kendalltau(np.arange(episodes), session.returns, alternative="less" if evidence.gap < 0 else "greater")
     if not with_time.pvalue < LEVEL:
         return None
     tested = []
     for i, condition in enumerate(_conditions(evidence)):
         chosen = (responses.condition == i) & ~responses.is_burst
-        n = np.bincount(answers.episode[chosen], minlength=episodes)
-        kept = n >= _FEWEST
+        n = np.bincount(session.episode[chosen], minlength=episodes)
+        kept = n >= _FEWEST_RESPONSES
         if np.count_nonzero(kept) >= FEWEST_EPISODES:
             x, t = (
-                np.bincount(answers.episode[chosen], each[chosen], episodes)[kept] / n[kept]
+                np.bincount(session.episode[chosen], each[chosen], episodes)[kept] / n[kept]
                 for each in (responses.rate_hz, time_s / 60)
             )
             tested.append((condition.label, linregress(t, x), float(np.ptp(t)) / max(float(x.mean()), 1e-9)))
-    told, most = [], 0.0
+    changes, most = [], 0.0
     for label, fit, scale in tested:
         change, error = fit.slope * scale, fit.stderr * scale
         if fit.pvalue < LEVEL / len(tested) and abs(change) >= LEAST_TREND:
             most = max(most, change, key=abs)
-            told.append(
+            changes.append(
                 f"to {label} {'rise' if change > 0 else 'fall'} by {100 * abs(change):.0f} % +- {100 * error:.0f}"
             )
-    if not told:
+    if not changes:
         return None
     message = (
-        f"the culture changed over the session's {answers.span_min:.0f} min: responses {', '.join(told)} (of their "
+        f"the culture changed over the session's {session.span_min:.0f} min: responses {', '.join(changes)} (of their "
         f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
     return Finding("trend", "note", message, most)
 
 
 def memory(evidence: Evidence) -> Finding | None:
-    """What the culture answered depends on its answer before, and the simulator that predicted does not know it."""
+    """Responses depend on previous responses, but the predicting simulator has no memory."""
     if evidence.calibration.simulator.has_memory:
         return None
-    found = next(memory_findings(evidence.answered.responses), None)
-    return None if found is None else Finding("memory", "note", found.message, found.value)
+    finding = next(memory_findings(evidence.session.responses), None)
+    return None if finding is None else Finding("memory", "note", finding.message, finding.value)
 
 
 def answers(evidence: Evidence) -> Finding | None:
-    """Conditions lead to other commands than they did on the simulator under the same policies.
+    """Conditions lead to different commands than on the simulator with the same policies.
 
-    t = (u - v) / sqrt(s^2 + r^2), with episodes - 1 degrees of freedom; u: the mean command of the session, s its error
-    from what differs between episodes; v: on the simulator, r its error from simulators of responses drawn anew.
-    Neither error is taken to be smaller than that of as many independent responses, if each were -1 or +1 (Agresti and
-    Coull 1998).
+    t = (u - v) / sqrt(s^2 + r^2), with episodes - 1 degrees of freedom; u: the mean command in the session, s its error
+    from differences between episodes; v: that on the simulator, r its error from bootstrap simulators. Neither error is
+    smaller than that of equally many independent responses, if each were -1 or +1 (Agresti and Coull 1998).
     """
     from scipy.stats import t as student
 
-    measured, predicted = evidence.answered.commanded, evidence.predicted
+    measured, predicted = evidence.session.commanded, evidence.predicted
     episodes, recorded_hz = len(measured.presented), evidence.calibration.responses_hz
     if episodes < FEWEST_EPISODES:
         return None
     conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
-    names, read_hz = evidence.answered.responses.readouts.names, evidence.answered.responses.read_hz
-    # Of one readout there is no axis.
+    names, read_hz = evidence.session.responses.readouts.names, evidence.session.responses.read_hz
+    # There is no axis for a single readout.
     of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
     tested = [(i, of) for i in conditions.tolist() for of in of_readouts]
-    told, most = [], 0.0
+    differences, most = [], 0.0
     for i, of in tested:
         at: Any = (i, *of)
         n, total = measured.presented[:, i], measured.total[:, *at]
         mean, expected = float(total.sum() / n.sum()), float(predicted.commanded.mean[at])
         between = episodes / (episodes - 1) * float(np.sum((total - mean * n) ** 2)) / float(n.sum()) ** 2
         error = max(between, _variance(mean, int(n.sum()))) ** 0.5
-        anew = float(np.nanvar(predicted.commanded_anew.mean[:, *at]))
-        expected_error = max(anew, _variance(expected, len(recorded_hz[i]))) ** 0.5
+        bootstrapped = float(np.nanvar(predicted.commanded_bootstraps.mean[:, *at]))
+        expected_error = max(bootstrapped, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = mean - expected
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < LEVEL / len(tested) and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
-            measured_hz = read_hz[evidence.answered.responses.condition == i, *of].mean()
+            measured_hz = read_hz[evidence.session.responses.condition == i, *of].mean()
             on = f" on {names[of[0]]}" if of else ""
-            told.append(
+            differences.append(
                 f"{_conditions(evidence)[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
                 f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, "
                 f"{recorded_hz[i][:, *of].mean():.3g} in the recording)"
             )
-    if not told:
+    if not differences:
         return None
-    message = f"conditions lead to other mean commands than predicted: {', '.join(told)}"
+    message = f"conditions lead to different mean commands than predicted: {', '.join(differences)}"
     return Finding("answers", "note", message, most)
 
 
 CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
-    "another presentation": presentation,
+    "a different presentation": presentation,
     "few responses": few_samples,
     "late pulses": lateness,
     "bursts": bursts,
@@ -203,14 +204,14 @@ CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
     "memory": memory,
     "mean commands": answers,
 }
-"""What is looked for, in words."""
+"""All checks, by their descriptions in messages."""
 
 
 def _variance(command: float, n: int) -> float:
-    """Of the mean of n commands that are -1 or +1."""
+    """The variance of the mean of n commands that are -1 or +1."""
     near = ((command + 1) / 2 * n + 2) / (n + 4)
     return 4 * near * (1 - near) / (n + 4)
 
 
 def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
-    return evidence.answered.responses.conditions
+    return evidence.session.responses.conditions

@@ -1,4 +1,4 @@
-"""A line of the table of predicted and measured returns."""
+"""A row of the table of predicted and measured returns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.evaluation.verdict import Beside
+from animat.evaluation.verdict import EpisodeComparison
 from animat.records import as_json
 
 _RESAMPLES = 10_000
@@ -17,28 +17,28 @@ _RESAMPLES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One line of the table.
+    """A row of the table.
 
     Attributes:
-        name, meaning: who acted.
+        name, meaning: of the agent.
         predicted: returns on the simulator, shape (episodes,).
-        predicted_anew: mean return on each simulator of the recording's responses drawn anew, shape (bootstraps,).
-        measured: returns of whole episodes on the culture, shape (episodes,).
-        pulses_per_action: that the culture was given, without the warm-up; so is all that follows of the culture.
-        electrode_pulses: in whole episodes, on average; NaN without any. One for each electrode of each pulse.
-        predicted_electrode_pulses: in an episode on the simulator; None where conditions do not say.
+        bootstrap_means: mean return on each bootstrap simulator, shape (bootstraps,).
+        measured: returns of complete episodes on the culture, shape (episodes,).
+        pulses_per_action: given to the culture, without the warm-up; the same holds for the measurements below.
+        electrode_pulses: mean number per complete episode, one for each electrode of each pulse; NaN without episodes.
+        predicted_electrode_pulses: per episode on the simulator; None if the conditions' electrodes are not known.
         pulse_cost: of an electrode pulse, in the units of the return.
-        bursts: share of responses that were.
+        bursts: share of responses that were bursts.
         late: share of trials that came late.
-        beside: the policies' measured returns beside these; None for the policies, and where either has none.
-        met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without one,
-            and where no episode came to its end.
+        comparison: of the policies' measured returns with these; None for the policies, and if either has none.
+        met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without a goal,
+            and without complete episodes.
     """
 
     name: str
     meaning: str
     predicted: Float64[np.ndarray, " predicted"]
-    predicted_anew: Float64[np.ndarray, " bootstraps"]
+    bootstrap_means: Float64[np.ndarray, " bootstraps"]
     measured: Float64[np.ndarray, " measured"]
     pulses_per_action: float
     electrode_pulses: float
@@ -46,49 +46,49 @@ class Row:
     pulse_cost: float
     bursts: float
     late: float
-    beside: Beside | None = None
+    comparison: EpisodeComparison | None = None
     met: dict[str, Any] = field(default_factory=dict)
 
     @property
     def prediction(self) -> Interval:
-        """Mean predicted return, and between which it lies as the recording's responses are drawn anew."""
-        return between(self.predicted.mean(), self.predicted_anew)
+        """Mean predicted return, with its interval over bootstrap samples of the recording's responses."""
+        return bootstrap_interval(self.predicted.mean(), self.bootstrap_means)
 
     @property
     def gap(self) -> Interval:
-        """Mean measured less mean predicted return; its interval is over recordings and measured episodes drawn anew.
+        """Mean measured less mean predicted return; its interval is over bootstrap recordings and measured episodes.
 
         Its ends are infinite with fewer than two measured episodes. Responses are drawn as if they were independent:
-        a drift between the recording and the loop is not in the interval, and shows as a gap.
+        drift between recording and loop is not in the interval, and shows as a gap.
         """
         value = self.measured.mean() - self.predicted.mean()
         if len(self.measured) < 2:
             return Interval(float(value), -np.inf, np.inf, CONFIDENCE)
         rng = np.random.default_rng(0)
         measured = resampled_means(self.measured, rng)
-        return between(value, measured - rng.choice(self.predicted_anew, len(measured)))
+        return bootstrap_interval(value, measured - rng.choice(self.bootstrap_means, len(measured)))
 
     @property
     def net(self) -> float | None:
-        """Mean measured return less the cost of pulses; None where no episode came to its end."""
+        """Mean measured return less the cost of pulses; None without complete episodes."""
         return float(self.measured.mean() - self.pulse_cost * self.electrode_pulses) if len(self.measured) else None
 
     @property
     def predicted_net(self) -> float | None:
-        """Mean predicted return less the cost of pulses; None where these are not known."""
-        given = self.predicted_electrode_pulses
-        return None if given is None else float(self.predicted.mean() - self.pulse_cost * given)
+        """Mean predicted return less the cost of pulses; None if these are not known."""
+        pulses = self.predicted_electrode_pulses
+        return None if pulses is None else float(self.predicted.mean() - self.pulse_cost * pulses)
 
     @property
     def gap_sign(self) -> Literal[-1, 0, 1]:
-        """-1 where less was measured than predicted, 1 where more, 0 where that cannot be told."""
+        """-1 if less was measured than predicted, 1 if more, 0 if this cannot be determined."""
         if not len(self.measured):
             return 0
         gap = self.gap
         return -1 if gap.high < 0 else 1 if gap.low > 0 else 0
 
     def to_dict(self) -> dict[str, Any]:
-        """The line as plain data."""
+        """The row as plain data."""
         measured = bool(len(self.measured))
         return {
             "name": self.name,
@@ -106,15 +106,15 @@ class Row:
             "predicted_net": self.predicted_net,
             "bursts": self.bursts,
             "late": self.late,
-            "p": None if self.beside is None else self.beside.p,
-            "wins": None if self.beside is None else self.beside.wins,
+            "p": None if self.comparison is None else self.comparison.p,
+            "wins": None if self.comparison is None else self.comparison.wins,
             **self.met,
         }
 
 
-def between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
-    """A value with the interval that holds 95 % of what was drawn anew."""
-    # Of a hundred draws the usual interpolation would hold 93 %.
+def bootstrap_interval(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
+    """A value with the interval that contains 95 % of bootstrap draws."""
+    # With a hundred draws the usual interpolation would contain 93 %.
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
     return Interval(float(value), float(low), float(high), CONFIDENCE)
 
@@ -122,7 +122,7 @@ def between(value: float, drawn: Float64[np.ndarray, " draws"]) -> Interval:
 def resampled_means(
     returns: Float64[np.ndarray, " episodes"], rng: np.random.Generator
 ) -> Float64[np.ndarray, " resamples"]:
-    """Means of returns drawn anew, with replacement."""
+    """Means of bootstrap samples of returns."""
     n = len(returns)
     often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
     return np.asarray(often @ returns / n)

@@ -1,4 +1,4 @@
-"""Policies and the controls of the study, first on the simulator, then between each other on the culture."""
+"""Policies and controls, first on the simulator, then interleaved on the culture."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from animat.evaluation.transfer import (
     other_calibration,
     other_simulator,
 )
-from animat.evaluation.verdict import beside
+from animat.evaluation.verdict import compare_episodes
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
-from animat.reality_gap.answered import answered, outcomes
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.optimum import OptimumBeside
+from animat.reality_gap.interventions import half_an_episode, intervention_table, run_ideal_actuator
+from animat.reality_gap.optimum import BackgroundOptimum
 from animat.reality_gap.outlook import outlook
-from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Predicted, episodes_on_host, predict, together
+from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
-from animat.reality_gap.row import Row, between
+from animat.reality_gap.row import Row, bootstrap_interval
+from animat.reality_gap.session_responses import outcomes, read_responses
 from animat.reality_gap.table import RealityGap
-from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
 from animat.robots.grid import no_grid
@@ -51,7 +51,7 @@ from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
-"""Beside ten episodes of policies or more they can tell (p < 0.01) that policies outperform it."""
+"""Fewest episodes of a control: enough to show (p < 0.01) that ten or more of policies outperform it."""
 
 
 def run_policies(
@@ -73,28 +73,28 @@ def run_policies(
     noticed: Sequence[Finding] = (),
     **settings: Any,
 ) -> RealityGap:
-    """Run policies, and the controls of the study between them, in closed loop, and compare with the prediction.
+    """Run policies and controls in closed loop, and compare with the prediction.
 
-    Episodes of all of them are interleaved in random order on the one culture, so that drift hits all alike. The
-    controls have no more episodes together than the policies, but for `FEWEST_OF_A_CONTROL` of each: what a culture is
-    given for controls makes it another one for the policies. Under the silent and the shuffled control the policies
-    take turns, episode after episode.
+    All episodes are interleaved in random order on the one culture, so that drift affects all alike. The controls
+    together have no more episodes than the policies, except that each has at least `FEWEST_OF_A_CONTROL`: stimulation
+    for controls changes the culture for the policies. Under the silent and the shuffled controls the policies take
+    turns, one episode each.
 
     Args:
-        policies: by name, of one robot, mapping and set of conditions.
+        policies: by name, all with the same robot, mapping and conditions.
         culture: open.
         calibration: percentiles, whether they adapt, burst threshold and prediction.
         episodes: of each policy, and at most of each control.
-        with_controls: all of them; if not, only the random one.
-        with_coupling: the best coupling on the calibration's simulator too, which is searched for first.
-        with_interventions: the policies with random spikes in place of responses, yoked stimuli, the mapping turned
-            round and, of a robot with several goals, the goal switched; and whose work it is.
+        with_controls: whether to run all controls, or only the random one.
+        with_coupling: whether to run the best coupling too, which is first searched on the calibration's simulator.
+        with_interventions: whether to run the policies also with random spikes instead of responses, yoked stimuli, the
+            mapping turned round and, for a robot with several goals, the goal switched; adds `whose_work`.
         greedy: whether policies take the most probable action, or draw as in training.
-        seed: decides every random draw, but what the culture does.
-        pulses: of a trial; None: as in the policies' recordings.
-        progress: told of each phase how far it is, and of the closed loop the returns so far.
-        report: is given lines before the session: the warnings, and how long it will and can be.
-        noticed: findings to be reported beside those made here.
+        seed: decides every random draw except those of the culture.
+        pulses: per trial; None: as in the policies' recordings.
+        progress: updated in each phase; in the closed loop with the returns so far.
+        report: called with lines before the session: the warnings, and how long it will and can be.
+        noticed: findings to report in addition to those made here.
         settings: other attributes of `Loop`.
 
     Raises:
@@ -105,7 +105,7 @@ def run_policies(
     first = check_policies(policies)
     check_conditions(first, calibration)
     loop, findings = _loop_of(first, calibration, pulses, settings)
-    findings += tuple(_warned(first, loop, calibration, culture.now_s / 60))
+    findings += tuple(_warnings(first, loop, calibration, culture.now_s / 60))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
@@ -118,18 +118,20 @@ def run_policies(
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
         labels = [condition.label for condition in loop.conditions]
         controls = controls_of(environment, simulator, labels, networks, n_policies)
-        # Random numbers are drawn by place, and it was always the last.
+        # The heuristic stays last: random numbers depend on the place.
         controls.sort(key=lambda control: control.name == "heuristic")
     if with_coupling:
-        in_phase(progress, "best coupling").update(0, 1, "searching for it on the simulator")
+        in_phase(progress, "best coupling").update(0, 1, "searching on the simulator")
         controls.append(coupling_of(environment, simulator, seed=seed))
     ideal = None
     if with_interventions:
         if isinstance(loop.robot, HostRobot):
-            raise InvalidArgument(f"--interventions: expected a robot in JAX, got {loop.robot.name}")
+            raise InvalidArgument(
+                f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped on the host"
+            )
         half = half_an_episode(trained, environment, simulator, seed)
         of_ideal, *changed = interventions_of(environment, simulator, networks, n_policies, switch_at=half)
-        ideal = with_ideal_actuator(of_ideal, environment, simulator, seed)
+        ideal = run_ideal_actuator(of_ideal, environment, simulator, seed)
         controls += [each for each in changed if each.name not in ("silent", "shuffled")]
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     pooled = np.concatenate(calibration.responses_hz)
@@ -147,26 +149,26 @@ def run_policies(
         tuple(policies),
         controls,
         environment,
-        # Fixed thresholds are what they are; adaptive ones would adapt to other responses too.
+        # Fixed thresholds stay the same in bootstraps; adaptive ones would adapt to their responses.
         calibration if calibration.adaptive else calibration.with_percentiles(simulator.percentiles),
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = OptimumBeside(animat, simulator) if why_no_optimum is None else None
+    optimum = BackgroundOptimum(animat, simulator) if why_no_optimum is None else None
     if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
-        # Such a loop has no time to lose.
+        # Such a loop must not wait for a core.
         optimum.value(progress)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
-    ahead = outlook(loop, calibration, plan, account, culture.now_s / 60)
+    expected = outlook(loop, calibration, plan, account, culture.now_s / 60)
     findings = (*noticed, *findings, *calibration.findings)
     if report is not None:
-        # Before the first pulse: whoever stands at the rig may think better of it.
+        # Before the first pulse, so that the operator can still stop.
         for message in warnings_once(findings):
             report(f"warning: {message}")
         report(f"each pulse: {loop.pulse}")
-        report(str(ahead))
+        report(str(expected))
     try:
         session = run_session(
             culture,
@@ -177,26 +179,26 @@ def run_policies(
             seed=seed,
             account=account,
             progress=in_phase(progress, "closed loop", sum(of_each), "episodes"),
-            predicted={name: between(of.returns.mean(), of.anew) for name, of in predicted.items()},
+            predicted={
+                name: bootstrap_interval(of.returns.mean(), of.bootstrap_means) for name, of in predicted.items()
+            },
         )
     except Exception:
         if optimum is not None:
-            optimum.let_end()
+            optimum.join()
         raise
     best = None
-    # Whoever stopped the session does not wait for it.
-    if optimum is not None and (optimum.is_known or session.ending.by == "plan"):
+    # A user who stopped the session does not wait for it.
+    if optimum is not None and (optimum.is_done or session.ending.by == "plan"):
         try:
             best = optimum.value(progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
     rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
-    found: tuple[Finding, ...] = ()
+    gap_reasons: tuple[Finding, ...] = ()
     if sign := rows[0].gap_sign:
-        evidence = Evidence(
-            answered(session, loop, tuple(policies)), calibration, together([predicted[p] for p in policies]), sign
-        )
-        found = reasons(evidence)
+        responses = read_responses(session, loop, tuple(policies))
+        gap_reasons = reasons(Evidence(responses, calibration, pool([predicted[p] for p in policies]), sign))
     return RealityGap(
         robot=loop.robot.name,
         mapping=loop.mapping.name,
@@ -208,45 +210,45 @@ def run_policies(
         account=account,
         findings=findings,
         responses=sum(map(len, calibration.responses_hz)),
-        outlook=ahead,
-        reasons=found,
-        whose_work=() if ideal is None else replaced(rows, *ideal),
+        outlook=expected,
+        reasons=gap_reasons,
+        whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
 
 
 def _loop_of(
     first: Policy, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
 ) -> tuple[Loop, tuple[Finding, ...]]:
-    """The loop that policies like the first one act in, and what is to be said of it."""
+    """The loop for policies like the first one, and its findings."""
     settings = {"burst_threshold": calibration.burst_threshold, **settings}
     if calibration.adaptive:
         settings["adaptive_from"] = calibration.adjusted
-    # What the calibrating recording tells of their stimuli: a policy of before does not know those of patterns.
+    # The recording's conditions have their stimuli: older policies do not know those of patterns.
     settings["conditions"] = calibration.conditions
     if first.neural_observation:
         settings["remembering"] = calibration.remembering
     return Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
 
 
-def _warned(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
-    """Why less or other than the prediction may be measured, as far as it is known before the session."""
+def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
+    """Known reasons why the measured return may differ from the prediction."""
     yield from other_calibration(first.presentation, calibration.presentation)
     if first.delivery == "shuffled":
         message = (
-            "the policies were trained as a control, with conditions drawn at random whatever they chose; in this loop "
-            "what they choose is delivered"
+            "the policies were trained as a control, with conditions drawn at random whatever they chose; this loop "
+            "delivers what they choose"
         )
         yield Finding("trained-as-control", "warning", message)
     if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
         message = (
-            "episodes begin after a rest (--warm-up 0), and those of the simulator as after stimuli of all conditions: "
-            "the measured return will be less than predicted"
+            "episodes begin after a rest (--warm-up 0), but on the simulator as after stimuli of all conditions: the "
+            "measured return will be less than predicted"
         )
         yield Finding("no-warm-up", "warning", message)
     if calibration.adaptive and first.percentiles == "first":
         message = (
-            "the policies were trained with fixed thresholds, and in this loop these adapt to the culture: with "
-            "--thresholds fixed they are as in training"
+            "the policies were trained with fixed thresholds, but in this loop thresholds adapt to the culture: use "
+            "--thresholds fixed to have them as in training"
         )
         yield Finding("moving-percentiles", "warning", message)
     yield from other_simulator(first.fitted, calibration.fitted)
@@ -255,17 +257,17 @@ def _warned(first: Policy, loop: Loop, calibration: Calibration, now_min: float)
     if isinstance(loop.robot, HostRobot):
         episodes_predicted = ROLL_OUTS * episodes_on_host(loop.robot)
         message = (
-            f"{loop.robot.name} is stepped on the host: predicted returns are of {episodes_predicted} episodes, and "
-            f"their intervals of {BOOTSTRAPS_ON_HOST} bootstraps"
+            f"{loop.robot.name} is stepped on the host: predicted returns are from {episodes_predicted} episodes, and "
+            f"their intervals from {BOOTSTRAPS_ON_HOST} bootstraps"
         )
         yield Finding("few-predicted", "note", message)
 
 
 def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
-    """Of each policy, then of each control.
+    """Episodes of each policy, then of each control.
 
     Args:
-        policies, controls: how many there are.
+        policies, controls: their numbers.
         episodes: of each policy, and at most of each control.
     """
     of_a_control = max(FEWEST_OF_A_CONTROL, math.ceil(policies * episodes / controls))
@@ -273,30 +275,30 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
 
 
 def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
-    """What keeps the optimal return from being computed; None where nothing does."""
-    why_not = no_grid(loop.robot)
+    """Why the optimal return cannot be computed; None if it can."""
+    reason = no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
-        why_not = f"these conditions have too few responses: {', '.join(few)}"
-    return None if why_not is None else lacking(loop.robot).get("value_grid", f"no optimal return: {why_not}")
+        reason = f"these conditions have too few responses: {', '.join(few)}"
+    return None if reason is None else lacking(loop.robot).get("value_grid", f"no optimal return: {reason}")
 
 
 def check_policies(policies: Mapping[str, Policy]) -> Policy:
-    """Raise unless policies can take turns in one closed loop; returns the first, which stands for all.
+    """Raise unless policies can take turns in one closed loop; return the first, which represents all.
 
     Raises:
-        InvalidArgument: for none.
+        InvalidArgument: for no policies.
         Mismatch: if they differ in robot, mapping, readouts, conditions, presentation, response window, percentiles,
-            delivery, or in how the simulators were made that they were trained on.
+            delivery, cost of pulses, or how their training simulators were fitted.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "presentation", "window_ms", "fitted")
     return first_of_alike(policies, (*alike, "percentiles", "delivery", "pulse_cost"), "run it alone")
 
 
 def check_conditions(first: Policy, calibration: Calibration) -> None:
-    """Raise unless a calibration is for the conditions that policies pick from, and the readouts that they act by.
+    """Raise unless a calibration has the policies' conditions and readouts.
 
     Raises:
-        Mismatch: if it is not.
+        Mismatch: if it has not.
     """
     if first.mapping is not None:
         expect_conditions(first, calibration.conditions, calibration.readouts)
@@ -305,12 +307,12 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
 def _rows(
     agents: Sequence[Agent],
     names: tuple[str, ...],
-    predicted: Mapping[str, Predicted],
+    predicted: Mapping[str, Prediction],
     session: Session,
     loop: Loop,
     pulse_cost: float,
 ) -> tuple[Row, ...]:
-    came_to, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
+    goal_outcomes, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
     unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
 
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
@@ -318,19 +320,19 @@ def _rows(
         whole = [each for each in episodes if each.is_whole]
         actions = max(1, sum(each.iterations for each in episodes))
         trials = max(1, sum(each.trials for each in episodes))
-        of_them = together([predicted[each] for each in of])
-        met = [came_to[episode.number] for episode in episodes if episode.number in came_to]
+        pooled = pool([predicted[each] for each in of])
+        met = [goal_outcomes[episode.number] for episode in episodes if episode.number in goal_outcomes]
         return Row(
             name=name,
             meaning=meaning,
-            predicted=of_them.returns,
-            predicted_anew=of_them.anew,
+            predicted=pooled.returns,
+            bootstrap_means=pooled.bootstrap_means,
             measured=np.array([episode.total for episode in whole], np.float64),
             pulses_per_action=sum(each.pulses - each.warm_up_pulses for each in episodes) / actions,
             electrode_pulses=sum(each.electrode_pulses for each in whole) / len(whole) if whole else math.nan,
             predicted_electrode_pulses=None
             if of_trials is None
-            else float(of_them.presented @ of_trials) * (name not in unstimulated),
+            else float(pooled.presented @ of_trials) * (name not in unstimulated),
             pulse_cost=pulse_cost,
             bursts=sum(each.bursts for each in episodes) / trials,
             late=sum(each.late for each in episodes) / trials,
@@ -345,8 +347,8 @@ def _rows(
                 rows.append(row(agent.name, agent.meaning, [agent.name]))
             continue
         control = row(agent.name, agent.meaning, [agent.name])
-        # With another goal in mid-episode policies are to do as well as ever: nothing to outperform.
+        # With a different goal in mid-episode policies should do equally well: there is nothing to outperform.
         if len(control.measured) and len(policies.measured) and agent.switch_at is None:
-            control = replace(control, beside=beside(policies.measured, control.measured))
+            control = replace(control, comparison=compare_episodes(policies.measured, control.measured))
         rows.append(control)
     return tuple(rows)

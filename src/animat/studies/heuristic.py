@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from animat.evaluation.verdict import beside, is_worse
+from animat.evaluation.verdict import compare_episodes, is_worse
 from animat.report.results import BesideHeuristic, Results
 from animat.studies.episodes import POLICY, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
@@ -25,8 +25,8 @@ def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterato
         for at_min, episodes in policies:
             if at_min in rule:
                 ours, theirs = episodes["return"].to_numpy(), rule[at_min]
-                found = beside(ours, theirs)
-                outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.can_tell else TOO_FEW
+                found = compare_episodes(ours, theirs)
+                outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.has_enough_episodes else TOO_FEW
                 # Of the policies' means, as in the scores: another order of summing can round to another digit.
                 means = float(mean_returns(episodes).mean()), float(theirs.mean())
                 yield BesideHeuristic(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)

@@ -8,7 +8,7 @@ from typing import Any, final
 
 from animat.environment import Animat
 from animat.evaluation.optimum import Case, Optimum, best_returns
-from animat.evaluation.resampling import Counted, few_of
+from animat.evaluation.resampling import WellSampled, undersampled
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress
 from animat.report.results import StudyOptimum
@@ -111,7 +111,7 @@ class FindOptima(StudyTask):
             done += len(same)
         for each in known:
             assert each.counted is not None and each.optimum is not None
-            each.optimum = each.counted.known(each.optimum, resolution=COARSER * resolution, seed=study.seed)
+            each.optimum = each.counted.with_interval(each.optimum, resolution=COARSER * resolution, seed=study.seed)
             done += 1
             progress.update(done, steps, "how well it is known")
         return [write_typed(file, [each.told(self.spec.name) for each in asked])]
@@ -121,10 +121,10 @@ class FindOptima(StudyTask):
         if timeline is None or not isinstance(environment, Animat):
             return _Asked(kind, at_min, case=(environment, None))
         responses = timeline.responses[timeline.row_at(at_min)]
-        few = few_of(responses)
+        few = undersampled(responses)
         if len(few) == len(responses.conditions):
             return _Asked(kind, at_min, left_out=few)
-        of = Counted.of(environment, timeline, at_min, are_fixed=kind.percentiles == "first")
+        of = WellSampled.of(environment, timeline, at_min, are_fixed=kind.percentiles == "first")
         return _Asked(kind, at_min, case=(of.environment, of.simulator), counted=of, left_out=few)
 
 
@@ -141,7 +141,7 @@ class _Asked:
     kind: Arm
     at_min: float
     case: Case | None = None
-    counted: Counted | None = None
+    counted: WellSampled | None = None
     left_out: tuple[str, ...] = ()
     optimum: Optimum | None = None
 

@@ -1,4 +1,4 @@
-"""What a session's log says of its episodes: the responses that moved the policies' robots, and what goals came to."""
+"""From a session's log: the responses that moved the policies' robots, and the outcomes of episodes with a goal."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from animat.responses.responses import Presented, Responses
 from animat.robots.base import Robot
 
 
-class Commanded(NamedTuple):
-    """What each condition led to.
+class CommandSums(NamedTuple):
+    """The commands that each condition led to.
 
     Attributes:
-        presented: how often it was presented, shape (..., conditions).
-        total: the sum of its commands, the same shape; of several commands each on its own, shape (..., conditions,
-            commands).
+        presented: how often each condition was presented, shape (..., conditions).
+        total: the sum of its commands, the same shape; several commands separately, shape (..., conditions, commands).
     """
 
     presented: Int64[np.ndarray, "*any conditions"]
@@ -37,23 +36,23 @@ class Commanded(NamedTuple):
         with np.errstate(invalid="ignore"):
             return np.asarray(self.total / (self.presented[..., None] if of_several else self.presented))
 
-    def summed(self, axis: int) -> Commanded:
-        """Over policies or episodes."""
-        return Commanded(self.presented.sum(axis=axis), self.total.sum(axis=axis))
+    def summed(self, axis: int) -> CommandSums:
+        """Summed over an axis of policies or episodes."""
+        return CommandSums(self.presented.sum(axis=axis), self.total.sum(axis=axis))
 
 
 @dataclass(frozen=True, eq=False)
-class Answered:
-    """Responses in the episodes of policies that came to their end, without the warm-up.
+class SessionResponses:
+    """Responses in the complete episodes of policies, without the warm-up.
 
     Attributes:
-        responses: in the order of time, on the session's clock, with all that the culture was presented between them.
-        episode: which of `returns` each one belongs to, shape (responses,).
-        late_s: by how much its pulses came late, shape (responses,).
+        responses: in order of time, on the session's clock, with everything that was presented between them.
+        episode: index in `returns` of each response's episode, shape (responses,).
+        late_s: lateness of its pulses, shape (responses,).
         moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
-        command: that it moved the robot with, shape (responses,); of several commands each on its own, shape
-            (responses, commands). NaN where it did not move it.
-        returns: of the episodes, in the order of time, shape (episodes,).
+        command: with which it moved the robot, shape (responses,); several commands separately, shape (responses,
+            commands). NaN if it did not move the robot.
+        returns: of the episodes, in order of time, shape (episodes,).
     """
 
     responses: Responses
@@ -64,44 +63,43 @@ class Answered:
     returns: Float64[np.ndarray, " episodes"]
 
     @property
-    def commanded(self) -> Commanded:
-        """Of the responses that moved the robot in each episode, shape (episodes, conditions)."""
+    def commanded(self) -> CommandSums:
+        """Commands of the responses that moved the robot in each episode, shape (episodes, conditions)."""
         shape, moved = (len(self.returns), len(self.responses.conditions)), self.moved
         presented, total = np.zeros(shape, np.int64), np.zeros((*shape, *self.command.shape[1:]))
         at = self.episode[moved], self.responses.condition[moved]
         np.add.at(presented, at, 1)
         np.add.at(total, at, self.command[moved])
-        return Commanded(presented, total)
+        return CommandSums(presented, total)
 
     @property
     def span_min(self) -> float:
-        """From the first response to the last."""
+        """Minutes from the first response to the last."""
         time_s = self.responses.time_s
         return 0.0 if time_s is None or not len(time_s) else float(time_s[-1] - time_s[0]) / 60
 
 
-def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answered:
-    """Read what policies were answered from a session's log.
+def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> SessionResponses:
+    """Read the responses to policies from the log of a session that has ended.
 
     Args:
-        session: that ended.
         policies: their names among the agents.
     """
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
     place = {each.number: row for row, each in enumerate(whole)}
     presented: list[tuple[int, float, bool, float, float]] = []
     acted: list[tuple[int, int, float, float, bool]] = []
-    of_each = loop.decoder.percentiles_shape[:-1]
-    nothing, commands = np.full(of_each, np.nan).tolist(), []
+    shape = loop.decoder.percentiles_shape[:-1]
+    no_command, commands = np.full(shape, np.nan).tolist(), []
     read_hz: list[Sequence[float]] = []
-    for words in session.log.records.words():
-        tick = words.get("tick")
+    for record in session.log.records.words():
+        tick = record.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
         if tick["iteration"] >= 0 and tick["episode"] in place:
             moved = tick["handled"] == "used"
             read_hz.append(tick.get("readout_hz") or [tick["rate_hz"]])
-            commands.append(tick["command"] if moved else nothing)
+            commands.append(tick["command"] if moved else no_command)
             acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved))
         presented.append(
             (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])
@@ -110,14 +108,13 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     episode, at, late_s, active_ratio, moved = _columns(acted, 5)
     at = at.astype(np.int64)
     x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
-    before_s = np.concatenate([[-np.inf], read_s[:-1]])
-    is_rested = first_s - before_s > SILENCE_S
-    every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
+    is_rested = first_s - np.concatenate([[-np.inf], read_s[:-1]]) > SILENCE_S
+    presentations = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
     responses = Responses(
-        condition=every.condition[at],
-        rate_hz=every.rate_hz[at],
+        condition=presentations.condition[at],
+        rate_hz=presentations.rate_hz[at],
         active_ratio=active_ratio,
-        is_burst=every.is_burst[at],
+        is_burst=presentations.is_burst[at],
         conditions=loop.conditions,
         window_ms=loop.window_ms,
         n_channels=len(session.log.header["channels"]["label"]),
@@ -125,18 +122,18 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
         separability=float("nan"),
         presentation=loop.presentation,
         time_s=read_s[at],
-        presented=every,
+        presented=presentations,
         place=at,
         readouts=loop.readouts,
         readout_hz=None if loop.readouts.are_all else x_hz,
     )
     returns = np.array([each.total for each in whole], np.float64)
-    command = np.array(commands, np.float64).reshape(len(acted), *of_each)
-    return Answered(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
+    command = np.array(commands, np.float64).reshape(len(acted), *shape)
+    return SessionResponses(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
 
 
 def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:
-    """Of each episode that came to its end, by its number, what it came to; none of a robot without a goal."""
+    """The outcome of each complete episode, by its number; empty for a robot without a goal."""
     if not isinstance(robot, RobotWithGoal):
         return {}
     observed = {episode.number: [episode.start] for episode in session.episodes if episode.is_whole}

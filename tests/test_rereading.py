@@ -1,4 +1,4 @@
-"""A recording as adaptive thresholds read it: what it takes away, what it leaves, and who predicts with it."""
+"""A recording as adaptive thresholds read it: what this removes, what it keeps, and which predictions use it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from animat.neurons.history import Memory, Ranked
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.simulator import fit_empirical
 from animat.reality_gap import Calibration
-from animat.reality_gap.as_read import as_read
+from animat.reality_gap.rereading import reread
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
@@ -32,11 +32,11 @@ def mixed(rng: np.random.Generator, n: int, rises: np.ndarray | float = 0.0) -> 
 
 
 def read(responses: Responses) -> Responses:
-    return as_read(responses, AdjustedRanks.of(responses, fit_empirical(responses)))
+    return reread(responses, AdjustedRanks.of(responses, fit_empirical(responses)))
 
 
 def in_common(responses: Responses) -> float:
-    """What ranks 10 to 80 trials apart have in common beside their condition: the root of the mean product."""
+    """What ranks 10 to 80 trials apart have in common in addition to their condition: the root of the mean product."""
     rank = np.argsort(np.argsort(responses.rate_hz)) / len(responses)
     for condition in range(5):
         rank[responses.condition == condition] -= rank[responses.condition == condition].mean()
@@ -44,13 +44,13 @@ def in_common(responses: Responses) -> float:
     return float(np.sqrt(max(product, 0.0)))
 
 
-def test_what_rises_and_falls_over_minutes_is_taken_away() -> None:
+def test_changes_over_minutes_are_removed() -> None:
     rng, n = np.random.default_rng(1), 5_000
     rising = mixed(rng, n, np.sin(2 * np.pi * np.arange(n) / 400))
     left = read(rising)
     assert in_common(rising) > 0.1
     assert in_common(left) < 0.05
-    # Responses of a condition are less alike by that, and conditions differ as they did.
+    # The responses of a condition spread less by that, and conditions differ as before.
     for condition in range(5):
         was, now = (np.std(np.log(each.rates_of(condition))) for each in (rising, left))
         assert now < 0.92 * was
@@ -62,7 +62,7 @@ def test_what_rises_and_falls_over_minutes_is_taken_away() -> None:
 def test_independent_responses_stay_nearly_as_they_are() -> None:
     independent = mixed(np.random.default_rng(2), 5_000)
     left = read(independent)
-    # Thresholds of so few of the latest responses err by chance: 1 / sqrt(45) of a standard deviation.
+    # Thresholds from so few of the latest responses have a random error: 1 / sqrt(45) of a standard deviation.
     assert spearmanr(independent.rate_hz, left.rate_hz).statistic > 0.975
     assert np.corrcoef(np.log(independent.rate_hz), np.log(left.rate_hz))[0, 1] > 0.97
 
@@ -72,7 +72,7 @@ def test_each_response_is_at_the_rank_that_it_has_for_the_thresholds_before_it()
     with FakeCulture() as culture:
         recorded = extract_responses(culture.record(PROTOCOL, 0), burst_threshold=0.95)
     adjusted = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY))
-    left, ranked = as_read(recorded, adjusted), Ranked(recorded)
+    left, ranked = reread(recorded, adjusted), Ranked(recorded)
     history = np.stack([ranked.traces(MEMORY), ranked.loads(MEMORY.load_s).at], axis=1)
     explained, everything = history @ adjusted.slopes[:, 0], np.sort(np.concatenate(adjusted.responses_hz))
     answered: list[Answered] = []
@@ -105,7 +105,7 @@ def test_of_readouts_each_is_read_by_its_own_and_bursts_move_nothing() -> None:
     np.testing.assert_array_equal(read(bursts).rate_hz[~is_burst], read(far).rate_hz[~is_burst])
 
 
-def test_who_predicts_with_it() -> None:
+def test_which_predictions_use_it() -> None:
     rng = np.random.default_rng(5)
     responses = replace(mixed(rng, 1_000, np.sin(np.arange(1_000) / 60)), presentation=Presentation("mixed", 1))
     adaptive, fixed = (Calibration.of_series([responses], adaptive=each, kind="empirical") for each in (True, False))
@@ -131,7 +131,7 @@ def test_what_policies_see_of_the_neurons_is_remembered_as_the_loop_has_it(monke
         0, [recorded], Cartpole(), weights=weights, scales=np.ones(6, np.float32), neural_observation=True
     )
     blind, sees = (Calibration.of_series([recorded], policy, kind="memory") for policy in (None, seeing))
-    # The policy's trace in the loop is made with the memory of the recording, whatever is found in what is read.
+    # The policy's trace in the loop is computed with the memory of the recording, not of the reread responses.
     for each, wanted in ((blind, other), (sees, MEMORY)):
         assert isinstance(each.simulator, MemorySimulator)
         assert each.simulator.memory == pytest.approx(wanted)

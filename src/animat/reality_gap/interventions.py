@@ -1,4 +1,4 @@
-"""Whose work is it, in closed loop: what the policies' measured return becomes without the culture, or against it."""
+"""Whose work is it, in closed loop: the policies' return with something in place of the culture."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.reality_gap.row import Row, resampled_means
 from animat.records import as_json
 
-REPLACED = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
-"""Those that were measured, in their order."""
+MEASURED = ("random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched")
+"""Interventions that are measured, in the order of the table."""
 EPISODES = 100
-"""Of each policy on the simulator, with an ideal actuator, and to know when an episode is half over."""
+"""Episodes of each policy on the simulator, with an ideal actuator and for the median length of an episode."""
 
 
 @dataclass(frozen=True)
-class Replaced:
-    """One line: the same policies with something in the culture's place.
+class Intervention:
+    """The same policies with something in place of the culture.
 
     Attributes:
-        name, meaning: what.
-        is_measured: whether in closed loop on the culture; else on its simulator.
-        lost: how much less that is than the policies' measured return, with its interval over episodes.
+        name, meaning: of the intervention.
+        is_measured: whether in closed loop on the culture, or on its simulator.
+        lost: loss against the policies' measured return, with its interval over episodes.
     """
 
     name: str
@@ -46,63 +46,62 @@ class Replaced:
 
 
 def half_an_episode(policies: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int) -> int:
-    """Half of the median episode of policies on the simulator, in iterations; one at least."""
+    """Half of the policies' median episode on the simulator, in iterations; at least one."""
     ran = roll_out(environment, simulator, policies.actor, policies.n_actors, episodes=EPISODES, seed=seed)
     return max(1, int(np.median(ran.lengths)) // 2)
 
 
-def with_ideal_actuator(
+def run_ideal_actuator(
     ideal: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int
 ) -> tuple[str, Float64[np.ndarray, " episodes"]]:
-    """What an ideal actuator is, and returns of policies that have one in the culture's place."""
+    """The meaning of an ideal actuator, and returns of policies with one in place of the culture."""
     within = ideal.within(environment, simulator)
     ran = roll_out(*within, ideal.actor, ideal.n_actors, episodes=EPISODES, seed=seed)
     return ideal.meaning, np.asarray(ran.returns, np.float64).ravel()
 
 
-def replaced(
+def intervention_table(
     rows: Sequence[Row], meaning_of_ideal: str, with_ideal: Float64[np.ndarray, " episodes"]
-) -> tuple[Replaced, ...]:
-    """The table: its simulator, an ideal actuator, then what was measured; none where no policy came to an end.
+) -> tuple[Intervention, ...]:
+    """The table: the simulator, an ideal actuator, then the measured interventions; empty without complete episodes.
 
     Args:
         rows: of the session's table, the policies first.
-        meaning_of_ideal, with_ideal: as of `with_ideal_actuator`.
+        meaning_of_ideal, with_ideal: as returned by `run_ideal_actuator`.
     """
-    policies = rows[0]
-    if not len(policies.measured):
+    usual_returns = rows[0].measured
+    if not len(usual_returns):
         return ()
     by_name = {row.name: row for row in rows}
-    found = [
-        Replaced("its simulator", "as predicted", False, float(policies.predicted.mean()), policies.gap),
-        Replaced(
-            "ideal actuator", meaning_of_ideal, False, float(with_ideal.mean()), _lost(policies.measured, with_ideal)
-        ),
+    lost = _lost(usual_returns, with_ideal)
+    table = [
+        Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
+        Intervention("ideal actuator", meaning_of_ideal, False, float(with_ideal.mean()), lost),
     ]
-    for name in REPLACED:
+    for name in MEASURED:
         row = by_name.get(name)
         if row is not None and len(row.measured):
-            lost = _lost(policies.measured, row.measured)
-            found.append(Replaced(name, row.meaning, True, float(row.measured.mean()), lost))
-    return tuple(found)
+            lost = _lost(usual_returns, row.measured)
+            table.append(Intervention(name, row.meaning, True, float(row.measured.mean()), lost))
+    return tuple(table)
 
 
-def told_replaced(policies: Row, found: Sequence[Replaced]) -> list[str]:
+def intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str]:
     """The table as lines for a terminal."""
     cells = []
-    for each in found:
+    for each in table:
         where = "measured" if each.is_measured else "simulator"
         lost = f"{each.lost.value:.1f}", each.lost.ends
         cells.append([each.name, f"{each.mean_return:.1f}", *lost, where, each.meaning])
-    usual = f"{policies.measured.mean():.1f}"
     return [
-        f"whose work is it: return with the culture replaced, and the loss from the measured {usual}",
+        "whose work is it: return with the culture replaced, and the loss from the measured "
+        f"{policies.measured.mean():.1f}",
         *lined_up(["", "return", "lost", "95 % interval", "", ""], cells),
     ]
 
 
 def _lost(usual: Float64[np.ndarray, " episodes"], changed: Float64[np.ndarray, " others"]) -> Interval:
-    """Difference of means, its percentile interval over episodes drawn anew; infinite ends with fewer than two."""
+    """Difference of means, with its bootstrap percentile interval over episodes; infinite with fewer than two."""
     value = float(usual.mean() - changed.mean())
     if min(len(usual), len(changed)) < 2:
         return Interval(value, -np.inf, np.inf, CONFIDENCE)

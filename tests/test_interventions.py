@@ -1,4 +1,4 @@
-"""Interventions: each against what it must do to a robot whose rewards are known, and the table of all of them."""
+"""Interventions: the known effect of each on a robot whose rewards are known, and the table of all of them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.controls import interventions_of
+from animat.evaluation.interventions import run_interventions
 from animat.evaluation.rollouts import Actor, Networks, roll_out
 from animat.evaluation.traces import trace
-from animat.evaluation.whose_work import whose_work
 from animat.neurons.simulator import indifferent
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Quantity, Robot, Wheels
@@ -32,7 +32,7 @@ class Aimed(NamedTuple):
 
 @dataclass(frozen=True)
 class Aiming(Robot[Aimed]):
-    """A number is sensed, drawn anew in each iteration; its goal is -1 or 1, and the reward goal x sensed x u."""
+    """Senses a number that is drawn in each iteration; its goal is -1 or 1, and the reward goal x sensed x u."""
 
     episode_limit: int = 10
     name = "aiming"
@@ -89,14 +89,14 @@ def test_each_intervention_does_what_it_says() -> None:
     assert abs(usual.mean() - 10 * (means[-1] - means[0]) / 2) < 4 * usual.std() / np.sqrt(2000)
     np.testing.assert_array_equal(returns["ideal actuator"], 10.0)
     np.testing.assert_array_equal(returns["turned round"], -usual)
-    # Without a link between what is chosen and what is done, the goal is met as often as not.
+    # Without a link between choice and command, the goal is met half of the time.
     for name in ("random spikes", "silent", "shuffled", "yoked"):
         assert abs(returns[name].mean()) < 4 * returns[name].std() / np.sqrt(2000), name
-    # Who knows the goal is not bothered by another one.
+    # A policy that knows the goal is not affected by a switch.
     assert abs(returns["goal switched"].mean() - usual.mean()) < 6 * usual.std() / np.sqrt(2000)
 
 
-def test_random_spikes_have_the_rates_of_the_culture_and_do_not_listen() -> None:
+def test_random_spikes_have_the_rates_of_the_culture_and_do_not_depend_on_stimuli() -> None:
     spikes = indifferent(SIMULATOR)
     uniforms = (jnp.arange(4096) + 0.5) / 4096
     conditions = jnp.arange(SIMULATOR.n_conditions)
@@ -115,7 +115,7 @@ def test_yoked_stimuli_are_those_of_the_episode_that_is_observed() -> None:
     other = traced.states.info["other_episode"].robot
     agree = np.asarray(other.goal * other.sensed)[:, :, :-1] > 0
     np.testing.assert_array_equal(traced.actions == 4, agree)
-    # The two episodes have nothing to do with each other.
+    # The two episodes are independent.
     here = np.asarray(traced.states.robot.goal * traced.states.robot.sensed)[:, :, :-1] > 0
     assert 0.4 < (here == agree).mean() < 0.6
 
@@ -135,7 +135,7 @@ def test_the_goal_is_switched_once_and_nothing_else() -> None:
     np.testing.assert_array_equal(goals[..., 3:], goals[..., 3:4].repeat(8, axis=2))
     changed = goals[..., 3] != goals[..., 2]
     assert changed.all()
-    # Whoever knows the goal turns with the first action after it.
+    # A policy that knows the goal changes its choice at the first action after the switch.
     differs = once.actions != usual.actions
     np.testing.assert_array_equal(differs[..., :3], False)
     np.testing.assert_array_equal(differs[..., 3], changed)
@@ -151,31 +151,31 @@ def linear_networks(*weights: np.ndarray) -> Networks:
 
 
 @pytest.mark.oracle
-def test_the_table_tells_a_policy_that_knows_its_goal_from_one_that_does_not() -> None:
+def test_the_table_distinguishes_a_policy_that_knows_its_goal_from_one_that_does_not() -> None:
     towards = np.array([[0.0] * 5, [-1.0, 0.0, 0.0, 0.0, 1.0]])
-    knows = whose_work(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), 2, episodes=50, seed=1)
-    told = {row["name"]: row for row in knows.to_dict()["rows"]}
-    # Of two goals that are equally likely each has its action: 1 bit, whether the culture listens or not.
+    knows = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), 2, episodes=50, seed=1)
+    rows = {row["name"]: row for row in knows.to_dict()["rows"]}
+    # Two equally likely goals, each with its own action: 1 bit, whether stimuli have an effect or not.
     for name in ("as they are", "silent", "shuffled"):
-        assert told[name]["goal_information"]["bits"]["value"] == pytest.approx(1.0, abs=0.05)
+        assert rows[name]["goal_information"]["bits"]["value"] == pytest.approx(1.0, abs=0.05)
     turning = knows.turning
     assert turning is not None and (turning.at, turning.episodes, turning.after) == (5, 64, 1.0)
     assert turning.turned == 1.0
-    blind = whose_work(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), 1, episodes=50, seed=1)
+    blind = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), 1, episodes=50, seed=1)
     information = blind.rows[0].information
     assert information is not None and (information.bits.value, information.p) == (0.0, 1.0)
     assert blind.turning is not None and (blind.turning.turned, blind.turning.after) == (0.0, None)
     text = knows.to_text()
-    assert "of 1.00 bits" in text and "the first time with action 1 after it" in text
+    assert "of 1.00 bits" in text and "first at action 1 after the switch" in text
     usual, turned = (row.returns for row in (knows.rows[0], knows.rows[6]))
     np.testing.assert_allclose(knows.rows[6].lost.value, (usual - turned).mean())
 
 
 @pytest.mark.oracle
-def test_one_goal_alone_and_no_neurons_are_said() -> None:
+def test_a_single_goal_and_missing_neurons_are_reported() -> None:
     falling = linear_networks(np.zeros((4, 5)))
-    made = whose_work(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
+    made = run_interventions(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
     assert made.turning is None and "the robot has only one goal" in made.to_text()
     assert [row.name for row in made.rows][-1] == "turned round"
     with pytest.raises(InvalidArgument, match="expected policies that act through neurons"):
-        whose_work(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)
+        run_interventions(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)
