@@ -11,7 +11,7 @@ import h5py
 import pytest
 
 from animat.errors import InvalidFile
-from animat.recordings import apart
+from animat.recordings import hdf5_subprocess
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from damaging import KINDS
 from synthetic_recordings import synthetic_recording
@@ -41,7 +41,7 @@ def damage(kind: str, seed: int, count: int, folder: Path) -> None:
     print(done.stdout)
 
 
-# One library reads those of HDF5, in another process, whose crashes have tests of their own (`test_reading_apart`).
+# One library reads those of HDF5, in another process, whose crashes have tests of their own (`test_hdf5_subprocess`).
 HDF5 = ("nwb", "other-nwb", "maxwell", "old-maxwell", "cl1")
 
 
@@ -71,6 +71,6 @@ def test_a_part_that_is_damaged_is_not_taken_for_one_that_is_missing(where: str,
 
 @pytest.mark.oracle
 def test_a_reader_that_is_not_ready_in_time_does_not_blame_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "START_S", 0.0)
+    monkeypatch.setattr(hdf5_subprocess, "START_S", 0.0)
     with pytest.raises(InvalidFile, match=r"not ready after 0 s, is the machine busy\?"):
-        apart._start()
+        hdf5_subprocess._start()

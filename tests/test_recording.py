@@ -10,7 +10,7 @@ import pytest
 
 from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding, merged
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.recordings.told import from_words, in_words
 from animat.stimulation.protocol import PAPER, Presentation
@@ -145,7 +145,7 @@ def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
     assert from_words({"source": "CL1 (device)", "pattern_seed": "none: they were given"})["culture"] is None
     with pytest.raises(InvalidArgument, match="protocol: expected JSON"):
         from_words({"protocol": "mixed"})
-    found = noticed(recording(findings=noted))
+    found = recording_findings(recording(findings=noted))
     assert [(f.name, f.severity, f.message) for f in found[:2]] == [
         ("a-thing", "warning", "something: odd"),
         ("another", "note", "less odd"),
@@ -160,8 +160,8 @@ def test_two_findings_of_one_name_are_both_kept() -> None:
 
 def test_what_is_seen_in_the_data_is_said() -> None:
     silent = recording(spike_times_s=[], spike_channels=[], stimuli=Stimuli([], [], [], np.empty((0, 1)), []))
-    assert {f.name: f.severity for f in noticed(silent)} == {"no-stimuli": "refuse", "no-spikes": "refuse"}
+    assert {f.name: f.severity for f in recording_findings(silent)} == {"no-stimuli": "refuse", "no-spikes": "refuse"}
     electrodes = np.full((2, 2), UNKNOWN)
     partly = recording(spike_channels=[0, 0, 0], stimuli=stimuli(electrodes=electrodes))
-    found = {f.name: f.value for f in noticed(partly)}
+    found = {f.name: f.value for f in recording_findings(partly)}
     assert found == {"silent-channels": 2.0, "stimulus-electrodes-unknown": 2.0, "presentation-unknown": None}

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as npst
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_recordings, read_source
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
@@ -35,7 +35,7 @@ def npz(folder: Path, **arrays: Any) -> Path:
 
 
 def names(recording: Recording) -> set[str]:
-    return {finding.name for finding in noticed(recording)}
+    return {finding.name for finding in recording_findings(recording)}
 
 
 # --- NPZ -------------------------------------------------------------------------------------------------------------
@@ -376,7 +376,7 @@ def test_csv_may_be_gzipped_and_have_a_byte_order_mark_and_windows_lines(tmp_pat
 def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
     recording = read_recording(csv(tmp_path, "time,channel\n0.5,1\n"))
     assert len(recording.stimuli) == 0
-    refusal = next(finding for finding in noticed(recording) if finding.name == "no-stimuli")
+    refusal = next(finding for finding in recording_findings(recording) if finding.name == "no-stimuli")
     assert refusal.severity == "refuse"
     assert "1 spikes but no stimuli" in refusal.message
     assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.message

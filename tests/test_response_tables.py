@@ -10,7 +10,7 @@ import pytest
 
 from animat.cli import main
 from animat.errors import AnimatError, InvalidFile
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_source, read_sources
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -110,7 +110,7 @@ def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
     assert responses.active_ratio.tolist() == [0.5, 0.0, 1.0]
     assert responses.time_s is None and not responses.presentations[0].is_rested.any()
     assert "window-assumed" in {f.name for f in responses.findings}
-    assert "stimulus-times-unknown" in {f.name for f in noticed(table)}
+    assert "stimulus-times-unknown" in {f.name for f in recording_findings(table)}
     text = inspection_text(inspect_recording(table, ByPattern()))
     assert "2.00 spikes in 2-10 ms per stimulus\n" in text
     assert "6 spikes on 2 channels, from 0 min" in text
@@ -119,7 +119,7 @@ def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
 def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
     def warned(frequency_hz: list[float]) -> list[str]:
         np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_frequency_hz=frequency_hz)
-        return [f.message for f in noticed(table_of(tmp_path / "a.npz")) if f.name == "other-frequencies"]
+        return [f.message for f in recording_findings(table_of(tmp_path / "a.npz")) if f.name == "other-frequencies"]
 
     assert warned([0.2, 0.05, 0.0125]) == [
         "all frequencies are below 1 Hz, 0.0125 to 0.2: if they are periods in seconds, write 1 divided by each, "

@@ -13,7 +13,7 @@ import pytest
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
@@ -33,7 +33,7 @@ TABLE = mapping_table([3, 9, 40], [1000, 2000, 26_399])
 
 
 def found(recording: Recording) -> dict[str, str]:
-    return {finding.name: finding.message for finding in noticed(recording)}
+    return {finding.name: finding.message for finding in recording_findings(recording)}
 
 
 def said(frequency: float, presentation: int) -> str:
@@ -414,7 +414,7 @@ def test_an_index_of_a_cl1_that_repeats_itself_tells_nothing_from_there_on(tmp_p
 
 def test_tables_that_may_be_stimuli_are_named_where_none_speaks_of_them(tmp_path: Path) -> None:
     path = write_trials(tmp_path / "a.nwb", None)
-    found = {f.name: f for f in noticed(read_recording(path))}
+    found = {f.name: f for f in recording_findings(read_recording(path))}
     listed = found["stimuli-elsewhere"].message
     assert found["no-stimuli"].severity == "refuse" and "intervals/sweeps" in listed and "--stimuli" in listed
     assert read_recording(path, stimuli="sweeps").stimuli.time_s.tolist() == pytest.approx([0.0, 0.2, 0.4])

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from skimage.filters import threshold_otsu
 
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
@@ -71,7 +71,7 @@ def test_the_protocol_is_the_papers() -> None:
     xy_um = np.column_stack([used % 220, used // 220]) * 17.5
     distance_um = np.linalg.norm(xy_um[:, None] - xy_um[None], axis=-1)[~np.eye(32, dtype=bool)]
     assert distance_um.min() > 100
-    assert noticed(recording) == ()
+    assert recording_findings(recording) == ()
 
 
 def test_spikes_outside_the_window_come_at_the_background_rate() -> None:

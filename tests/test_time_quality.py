@@ -14,7 +14,7 @@ from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import UnusableData
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.series import extract_series
@@ -46,7 +46,7 @@ def without_frequencies(source: Recording) -> Recording:
 
 
 def said(source: Recording) -> str | None:
-    return next((f.message for f in noticed(source) if f.name == "times-not-in-seconds"), None)
+    return next((f.message for f in recording_findings(source) if f.name == "times-not-in-seconds"), None)
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -99,7 +99,7 @@ def test_trains_back_to_back_a_row_each_are_never_refused(frequencies: list[floa
     stimulus_s = 1 + np.cumsum([0.0, *(pulses / frequency_hz[:-1])])
     spikes = [(t + 0.005, 0) for t in stimulus_s]
     source = of_spikes(spikes, stimulus_s, 4, stimulus_s[-1] + 60, frequency_hz=frequency_hz)
-    assert {f.severity for f in noticed(source) if f.name == "times-not-in-seconds"} <= {"warning"}
+    assert {f.severity for f in recording_findings(source) if f.name == "times-not-in-seconds"} <= {"warning"}
 
 
 def test_trains_back_to_back_are_asked_about() -> None:
@@ -169,29 +169,29 @@ def test_training_on_milliseconds_is_refused_unless_allowed(tmp_path: Path, caps
 
 def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
     source = answering({5.0: 3.0, 80.0: 6.0})
-    assert not {"more-stimuli-than-spikes", "simultaneous-stimuli"} & {f.name for f in noticed(source)}
+    assert not {"more-stimuli-than-spikes", "simultaneous-stimuli"} & {f.name for f in recording_findings(source)}
     few, many = source.stimuli.time_s[:20], np.linspace(0.1, source.duration_s, 200)
     swapped = of_spikes([(t, 0) for t in few], many, 1, source.duration_s)
-    names = {f.name: f for f in noticed(swapped)}
+    names = {f.name: f for f in recording_findings(swapped)}
     assert names["more-stimuli-than-spikes"].severity == "refuse"
     assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].message
     # One unit, of which 70 % of the stimuli have one spike.
     sparse = of_spikes([(t + 0.005, 0) for t in many[:140]], many, 1, source.duration_s + 1)
-    assert {f.severity for f in noticed(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
+    assert {f.severity for f in recording_findings(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
     twice = np.repeat(source.stimuli.time_s, 2)
     spikes = list(zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True))
-    names = {f.name: f for f in noticed(of_spikes(spikes, twice, 40, source.duration_s))}
+    names = {f.name: f for f in recording_findings(of_spikes(spikes, twice, 40, source.duration_s))}
     assert names["simultaneous-stimuli"].message.startswith("120 of 240 stimuli")
     assert names["simultaneous-stimuli"].severity == "refuse"
     # Rows that belong to one presentation are read once.
     one = of_spikes(spikes, twice, 40, source.duration_s, presentation=np.repeat(np.arange(120), 2).tolist())
-    assert "simultaneous-stimuli" not in {f.name for f in noticed(one)}
+    assert "simultaneous-stimuli" not in {f.name for f in recording_findings(one)}
 
 
 def contradicted(stated_hz: np.ndarray) -> str | None:
     source = synthetic_recording(1, start_min=0.0, patterns=25, channels=16)
     stimuli = dataclasses.replace(source.stimuli, frequency_hz=stated_hz[: len(source.stimuli)])
-    found = noticed(dataclasses.replace(source, stimuli=stimuli))
+    found = recording_findings(dataclasses.replace(source, stimuli=stimuli))
     return next((f.message for f in found if f.name == "other-frequencies"), None)
 
 

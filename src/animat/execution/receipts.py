@@ -85,9 +85,9 @@ def digest_of(path: Path) -> str:
     """
     if path.suffix != ".nwb":
         return sha256(path)
-    from animat.recordings.apart import read_hdf5_apart
+    from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 
-    return hashlib.sha256(_packed(read_hdf5_apart(path))).hexdigest()
+    return hashlib.sha256(_packed(read_hdf5_in_subprocess(path))).hexdigest()
 
 
 def _packed(recording: Recording) -> bytes:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
-from animat.recordings.empty_stretches import late_start
 from animat.recordings.findings import Finding, merged
+from animat.recordings.gaps import late_start
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Order, Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli

@@ -13,17 +13,17 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.plain_file import expect_plain_file, is_folder, is_nothing
-from animat.recordings.apart import read_hdf5_apart
 from animat.recordings.columns import started_at
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
 from animat.recordings.formats.npz import read_npz
-from animat.recordings.formats.responses_plain import (
+from animat.recordings.formats.response_files import (
     is_response_csv,
     is_response_npz,
     read_response_csv,
     read_response_npz,
 )
+from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 
@@ -67,7 +67,7 @@ def read_recording(
 
     Returns:
         The recording, sorted and checked; what was noticed on the way is in its provenance (see
-        `animat.recordings.noticed`).
+        `animat.recordings.quality`).
 
     Raises:
         InvalidFile: naming the file, what was expected and what came.
@@ -119,7 +119,7 @@ def _read(
         raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
         if magic.startswith(HDF5):
-            return read_hdf5_apart(path, part=part, stimuli=stimuli)
+            return read_hdf5_in_subprocess(path, part=part, stimuli=stimuli)
         if read_table := _response_reader(path, magic):
             return read_table(path)
         if magic.startswith(ZIP):

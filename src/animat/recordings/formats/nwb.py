@@ -22,6 +22,7 @@ from jaxtyping import Float64, Int64
 
 from animat.compilation import pynwb_importable
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.recordings.formats.foreign_nwb import ragged, read_foreign_nwb
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.nwb_layout import (
     ELECTRODES_TABLE,
@@ -31,7 +32,6 @@ from animat.recordings.formats.nwb_layout import (
     STIMULI_TABLE,
     UNITS_TABLE,
 )
-from animat.recordings.formats.nwb_of_others import ragged, read_other_nwb
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.recording import Channels, Recording
 from animat.recordings.told import from_words
@@ -165,7 +165,7 @@ def _read(file: Hdf5File, stimuli: str | None) -> Recording:
     if not is_nwb(file):
         raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
     if not file.has(RECORDING_TABLE):
-        return read_other_nwb(file, stimuli)
+        return read_foreign_nwb(file, stimuli)
     if stimuli is not None:
         raise InvalidFile(f"{path}: expected no choice of stimuli for a file of animat's own, got {stimuli!r}")
     version = _cell(file, "format_version", int)

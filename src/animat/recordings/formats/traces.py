@@ -15,10 +15,10 @@ from jaxtyping import Float32, Int64
 
 from animat.errors import InvalidFile
 from animat.recordings.formats.cl1 import read_cl1
+from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, unavailable_filters
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
-from animat.recordings.formats.nwb_of_others import read_other_nwb
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 from animat.tables import UNKNOWN
@@ -55,7 +55,7 @@ def open_traces(
         base = read_cl1(path, spikes=False)
     else:
         with hdf5_file(path, "NWB recording") as file:
-            base = read_other_nwb(file, stimuli, spikes=False)
+            base = read_foreign_nwb(file, stimuli, spikes=False)
     with hdf5_file(path, "file of raw traces") as file:
         if found == "MaxWell":
             traces = _maxwell(file, part, base)

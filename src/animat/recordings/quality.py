@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from animat.recordings.empty_stretches import silences
 from animat.recordings.findings import Finding
+from animat.recordings.gaps import silences
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import frequency_findings, time_findings
@@ -18,7 +18,7 @@ STIMULI_A_SPIKE = 10.0
 """From here on, spikes and stimuli must be swapped: a culture that answers so seldom teaches nothing."""
 
 
-def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
+def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
     """All findings about a recording: those noted when its file was read, then those seen in its data.
 
     Of a table of responses, which has no spikes to look at, the former and its frequencies (`other-frequencies`).

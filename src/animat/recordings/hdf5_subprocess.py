@@ -33,7 +33,7 @@ _lock = threading.Lock()
 _reader: Process | None = None
 
 
-def read_hdf5_apart(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
+def read_hdf5_in_subprocess(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
     """Read a recording as `animat.recordings.formats.hdf5_formats.read_hdf5` does, in the process kept for it.
 
     Raises:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from animat.cli import main
 from animat.errors import AnimatError
 from animat.recordings.columns import PlainColumns
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.inspection import inspect_recording
@@ -29,7 +29,7 @@ def spikes_csv(folder: Path, from_s: float, n: int = 20_000, length_s: float = 6
 
 
 def said(source: Recording) -> dict[str, str]:
-    return {finding.name: finding.message for finding in noticed(source)}
+    return {finding.name: finding.message for finding in recording_findings(source)}
 
 
 @pytest.mark.parametrize("from_s", [3600.0, 1.7e9])
@@ -38,7 +38,7 @@ def test_a_clock_that_does_not_begin_at_0_is_warned_of_and_its_start_can_be_give
 ) -> None:
     path = spikes_csv(tmp_path, from_s)
     source = read_recording(path)
-    finding = next(f for f in noticed(source) if f.name == "start-unknown")
+    finding = next(f for f in recording_findings(source) if f.name == "start-unknown")
     assert finding.severity == "warning" and "animat convert --start-s" in finding.message
     assert f"the first event is at {source.spike_times_s[0]:.12g} s" in finding.message
     told = read_recording(path, start_s=from_s)
@@ -94,10 +94,10 @@ def poisson(silent_s: list[tuple[float, float]], duration_s: float = 1000.0) -> 
 
 def test_silences_are_told_where_they_are() -> None:
     assert "silence" not in said(poisson([]))
-    finding = next(f for f in noticed(poisson([(400, 600)])) if f.name == "silence")
+    finding = next(f for f in recording_findings(poisson([(400, 600)])) if f.name == "silence")
     assert finding.severity == "warning" and finding.value == pytest.approx(200, abs=0.1)
     assert finding.message.startswith("no spike on any channel from 399.9") and "to 600.0" in finding.message
-    two = next(f for f in noticed(poisson([(100, 130), (900, 1000)])) if f.name == "silence")
+    two = next(f for f in recording_findings(poisson([(100, 130), (900, 1000)])) if f.name == "silence")
     assert two.value == pytest.approx(130, abs=0.1) and ", from 899.9" in two.message
     # Less than a hundredth of the recording changes no rate by much.
     assert "silence" not in said(poisson([(400, 405)]))

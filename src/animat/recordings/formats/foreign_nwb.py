@@ -31,7 +31,7 @@ ELECTRODE_LABELS = ("label", "channel_name", "electrode_name")
 TEXTS = ("experiment_description", "session_description", "institution", "lab")
 
 
-def read_other_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
+def read_foreign_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
     """Read a recording that another program wrote.
 
     Args:
