@@ -58,7 +58,7 @@ def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
         ({"recording": [1.5]}, "selection.recording: expected a whole number, got 1.5"),
         ({"recording": [10**30]}, "selection.recording: expected at most"),
         ({"recording": {}}, "selection.recording: expected a list"),
-        ({"patterns": [[1], [1, 2]]}, "selection.patterns: expected as many electrodes in each"),
+        ({"patterns": [[1], [1, 2]]}, "selection.patterns: expected the same number of electrodes in each"),
         ({"rule": {"spacing_um": "a"}}, "selection.rule.spacing_um: expected a number"),
         ({"seed": 1.5}, "expected a whole number, got 1.5"),
     ],
