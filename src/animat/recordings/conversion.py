@@ -220,10 +220,10 @@ def _with_spikes_of(
     Args:
         base: channels (those of the traces), stimuli, span and provenance.
     """
-    from animat.recordings.detection.finding_spikes import find_spikes
+    from animat.recordings.detection.spikes import detect_spikes
 
     settings = settings or Detection()
-    found = find_spikes(traces, base.stimuli.time_s, settings, progress=progress)
+    found = detect_spikes(traces, base.stimuli.time_s, settings, progress=progress)
     band = "as recorded" if settings.band_hz is None else f"{settings.band_hz[0]:g}-{settings.band_hz[1]:g} Hz"
     how = (
         f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, blanked "

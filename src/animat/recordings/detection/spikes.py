@@ -29,7 +29,7 @@ MUCH_LOST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class FoundSpikes:
+class DetectedSpikes:
     """Spikes that were found, in the order of time.
 
     Attributes:
@@ -44,14 +44,14 @@ class FoundSpikes:
     findings: tuple[Finding, ...]
 
 
-def find_spikes(
+def detect_spikes(
     traces: RawTraces,
     stimulus_time_s: Float64[np.ndarray, " stimuli"] | None = None,
     settings: Detection | None = None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> FoundSpikes:
+) -> DetectedSpikes:
     """Find spikes in raw traces.
 
     A spike is a negative peak of the band-passed trace deeper than `threshold` standard deviations of its channel's
@@ -76,7 +76,7 @@ def find_spikes(
     noise_uv = _noise_uv(traces, stimulus, settings, workers)
     sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, settings, workers, progress)
     order = np.lexsort((channel, sample))
-    return FoundSpikes(
+    return DetectedSpikes(
         time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
