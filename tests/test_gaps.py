@@ -44,7 +44,7 @@ def test_a_clock_that_does_not_begin_at_0_is_warned_of_and_its_start_can_be_give
     told = read_recording(path, start_s=from_s)
     assert not {"start-unknown", "silence", "times-not-in-seconds"} & set(said(told))
     assert (told.start_s, told.stop_s) == (from_s, source.stop_s)
-    assert said(told)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, in place of 0 s"
+    assert said(told)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, instead of 0 s"
     assert "start-given" not in said(read_recording(path, start_s=0.0))
     inspection = inspect_recording(told)
     # 20,000 spikes on 30 channels in 600 s, independent of each other.
@@ -131,10 +131,10 @@ def test_trials_that_nobody_numbered_are_trials_each_and_several_frequencies_are
     assert said(unknown)["trials-unknown"].startswith("50 of 50 stimuli name no trial (-1)")
     some = trials(stimulus_presentation=np.r_[np.full(20, -1), np.repeat(np.arange(15), 2)])
     assert np.count_nonzero(some.stimuli.is_last_of_presentation) == 35
-    with pytest.raises(AnimatError, match="expected numbers that do not fall"):
+    with pytest.raises(AnimatError, match="expected numbers that never fall over time"):
         trials(stimulus_presentation=np.r_[np.full(20, -1), np.arange(30)[::-1]])
     frequency_hz = np.tile([5.0, 10.0], 25)
     mixed = trials(stimulus_presentation=np.repeat([0, 1], 25), stimulus_frequency_hz=frequency_hz)
-    assert said(mixed)["trials-of-several-frequencies"].startswith("2 of 2 trials hold pulses of several frequencies")
+    assert said(mixed)["trials-of-several-frequencies"].startswith("2 of 2 trials have pulses of several frequencies")
     alike = trials(stimulus_presentation=np.repeat([0, 1], 25), stimulus_frequency_hz=np.repeat([5.0, 10.0], 25))
     assert "trials-of-several-frequencies" not in said(alike)

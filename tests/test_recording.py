@@ -57,7 +57,7 @@ def recording(**changes: Any) -> Recording:
         ({"duration_s": 1.0}, r"spike_times_s: expected times within the recording \(-1 to 0 s\)"),
         ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
         ({"start_s": np.nan}, "start_s, duration_s: expected finite seconds"),
-        ({"start_min": np.nan}, "start_min: expected finite minutes, within a century, got nan"),
+        ({"start_min": np.nan}, "start_min: expected finite minutes within a century, got nan"),
         ({"sampling_rate_hz": 0.0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, or NaN"),
     ],
 )
@@ -76,7 +76,7 @@ def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: st
         ),
         ({"frequency_hz": [0.0, 5.0]}, "expected positive frequencies"),
         ({"electrodes": [1, 2]}, r"stimuli.electrodes: expected shape \(stimuli, electrodes\)"),
-        ({"presentation": [1, 0]}, "stimuli.presentation: expected numbers that do not fall"),
+        ({"presentation": [1, 0]}, "stimuli.presentation: expected numbers that never fall over time"),
         ({"pattern": [1]}, "pattern: expected 2 values"),
     ],
 )

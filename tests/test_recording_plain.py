@@ -75,9 +75,9 @@ def test_spikes_out_of_order_are_those_with_a_later_one_anywhere_before_them(tim
         ({"stimulus_time_s": np.array([0.0, -1e300])}, "stimulus_time_s: expected times in seconds, within a century"),
         ({"sampling_rate_hz": 1e300}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz"),
         ({"stimulus_frequency_hz": np.array([1e300, 1])}, "frequency_hz: expected positive frequencies up to 1e.09 Hz"),
-        ({"start_min": -1e300}, "start_min: expected finite minutes, within a century, got -1e.300"),
-        ({"start_s": -1e300}, "start_s, duration_s: expected finite seconds, within a century, got -1e.300"),
-        ({"duration_s": 1e300}, "start_s, duration_s: expected finite seconds, within a century, got -0.25 and 1e.300"),
+        ({"start_min": -1e300}, "start_min: expected finite minutes within a century, got -1e.300"),
+        ({"start_s": -1e300}, "start_s, duration_s: expected finite seconds within a century, got -1e.300"),
+        ({"duration_s": 1e300}, "start_s, duration_s: expected finite seconds within a century, got -0.25 and 1e.300"),
         # Each of many rows would have room for it.
         ({"channel_label": np.array(["3", "x" * 1001])}, "channel_label: expected names of at most 1,000 characters"),
         ({"spike_channel": np.array(["3", "x" * 1001, "3"])}, "spike_channel: expected names of at most 1,000"),
@@ -228,7 +228,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "two lengths": (
         {"spike_channel": np.zeros(2)},
-        r"spike_channel: expected one channel a spike, shape \(3,\), got \(2,\)",
+        r"spike_channel: expected one channel per spike, shape \(3,\), got \(2,\)",
     ),
     "unknown label": (
         {"channel_label": np.array([3, 4])},
@@ -261,9 +261,9 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an electrode below 0": (
         {"stimulus_electrodes": np.array([[3, -1], [-7, -1]])},
-        "stimulus_electrodes: expected numbers of electrodes, .* got -7",
+        "stimulus_electrodes: expected electrode numbers, .* got -7",
     ),
-    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: expected, to know which 5"),
+    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: required to know which 5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
@@ -271,7 +271,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     "no rate": ({"sampling_rate_hz": 0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, .*got 0"),
     "start that is not finite": (
         {"start_min": np.nan},
-        "start_min: expected finite minutes, within a century, got nan",
+        "start_min: expected finite minutes within a century, got nan",
     ),
     "duration too short": ({"duration_s": 1.0}, "expected times within the recording"),
     "negative duration": ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
@@ -507,8 +507,8 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
         "none.nwb": "no such file",
         "a.npy": "expected NPZ .* got NPY",
         "empty.nwb": "got an empty file",
-        "b.nwb": "expected HDF5 in a file of this name, got something else",
-        "b.bin": "expected a recording .NWB, MaxWell, CL1, NPZ or CSV., got a file of another kind",
+        "b.nwb": "expected HDF5 in a file with this name, got something else",
+        "b.bin": "expected a recording .NWB, MaxWell, CL1, NPZ or CSV., got an unknown kind of file",
         **{f"p{protocol}.pkl": "got a Python pickle, which is never read.*numpy.savez" for protocol in range(2, 6)},
         "latin.csv": "expected CSV .text in UTF-8., .* save it as CSV in UTF-8",
         "sheet.csv": "got text in UTF-16; save it as CSV in UTF-8",

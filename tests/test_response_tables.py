@@ -132,7 +132,7 @@ def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
 def test_only_what_needs_spikes_refuses_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
     assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1
-    assert "got a table of responses, which animat inspect, train and evaluate read" in capsys.readouterr().err
+    assert "got a response table, which only animat inspect, train and evaluate read" in capsys.readouterr().err
     with pytest.raises(InvalidFile, match="this needs the times of spikes"):
         read_recording(tmp_path / "a.npz")
     (tmp_path / "b_responses.csv.gz").write_bytes(gzip.compress(b"count_1,start_min\n3,5\n"))
@@ -143,7 +143,7 @@ BAD = {
     "a negative count": ("count_1\n-2\n", "expected counts of 0 or more, got -2 for stimulus 1 on channel 1"),
     "a part of a spike": (
         "count_1\n0.5\n",
-        "whole, got 0.5 for stimulus 1 on channel 1; rates in Hz are called rate_hz",
+        "whole, got 0.5 for stimulus 1 on channel 1; if these are rates in Hz, name them rate_hz",
     ),
     "counts and rates": ("count_1,rate_hz_2\n1,2\n", "line 1: expected a column count_CHANNEL or rate_hz_.* got both"),
     "an empty count": ("count_1,count_2\n1,2\n1,\n", "line 3: count_2: expected a finite number, got an empty field"),

@@ -199,7 +199,7 @@ def test_frequencies_of_other_stimuli_are_warned_of() -> None:
     true_hz = synthetic_recording(1, start_min=0.0, patterns=25, channels=16).stimuli.frequency_hz
     assert contradicted(true_hz) is None
     swapped = np.select([true_hz == 5, true_hz == 80], [80.0, 5.0], true_hz)
-    assert "said to come at 5 Hz are 0.0125 s apart (median), not 0.2 s" in str(contradicted(swapped))
+    assert "with a stated frequency of 5 Hz are 0.0125 s apart (median), not 0.2 s" in str(contradicted(swapped))
     # Periods in place of frequencies.
     periods_s = str(contradicted(1 / true_hz))
     assert periods_s.endswith(": these are periods in seconds: write 1 divided by each, here 80")
