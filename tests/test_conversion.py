@@ -130,7 +130,7 @@ def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pyte
 
 @pytest.mark.parametrize("age", ["P42D", "P6W", "P1Y2M3DT4H", "P2.5W", "PT36H", "P20D/P22D", "P90Y/"])
 def test_an_age_is_a_duration(age: str) -> None:
-    assert Origin(subject_id="c", age=age).words()["age"] == age
+    assert Origin(subject_id="c", age=age).to_provenance()["age"] == age
 
 
 @pytest.mark.parametrize(
@@ -180,14 +180,14 @@ def test_text_under_the_name_of_hdf5_is_said_to_be_that(tmp_path: Path, capsys: 
 def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
     path = rig_file("maxwell", tmp_path)
     before = path.read_bytes()
-    with pytest.raises(InvalidArgument, match="--out: expected a name that is not taken"):
+    with pytest.raises(InvalidArgument, match="--out: expected a new file, got"):
         convert_recording(path, path)
     assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["x.csv", "x", "x.nwb.gz"])
 def test_what_is_written_is_called_nwb(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidArgument, match=r"^--out: expected a name that ends in \.nwb, as NWB is written, got "):
+    with pytest.raises(InvalidArgument, match=r"^--out: expected a name ending in \.nwb, as NWB is written, got "):
         convert_recording(rig_file("npz", tmp_path), tmp_path / name)
     assert not (tmp_path / name).exists()
 
@@ -271,14 +271,14 @@ def test_a_range_of_ages_begins_with_the_younger(age: str, fits: bool) -> None:
     if fits:
         assert Origin(age=age).age == age
     else:
-        with pytest.raises(InvalidArgument, match="age: expected a range from the younger to the older"):
+        with pytest.raises(InvalidArgument, match="age: expected a range with the younger age first"):
             Origin(age=age)
 
 
 @pytest.mark.parametrize("who", ["Jane Doe", "Doe, Jane; Max", ""])
 def test_an_experimenter_is_last_first(who: str) -> None:
     assert Origin(experimenter="Doe, Jane; Müller, Max").experimenter == "Doe, Jane; Müller, Max"
-    with pytest.raises(InvalidArgument, match="experimenter: expected Last, First, as NWB has it"):
+    with pytest.raises(InvalidArgument, match="experimenter: expected Last, First, several separated by semicolons"):
         Origin(experimenter=who)
 
 

@@ -522,7 +522,7 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(InvalidArgument, match="start_min: expected finite minutes, got nan"):
         read_recording(tmp_path / "a.npy", start_min=float("nan"))
-    with pytest.raises(InvalidArgument, match="stimuli_path: expected only beside CSV"):
+    with pytest.raises(InvalidArgument, match="stimuli_path: expected only with CSV"):
         read_recording(npz(tmp_path, **SPIKES, **STIMULI), stimuli_path=tmp_path / "a_stimuli.csv")
 
 
