@@ -38,7 +38,7 @@ def test_errors_come_through_as_they_are(path: Path) -> None:
     with pytest.raises(InvalidArgument, match="part: expected only for MaxWell files"):
         hdf5_subprocess.read_hdf5_in_subprocess(path, part="well000")
     path.with_name("b.nwb").write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(InvalidFile, match=r"b\.nwb: expected a whole HDF5 recording, but it is cut off"):
+    with pytest.raises(InvalidFile, match=r"b\.nwb: expected a complete HDF5 recording, but it is cut off"):
         hdf5_subprocess.read_hdf5_in_subprocess(path.with_name("b.nwb"))
 
 

@@ -192,7 +192,7 @@ def test_a_truncated_file_is_one_clear_line(synthetic: Recording, tmp_path: Path
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(
-        InvalidFile, match=r"a\.nwb: expected a whole (NWB|HDF5) recording, but it is cut off"
+        InvalidFile, match=r"a\.nwb: expected a complete (NWB|HDF5) recording, but it is cut off"
     ) as caught:
         read_recording(path)
     assert "\n" not in str(caught.value)

@@ -319,7 +319,7 @@ def test_a_truncated_npz_is_one_clear_line(share: float, tmp_path: Path) -> None
     path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(InvalidFile, match=r"a\.npz: expected a whole NPZ archive, but it is cut off or damaged"):
+    with pytest.raises(InvalidFile, match=r"a\.npz: expected a complete NPZ archive, but it is cut off or damaged"):
         read_recording(path)
 
 
@@ -435,21 +435,25 @@ BAD_CSV = {
         None,
         "line 2: .* got 3: .* decimal points, or sep.*semi",
     ),
-    "text with a comma": ("time,channel\n0.5,left, upper\n", None, "line 2: .* got 3: quote the text"),
+    "text with a comma": (
+        "time,channel\n0.5,left, upper\n",
+        None,
+        "line 2: .* got 3: quote text that contains the separator",
+    ),
     "commas that may be thousands": ("time;channel\n1,234;5\n", None, "line 2: .* decimal point, got '1,234'"),
     "commas and points": ("time;channel\n0.5;5\n0,5;5\n", None, "line 3: .* decimal point, got '0,5'"),
     "two headers of one name": ("Time,TIME,channel\n1,2,3\n", None, "line 1: expected one column time, got 'Time' and"),
     "spikes that are stimuli": ("time,frequency_hz\n1,5\n", None, "are spikes and stimuli swapped"),
-    "no header": ("0.5,3\n1,2\n", None, "line 1: expected a column .*found 0.5, 3: write the names"),
+    "no header": ("0.5,3\n1,2\n", None, "line 1: expected a column .*found 0.5, 3: add a line with the column names"),
     "the answer of a server": ("<html><body>404 not found</body></html>\n", None, "it is a web page, perhaps"),
     "blanks between columns": ("time channel\n1 2\n", None, "separate the columns by commas, semicolons or tabs"),
-    "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "take this first line out"),
+    "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "remove this first line"),
     "a quote that is not closed": (
         'time_s,channel\n0.1,a\n0.2,"b\n0.3,c\n',
         None,
         "line 3: expected a quote to be closed",
     ),
-    "times in milliseconds by name": ("time_ms,channel\n1,5\n", None, "bring the times of time_ms in seconds"),
+    "times in milliseconds by name": ("time_ms,channel\n1,5\n", None, "convert the times in time_ms to seconds"),
     "blank": ("\n\n", None, "expected a header line"),
     "stimuli without times": (
         "time,channel\n1,2\n",
@@ -483,7 +487,7 @@ def test_a_truncated_gzip_is_one_clear_line(share: float, tmp_path: Path) -> Non
     text = "time,channel\n" + "\n".join(f"{t / 7},{t % 5}" for t in range(400))
     content = gzip.compress(text.encode())
     (tmp_path / "a_spikes.csv.gz").write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(InvalidFile, match=r"expected a whole file, but it cannot be read or is cut off"):
+    with pytest.raises(InvalidFile, match=r"expected a complete file, but it cannot be read or is cut off"):
         read_recording(tmp_path / "a_spikes.csv.gz")
 
 
@@ -514,7 +518,7 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
         "sheet.csv": "got text in UTF-16; save it as CSV in UTF-8",
         "m.mat": "got a MATLAB file; save its columns as CSV or NPZ",
         "sheet.xlsx": "got a spreadsheet; save its tables as CSV",
-        "a_stimuli.csv": "expected a file of spikes, got the stimuli beside it",
+        "a_stimuli.csv": "expected a spike file, got the stimuli that belong to one",
         ".": "got a folder; read_recordings reads folders",
     }.items():
         with pytest.raises(InvalidFile, match=message) as caught:

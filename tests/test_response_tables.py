@@ -133,7 +133,7 @@ def test_only_what_needs_spikes_refuses_a_table(tmp_path: Path, capsys: pytest.C
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
     assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1
     assert "got a response table, which only animat inspect, train and evaluate read" in capsys.readouterr().err
-    with pytest.raises(InvalidFile, match="this needs the times of spikes"):
+    with pytest.raises(InvalidFile, match="this needs spike times"):
         read_recording(tmp_path / "a.npz")
     (tmp_path / "b_responses.csv.gz").write_bytes(gzip.compress(b"count_1,start_min\n3,5\n"))
     assert [source.start_min for source in read_sources(tmp_path)] == [0.0, 5.0]
@@ -143,7 +143,7 @@ BAD = {
     "a negative count": ("count_1\n-2\n", "expected counts of 0 or more, got -2 for stimulus 1 on channel 1"),
     "a part of a spike": (
         "count_1\n0.5\n",
-        "whole, got 0.5 for stimulus 1 on channel 1; if these are rates in Hz, name them rate_hz",
+        "expected whole spike counts, got 0.5 for stimulus 1 on channel 1; if these are rates in Hz, name them rate_hz",
     ),
     "counts and rates": ("count_1,rate_hz_2\n1,2\n", "line 1: expected a column count_CHANNEL or rate_hz_.* got both"),
     "an empty count": ("count_1,count_2\n1,2\n1,\n", "line 3: count_2: expected a finite number, got an empty field"),
@@ -153,11 +153,14 @@ BAD = {
         "line 3: window_end_ms: expected the same in all lines, 9 as in the first, got 10",
     ),
     "a window backwards": ("count_1,window_start_ms,window_end_ms\n1,9,2\n", "window: expected 0 <= start < end"),
-    "a pair twice": ("trial,channel,count\n1,a,2\n1,b,2\n1,a,3\n", "line 4: expected one line a stimulus and channel"),
+    "a pair twice": (
+        "trial,channel,count\n1,a,2\n1,b,2\n1,a,3\n",
+        "line 4: expected one line per stimulus and channel",
+    ),
     "long without trials": ("channel,count\n1,2\n", "expected trial .or stimulus_time_s., channel, and count"),
     "a trial with two patterns": (
         "trial,pattern,channel,count\n1,left,a,1\n2,up,a,1\n1,right,b,1\n",
-        "line 4: stimulus_pattern: expected 'left' as in line 2, which is of the same stimulus, got 'right'",
+        "line 4: stimulus_pattern: expected 'left' as in line 2, of the same stimulus, got 'right'",
     ),
     "a trial with two frequencies": (
         "trial,frequency_hz,channel,count\n1,5,a,1\n1,,b,1\n",
