@@ -66,7 +66,7 @@ def agreement(found: DetectedSpikes, truth: list[Int64[np.ndarray, " n"]]) -> tu
 @pytest.fixture(scope="module")
 def known() -> tuple[RawTraces, list[Int64[np.ndarray, " n"]]]:
     voltage, truth = noisy(70, 6.0)
-    return RawTraces.of_array(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
+    return RawTraces.from_array(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +184,7 @@ def stimulated() -> tuple[Traces, RawTraces]:
         x_um, y_um = culture.selection.array.position_um(culture.selection.recording)
     n = traces.voltage_uv.shape[1]
     table = Channels(np.arange(n).astype(str), np.arange(n), x_um, y_um)
-    return traces, RawTraces.of_array(traces.voltage_uv, table, traces.sampling_rate_hz)
+    return traces, RawTraces.from_array(traces.voltage_uv, table, traces.sampling_rate_hz)
 
 
 def in_window(
@@ -237,7 +237,7 @@ def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[T
 
 def test_a_window_is_not_eaten_unasked() -> None:
     assert Detection().blank_ms[1] <= 1.5
-    traces = RawTraces.of_array(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
+    traces = RawTraces.from_array(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
     found = detect_spikes(traces, np.array([0.5]), Detection(blank_ms=(0.5, 3.0)))
     assert {f.name: f.severity for f in found.findings}["blanked"] == "warning"
 
@@ -267,7 +267,9 @@ def test_the_negative_peak_of_a_spike_in_coarse_steps_is_no_saturation(amplitude
         for channel, ms in enumerate(of_pulse):
             at = pulse + round(ms * 20)
             voltage[at - 20 : at + 41, channel] += amplitude * SPIKE_UV
-    traces = RawTraces.of_array(np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv)
+    traces = RawTraces.from_array(
+        np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv
+    )
     found = detect_spikes(traces, pulses / RATE_HZ, Detection())
     assert "saturated-channels" not in {finding.name for finding in found.findings}
     truth = [pulses + np.rint(late[:, channel] * 20).astype(np.int64) for channel in range(8)]
@@ -312,7 +314,7 @@ def test_a_decay_is_taken_away_and_spikes_on_it_are_left(tau_ms: float, size_uv:
 
 
 def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
-    traces = RawTraces.of_array(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
+    traces = RawTraces.from_array(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
     found = detect_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), Detection())
     assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
 
@@ -329,7 +331,7 @@ def test_who_is_saturated_for_long_is_blanked_to_its_end(until_ms: float, chunk_
     for start, stop in zip(first, last, strict=True):
         is_railed[start:stop] = True
     voltage[is_railed, 2] = 32_000
-    source = RawTraces.of_array(voltage, channels(6), RATE_HZ, uv_per_step=0.1)
+    source = RawTraces.from_array(voltage, channels(6), RATE_HZ, uv_per_step=0.1)
     found = detect_spikes(source, pulses, Detection(chunk_s=chunk_s))
     sample = np.rint(found.time_s * RATE_HZ).astype(np.int64)
     on_it = sample[found.channel == 2]
@@ -358,7 +360,7 @@ def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(f
     for start_s in pulses[10:340:15]:
         is_railed[round(start_s * RATE_HZ) : round((start_s + 0.17) * RATE_HZ)] = True
     voltage[is_railed, 1] = 32_000
-    source = RawTraces.of_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
+    source = RawTraces.from_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
     found = detect_spikes(source, pulses, Detection(chunk_s=chunk_s))
     on_it = np.rint(found.time_s[found.channel == 1] * RATE_HZ).astype(np.int64)
     assert not np.any(is_railed[on_it])
@@ -372,10 +374,10 @@ def test_samples_that_are_no_numbers_are_blank_and_the_rest_of_the_channel_is_he
     lost[[10_000, 30_000], 1] = True
     lost[50_000:52_000, 1] = True
     lost[:, 3] = True
-    whole = detect_spikes(RawTraces.of_array(voltage_uv, channels(4), RATE_HZ))
+    whole = detect_spikes(RawTraces.from_array(voltage_uv, channels(4), RATE_HZ))
     voltage_uv[lost] = np.nan
     voltage_uv[30_000, 1] = np.inf
-    found = detect_spikes(RawTraces.of_array(voltage_uv, channels(4), RATE_HZ), np.array([1.0]))
+    found = detect_spikes(RawTraces.from_array(voltage_uv, channels(4), RATE_HZ), np.array([1.0]))
     assert np.all(np.isfinite(found.noise_uv)) and found.noise_uv[1] == pytest.approx(whole.noise_uv[1], rel=0.05)
     names = {f.name: f for f in found.findings}
     assert names["samples-lost"].value == lost.sum() and "2 of 4 channels" in names["samples-lost"].message
@@ -392,7 +394,7 @@ def test_dead_and_noisy_channels_are_said() -> None:
     voltage, _ = noisy(30, 1.0)
     voltage[:, 3] = 7
     voltage[:, 8] *= 20
-    found = detect_spikes(RawTraces.of_array(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
+    found = detect_spikes(RawTraces.from_array(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
     said = {finding.name: finding.value for finding in found.findings}
     assert (said["dead-channels"], said["noisy-channels"]) == (1, 1)
     assert 3 not in found.channel
@@ -408,7 +410,7 @@ def test_settings_that_cannot_be_are_refused(setting: str, value: object) -> Non
 
 
 def test_a_band_beyond_the_sampling_rate_is_refused() -> None:
-    traces = RawTraces.of_array(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
+    traces = RawTraces.from_array(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
     with pytest.raises(InvalidArgument, match="less than half the sampling rate of 5000 Hz, got 3000 Hz"):
         detect_spikes(traces)
 

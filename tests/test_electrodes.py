@@ -209,4 +209,4 @@ def test_a_scan_that_cannot_be_is_refused() -> None:
     with pytest.raises(UnusableData, match="each electrode once"):
         scanned(SMALL, electrode=np.zeros(200))
     blocks = [scanned(SMALL, electrode=np.arange(200) + 200 * i) for i in range(2)]
-    assert len(ScannedActivity.of_blocks(blocks)) == 400
+    assert len(ScannedActivity.from_blocks(blocks)) == 400

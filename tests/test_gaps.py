@@ -128,7 +128,7 @@ def test_trials_that_nobody_numbered_are_trials_each_and_several_frequencies_are
 
     unknown = trials(stimulus_presentation=np.full(50, -1))
     assert np.count_nonzero(unknown.stimuli.is_last_of_presentation) == 50
-    assert said(unknown)["trials-unknown"].startswith("50 of 50 stimuli name no trial (-1)")
+    assert said(unknown)["trials-unknown"].startswith("50 of 50 stimuli have no trial number (-1)")
     some = trials(stimulus_presentation=np.r_[np.full(20, -1), np.repeat(np.arange(15), 2)])
     assert np.count_nonzero(some.stimuli.is_last_of_presentation) == 35
     with pytest.raises(AnimatError, match="expected numbers that never fall over time"):

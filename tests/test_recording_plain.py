@@ -265,7 +265,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: required to know which 5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
-    "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),
+    "order as a number": ({"presentation_order": 1}, "presentation_order: expected text, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
     "two rates": ({"sampling_rate_hz": np.ones(2)}, r"sampling_rate_hz: expected one value, got shape \(2,\)"),
     "no rate": ({"sampling_rate_hz": 0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, .*got 0"),

@@ -258,7 +258,7 @@ class VirtualCulture(ComputedCulture):
         self._progress.update(0, 1, f"scanning the array for {self._scan_s:g} s")
         spikes_of = np.bincount(tissue.advance(self._scan_s).neuron, minlength=len(tissue.x_um))
         found = [visibility.measure(block, spikes_of, self._scan_s, rng) for block in MAXONE.scan_blocks()]
-        return ScannedActivity.of_blocks(found)
+        return ScannedActivity.from_blocks(found)
 
     def _look(self) -> None:
         """Which channels see each neuron, neuron by neuron."""

@@ -197,10 +197,12 @@ class PlainColumns:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
             presentations: Int64[np.ndarray, " stimuli"] = _whole("stimulus_presentation", column)[in_time]
             unknown = presentations == UNKNOWN
-            # Numbers that fall are for `Stimuli` to refuse.
+            # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
                 return presentations
-            message = f"{unknown.sum():,} of {n:,} stimuli name no trial (-1): each of them is taken for a trial"
+            message = (
+                f"{unknown.sum():,} of {n:,} stimuli have no trial number (-1): each of them is treated as one trial"
+            )
             noted.append(Finding("trials-unknown", "note", message, float(unknown.sum())))
             return np.cumsum(np.append(True, np.diff(presentations) != 0) | unknown) - 1
         if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
@@ -229,7 +231,7 @@ class PlainColumns:
         return start_s, _duration_s(start_s, float(max([start_s, *events_s])))
 
 
-def started_at(recording: Recording, start_s: float) -> Recording:
+def with_start(recording: Recording, start_s: float) -> Recording:
     """The recording with a new start, reported as a finding if it differs, and the same end.
 
     Raises:
@@ -269,17 +271,17 @@ def _in_time(
         raise UnusableData(f"{name}: expected one column of times in seconds, got shape {times_s.shape}")
     expect_times(name, times_s)
     order = np.argsort(times_s, kind="stable")
-    if early := out_of_order(times_s):
-        noted.append(unsorted(events, early, len(times_s)))
+    if early := count_out_of_order(times_s):
+        noted.append(unsorted_finding(events, early, len(times_s)))
     return times_s[order], order
 
 
-def out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
+def count_out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
     """How many times are earlier than any time listed before them, not only the one just before."""
     return int(np.count_nonzero(times_s < np.maximum.accumulate(times_s))) if len(times_s) else 0
 
 
-def unsorted(events: str, early: int, n: int) -> Finding:
+def unsorted_finding(events: str, early: int, n: int) -> Finding:
     """The note on events that were out of order in their file."""
     verbs = ("follows", "it was") if early == 1 else ("follow", "they were")
     message = f"{early:,} of {n:,} {events} {verbs[0]} a later one in the file; {verbs[1]} sorted by time"

@@ -43,7 +43,7 @@ class Finding:
         return cls(**{"message" if name == "sentence" else name: value for name, value in data.items()})
 
 
-def left_out_of(what: str, names: Sequence[str], file: str = "", missing: Sequence[str] = ()) -> Finding:
+def left_out_finding(what: str, names: Sequence[str], file: str = "", missing: Sequence[str] = ()) -> Finding:
     """The finding on unknown keys or columns of a file, each with the missing one whose name is similar."""
     listed = ", ".join(f"{name} ({near[2:]})" if (near := did_you_mean(name, missing)) else name for name in names)
     message = f"unknown {what}{f' of {file}' if file else ''} were left out: {listed}"

@@ -53,7 +53,7 @@ class RawTraces:
     start_s: float = 0.0
 
     @classmethod
-    def of_array(
+    def from_array(
         cls,
         voltage_uv: np.ndarray[Any, Any],
         channels: Channels,

@@ -13,7 +13,7 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.plain_file import expect_plain_file, is_folder, is_nothing
-from animat.recordings.columns import started_at
+from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
 from animat.recordings.formats.npz import read_npz
@@ -87,7 +87,7 @@ def read_recording(
         )
     if start_s is not None:
         try:
-            source = started_at(source, start_s)
+            source = with_start(source, start_s)
         except UnusableData as error:
             raise InvalidFile(f"{path}: {error}") from error
     return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))

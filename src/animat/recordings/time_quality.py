@@ -43,10 +43,10 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
     as long. If there is no common factor and stimuli come sooner than stated, in two thirds of the time or less, there
     is a warning on the frequencies (`other-frequencies`); stimuli that come later may have pauses between them.
     """
-    stated = _stated(recording.stimuli, recording.sampling_rate_hz)
+    stated = _common_factor(recording.stimuli, recording.sampling_rate_hz)
     if stated is not None and stated.severity == "refuse":
         yield stated
-    elif (reason := _fired(recording) or _apart(recording)) is not None:
+    elif (reason := _impossible_firing(recording) or _separate_clocks(recording)) is not None:
         yield Finding(NAME, "refuse", reason)
     elif stated is not None:
         yield stated
@@ -57,7 +57,7 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
 def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[Finding]:
     """A finding on frequencies that contradict the stimuli's times, or, without times, that look like periods."""
     if has_times:
-        yield from _contradicted(stimuli)
+        yield from _sooner_than_stated(stimuli)
         return
     stated_hz = np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)])
     if len(stated_hz) > 1 and stated_hz[-1] < 1:
@@ -68,7 +68,7 @@ def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[
         yield Finding(CONTRADICTED, "warning", message)
 
 
-def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
+def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
     """A finding if all intervals are the same multiple of those of the stated frequencies."""
     interval_s = np.diff(stimuli.time_s)
     # A pulse's frequency may be that of the interval before it, or of the one after it.
@@ -92,7 +92,7 @@ def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
     return None
 
 
-def _contradicted(stimuli: Stimuli) -> Iterator[Finding]:
+def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
     """A finding on stimuli that come sooner than their stated frequency allows."""
     intervals_s, sooner = np.diff(stimuli.time_s), []
     # A pulse's frequency may be that of the interval before it, or of the one after it.
@@ -134,7 +134,7 @@ def _plain(number: float) -> str:
     return f"{number:,.0f}" if number >= FAR else f"{number:.3g}"
 
 
-def _fired(recording: Recording) -> str | None:
+def _impossible_firing(recording: Recording) -> str | None:
     """Why spike times cannot be in seconds, from the duration and the rates; None if they can."""
     times_s, n_spikes = recording.spike_times_s, len(recording.spike_times_s)
     count = np.bincount(recording.spike_channels, minlength=len(recording.channels))
@@ -188,7 +188,7 @@ def _unit_of_spikes(median_hz: float, shortest_s: float, sampling_rate_hz: float
     return ("perhaps " if len(fits) > 1 else "") + "times are in " + ", or in ".join(likeliest)
 
 
-def _apart(recording: Recording) -> str | None:
+def _separate_clocks(recording: Recording) -> str | None:
     """Why spikes and stimuli must have different clocks; None if they need not."""
     spike_s, stimulus_s = recording.spike_times_s, recording.stimuli.time_s
     if len(spike_s) < ENOUGH_SPIKES or len(stimulus_s) < ENOUGH_STIMULI:

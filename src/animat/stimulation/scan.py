@@ -60,7 +60,7 @@ class ScannedActivity:
         return np.nan_to_num(1 / (1 + np.exp(-np.clip((longer + slower) / 2, -50, 50))), nan=0.0)
 
     @staticmethod
-    def of_blocks(blocks: list[ScannedActivity]) -> ScannedActivity:
+    def from_blocks(blocks: list[ScannedActivity]) -> ScannedActivity:
         """The blocks of a scan as one table."""
         names = ("electrode", *_MEASURED)
         return ScannedActivity(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})

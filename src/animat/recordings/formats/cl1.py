@@ -29,7 +29,6 @@ from animat.recordings.formats.stimulus_text import LONGEST, stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import padded
 
-WHAT = "CL1 recording"
 USUAL_RATE_HZ = 25_000.0
 _TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
 _LARGEST_CHANNEL_COUNT = 4096
@@ -54,7 +53,7 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
     """
     path = Path(path)
     findings: list[Finding] = []
-    with hdf5_file(path, WHAT) as file:
+    with hdf5_file(path, "CL1 recording") as file:
         if spikes and not file.has("spikes"):
             raise InvalidFile(
                 f"{path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
@@ -86,7 +85,9 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         names = ", ".join(
             f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in np.unique(channel[~on_electrode]).tolist()
         )
-        message = f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes; left out"
+        message = (
+            f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are not electrodes, and are left out"
+        )
         findings.append(Finding("spikes-not-on-electrodes", "note", message, float(stray)))
     frame, channel = frame[on_electrode], channel[on_electrode]
     spike_time_s, stimulus_time_s = (frame - start) / rate_hz, (stimulus_frame - start) / rate_hz

@@ -23,7 +23,7 @@ import numpy as np
 
 from animat.errors import InvalidFile, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding, left_out_of
+from animat.recordings.findings import Finding, left_out_finding
 from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
 from animat.tables import fits_padded, padded
@@ -130,7 +130,7 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
     left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
     if left_out:
         missing = [alias for name, names in known.items() if name not in place for alias in names]
-        table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
+        table.findings.append(left_out_finding("columns", left_out, table.path.name, missing))
     return columns, table.findings
 
 

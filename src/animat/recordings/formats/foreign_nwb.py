@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from animat.errors import InvalidFile, UnusableData
-from animat.recordings.columns import Column, PlainColumns, out_of_order, unsorted
+from animat.recordings.columns import Column, PlainColumns, count_out_of_order, unsorted_finding
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import SUBJECT
@@ -98,8 +98,8 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     if len(labels) != n or len(np.unique(labels)) != n:
         labels = np.arange(n).astype(np.str_)
     # Units follow each other; spikes count as out of order only within a unit.
-    if early := sum(map(out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
-        findings.append(unsorted("spikes", early, len(time_s)))
+    if early := sum(map(count_out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
+        findings.append(unsorted_finding("spikes", early, len(time_s)))
     order = np.argsort(time_s, kind="stable")
     columns: dict[str, Any] = {
         "spike_time_s": time_s[order],

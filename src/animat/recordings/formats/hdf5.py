@@ -85,7 +85,7 @@ class Hdf5File:
         return sorted(node) if isinstance(node, h5py.Group) else []
 
     @property
-    def held(self) -> str:
+    def root_names(self) -> str:
         """The first names at the root, for messages."""
         names = self.names("/")
         return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
@@ -190,18 +190,18 @@ class Hdf5File:
             )
 
 
-PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) and name its folder in HDF5_PLUGIN_PATH"
+PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) and set HDF5_PLUGIN_PATH to its folder"
 
 
 def unavailable_filters(dataset: h5py.Dataset) -> str:
-    """The compression filters of a dataset that are not installed here, in words; empty where all are."""
+    """The compression filters of a dataset that are not installed, for messages; empty if all are installed."""
     created = dataset.id.get_create_plist()
     names = []
     for code, _, _, name in map(created.get_filter, range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(code):
-            words = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
-            words = words.partition("\0")[0].strip()
-            names.append(f"filter {code}" + (f" ({words})" if words.isprintable() and words else ""))
+            text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
+            text = text.partition("\0")[0].strip()
+            names.append(f"filter {code}" + (f" ({text})" if text.isprintable() and text else ""))
     return ", ".join(names)
 
 

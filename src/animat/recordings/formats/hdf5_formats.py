@@ -39,7 +39,7 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
         kind = format_of(file)
         if kind is None:
             raise InvalidFile(
-                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.held}); save its "
+                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.root_names}); save its "
                 "columns as NPZ or CSV"
             )
     if part is not None and kind != "MaxWell":

@@ -31,7 +31,6 @@ from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
-WHAT = "MaxWell recording"
 OLD_VERSION = 20160704
 USUAL_RATE_HZ = 20_000.0
 ROOTS = ("wells", "recordings", "data_store")
@@ -64,7 +63,7 @@ def read_maxwell(
         UnusableData: if a column is invalid.
     """
     path = Path(path)
-    with hdf5_file(path, WHAT) as file:
+    with hdf5_file(path, "MaxWell recording") as file:
         contents = _old(file) if is_old(file) else _new(file, part)
         contents.read(file, stimuli, spikes)
     return contents.recording(path)

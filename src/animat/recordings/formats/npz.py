@@ -21,7 +21,7 @@ import numpy as np
 
 from animat.errors import InvalidFile, UnusableData, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import left_out_of
+from animat.recordings.findings import left_out_finding
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -29,9 +29,9 @@ from animat.tables import UNKNOWN
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
 UNPACKED_BYTES, UNPACKED_RATIO = 2**26, 20
-WORDS = ("presentation_order",)
+TEXTS = ("presentation_order",)
 WHOLE = ("presentation_pulses",)
-SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *WORDS)
+SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *TEXTS)
 OTHER_NAMES = {
     "stim_tag": "stimulus_pattern",
     "spike_unit": "spike_channel",
@@ -78,7 +78,9 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
         columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
-    findings = (left_out_of("keys", left_out, missing=[key for key in KEYS if key not in columns]),) if left_out else ()
+    findings = (
+        (left_out_finding("keys", left_out, missing=[key for key in KEYS if key not in columns]),) if left_out else ()
+    )
     return PlainColumns(**columns).to_recording(provenance, findings)
 
 
@@ -147,15 +149,15 @@ def _array(archive: Mapping[str, Column], key: str) -> Column:
 
 
 def _single(path: Path, key: str, array: Column) -> Any:
-    """The one value of an array, a number or a word."""
+    """The single value of an array, a number or text."""
     if array.size != 1:
         raise InvalidFile(f"{path}: {key}: expected one value, got shape {array.shape}")
     value = array.reshape(-1)[0].item()
     name = OTHER_NAMES.get(key, key)
-    if name in WORDS:
+    if name in TEXTS:
         if isinstance(value, str):
             return value
-        raise InvalidFile(f"{path}: {key}: expected a word, got {value!r}")
+        raise InvalidFile(f"{path}: {key}: expected text, got {value!r}")
     if not isinstance(value, int | float):
         raise InvalidFile(f"{path}: {key}: expected a number, got {value!r}")
     if name in WHOLE:

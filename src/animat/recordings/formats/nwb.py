@@ -39,7 +39,6 @@ from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 from animat.writing import atomic_write
 
-WHAT = "NWB recording"
 LARGEST_VALUES = 10_000_000
 """Rows times columns of the electrodes table."""
 
@@ -81,7 +80,7 @@ def write_nwb(
             f"got {first_s:g} to {last_s:g} s"
         )
     tree = nwb_file(recording, of_channels)
-    with atomic_write(path) as beside, beside.open("r+b", buffering=0) as raw:
+    with atomic_write(path) as temporary, temporary.open("r+b", buffering=0) as raw:
         disk = _Disk(raw)
         try:
             with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w", manager=BuildManager(_types())) as nwb_io:
@@ -150,7 +149,7 @@ def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Rec
     Raises:
         InvalidFile: if the file is missing, damaged, not NWB, or from another program and without spikes.
     """
-    with hdf5_file(Path(path), WHAT) as file:
+    with hdf5_file(Path(path), "NWB recording") as file:
         return _read(file, stimuli)
 
 
@@ -162,7 +161,7 @@ def is_nwb(file: Hdf5File) -> bool:
 def _read(file: Hdf5File, stimuli: str | None) -> Recording:
     path = file.path
     if not is_nwb(file):
-        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
+        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.root_names})")
     if not file.has(RECORDING_TABLE):
         return read_foreign_nwb(file, stimuli)
     if stimuli is not None:

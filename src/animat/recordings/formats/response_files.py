@@ -23,7 +23,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding, left_out_of
+from animat.recordings.findings import Finding, left_out_finding
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import load_columns
 from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
@@ -98,7 +98,7 @@ def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
     window = arrays.pop("response_window_ms", None)
     if window is not None and np.shape(window) != (2,):
         raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
-    findings = [left_out_of("keys", left_out)] if left_out else []
+    findings = [left_out_finding("keys", left_out)] if left_out else []
     labels = arrays.pop("channel_label", np.arange(values.shape[1]))
     window_ms = None if window is None else (float(window[0]), float(window[1]))
     provenance = {"source": path.name, "format": "NPZ of responses"}
@@ -130,7 +130,7 @@ def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
     left_out = [name for i, name in enumerate(table.header) if i not in used]
     if left_out:
         missing = [alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names]
-        table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
+        table.findings.append(left_out_finding("columns", left_out, table.path.name, missing))
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
     return _table(values, kind, labels, columns, window_ms, provenance, table.findings)
