@@ -46,18 +46,18 @@ HDF5 = ("nwb", "other-nwb", "maxwell", "old-maxwell", "cl1")
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.oracle] * (k in HDF5)) for k in KINDS])
-def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
+def test_a_hundred_damaged_files_are_read_or_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 1, 100, tmp_path)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_two_thousand_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
+def test_two_thousand_damaged_files_are_read_or_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 2, 2000, tmp_path)
 
 
 @pytest.mark.parametrize("where", ["processing", "processing/ecephys/animat_recording", "units/spike_times"])
-def test_a_part_that_is_damaged_is_not_taken_for_one_that_is_missing(where: str, tmp_path: Path) -> None:
+def test_a_damaged_part_is_not_reported_as_missing(where: str, tmp_path: Path) -> None:
     path = tmp_path / "recording.nwb"
     write_nwb(synthetic_recording(0, patterns=1, channels=20), path)
     with h5py.File(path) as file:

@@ -33,7 +33,7 @@ def said(source: Recording) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("from_s", [3600.0, 1.7e9])
-def test_a_clock_that_does_not_begin_at_0_is_warned_of_and_its_start_can_be_given(
+def test_a_clock_that_does_not_start_at_0_causes_a_warning_and_its_start_can_be_given(
     from_s: float, tmp_path: Path
 ) -> None:
     path = spikes_csv(tmp_path, from_s)
@@ -76,7 +76,7 @@ def test_independent_events_and_bursts_have_no_late_start_by_chance(seed: int, n
     assert "start-unknown" not in said(columns.to_recording({}))
 
 
-def test_a_late_first_event_is_not_asked_about_where_the_start_is_stated() -> None:
+def test_a_late_first_event_causes_no_warning_if_the_start_is_stated() -> None:
     times_s = 3600 + np.arange(100.0)
     for start_s, asked in [(None, True), (0.0, False), (3000.0, False)]:
         columns = PlainColumns(times_s, np.zeros(100, int), np.empty(0), start_s=start_s)
@@ -92,7 +92,7 @@ def poisson(silent_s: list[tuple[float, float]], duration_s: float = 1000.0) -> 
     return of_spikes(np.column_stack([times, rng.integers(20, size=len(times))]), [], 20, duration_s)
 
 
-def test_silences_are_told_where_they_are() -> None:
+def test_silences_are_reported_with_their_times() -> None:
     assert "silence" not in said(poisson([]))
     finding = next(f for f in recording_findings(poisson([(400, 600)])) if f.name == "silence")
     assert finding.severity == "warning" and finding.value == pytest.approx(200, abs=0.1)
@@ -104,13 +104,13 @@ def test_silences_are_told_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("n_bursts", [1, 2, 3, 5, 20])
-def test_a_culture_that_fires_in_bursts_alone_is_not_silent(n_bursts: int) -> None:
+def test_a_culture_that_fires_only_in_bursts_is_not_silent(n_bursts: int) -> None:
     rng = np.random.default_rng(n_bursts)
     times = [t for at in rng.uniform(0, 600, n_bursts) for t in at + rng.uniform(0, 0.3, 2000)]
     assert "silence" not in said(of_spikes([(t, 0) for t in times], [], 4, 601.0))
 
 
-def test_spikes_that_are_there_twice_are_warned_of() -> None:
+def test_duplicate_spikes_cause_a_warning() -> None:
     rng = np.random.default_rng(0)
     spikes = np.column_stack([rng.uniform(0, 10, 1000), rng.integers(4, size=1000)])
     assert "duplicate-spikes" not in said(of_spikes(spikes, [], 4))
@@ -121,7 +121,7 @@ def test_spikes_that_are_there_twice_are_warned_of() -> None:
     assert "duplicate-spikes" not in said(of_spikes(both, [], 4))
 
 
-def test_trials_that_nobody_numbered_are_trials_each_and_several_frequencies_are_warned_of() -> None:
+def test_unnumbered_pulses_are_trials_and_several_frequencies_in_one_cause_a_warning() -> None:
     def trials(**columns: object) -> Recording:
         times_s = np.arange(1.0, 51.0)
         return PlainColumns(np.array([1.005]), np.zeros(1, int), times_s, **columns).to_recording({})  # type: ignore[arg-type]

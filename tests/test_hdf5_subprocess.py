@@ -23,18 +23,18 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_it_is_the_recording_that_this_process_reads(path: Path) -> None:
+def test_the_recording_equals_the_one_read_in_this_process(path: Path) -> None:
     assert hdf5_subprocess.read_hdf5_in_subprocess(path).equals(read_hdf5(path))
     assert not hdf5_subprocess.read_hdf5_in_subprocess(path).spike_times_s.flags.writeable
 
 
-def test_a_path_is_counted_from_where_the_program_is_now(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_is_relative_to_the_current_folder(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = read_recording(path)
     monkeypatch.chdir(path.parent)
     assert read_recording("a.nwb").equals(before)
 
 
-def test_errors_come_through_as_they_are(path: Path) -> None:
+def test_errors_are_passed_on_unchanged(path: Path) -> None:
     with pytest.raises(InvalidArgument, match="part: expected only for MaxWell files"):
         hdf5_subprocess.read_hdf5_in_subprocess(path, part="well000")
     path.with_name("b.nwb").write_bytes(path.read_bytes()[:5000])
@@ -46,13 +46,13 @@ def fail(*_: object) -> None:
     raise SystemError("of the library")
 
 
-def test_whatever_is_raised_in_reading_is_of_the_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_error_in_reading_names_the_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5_subprocess, "_read", fail)
     with pytest.raises(InvalidFile, match=r"a\.nwb: expected a recording, but it cannot be read \(of the library\)"):
         hdf5_subprocess.read_hdf5_in_subprocess(path)
 
 
-def test_a_process_that_died_is_started_anew(path: Path) -> None:
+def test_a_dead_process_is_replaced(path: Path) -> None:
     before = read_recording(path)
     assert hdf5_subprocess._reader is not None
     process = hdf5_subprocess._reader._popen
@@ -61,7 +61,7 @@ def test_a_process_that_died_is_started_anew(path: Path) -> None:
     assert read_recording(path).equals(before)
 
 
-def test_a_file_that_the_library_crashes_on_is_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_crashes_the_library_is_reported_as_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read_recording(path)
     assert hdf5_subprocess._reader is not None
     process = hdf5_subprocess._reader._popen

@@ -42,7 +42,7 @@ SELECTION: dict[str, Any] = {
     ],
     ids=["nested", "digits", "more digits", "slow", "a list", "infinite", "long"],
 )
-def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
+def test_invalid_protocols_are_refused_in_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "p.json").write_text(text)
     with pytest.raises(InvalidFile, match=r"p\.json: ") as raised:
         read_protocol(tmp_path / "p.json")
@@ -63,7 +63,7 @@ def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
         ({"seed": 1.5}, "expected a whole number, got 1.5"),
     ],
 )
-def test_selections_made_by_hand_are_one_line(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_invalid_selections_are_refused_in_one_line(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
     (tmp_path / "s.json").write_text(json.dumps(SELECTION))
     assert len(Selection.load(tmp_path / "s.json").recording) == 3
     (tmp_path / "s.json").write_text(json.dumps(SELECTION | changed))

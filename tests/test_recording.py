@@ -61,7 +61,7 @@ def recording(**changes: Any) -> Recording:
         ({"sampling_rate_hz": 0.0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, or NaN"),
     ],
 )
-def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
+def test_a_recording_refuses_impossible_values(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(UnusableData, match=message):
         recording(**changes)
 
@@ -80,19 +80,19 @@ def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: st
         ({"pattern": [1]}, "pattern: expected 2 values"),
     ],
 )
-def test_a_stimulus_table_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
+def test_a_stimulus_table_refuses_impossible_values(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(UnusableData, match=message):
         stimuli(**changes)
 
 
-def test_a_presentation_refuses_what_cannot_be() -> None:
+def test_a_presentation_refuses_impossible_values() -> None:
     with pytest.raises(InvalidArgument, match="pulses: expected at least 1, got 0"):
         Presentation("mixed", 0)
     with pytest.raises(InvalidArgument, match="order: expected 'blocked' or 'mixed'"):
         Presentation("shuffled")  # type: ignore[arg-type]
 
 
-def test_a_recording_cannot_be_changed_nor_does_it_hold_on_to_what_made_it() -> None:
+def test_a_recording_is_immutable_and_copies_its_inputs() -> None:
     times = np.array([-1.0, 0.5, 0.5])
     made = recording(spike_times_s=times, spike_channels=[2, 1, 0])
     times[0] = 7.0
@@ -125,12 +125,12 @@ def test_simultaneous_spikes_have_one_order() -> None:
         {"channels": channels(4)},
     ],
 )
-def test_recordings_that_differ_in_anything_are_not_equal(changes: dict[str, Any]) -> None:
+def test_recordings_that_differ_in_any_value_are_not_equal(changes: dict[str, Any]) -> None:
     assert recording().equals(recording())
     assert not recording(**changes).equals(recording())
 
 
-def test_the_response_is_read_after_the_last_pulse_of_a_presentation() -> None:
+def test_the_response_is_read_after_the_last_pulse_of_a_trial() -> None:
     table = Stimuli(np.arange(5.0), np.full(5, 5.0), np.zeros(5), np.zeros((5, 1)), np.array([0, 0, 0, 4, 4]))
     assert table.is_last_of_presentation.tolist() == [False, False, True, False, True]
 
@@ -158,7 +158,7 @@ def test_two_findings_of_one_name_are_both_kept() -> None:
     assert merged(noted) == (Finding("columns-left-out", "note", "x of a.csv; y of b.csv"),)
 
 
-def test_what_is_seen_in_the_data_is_said() -> None:
+def test_problems_in_the_data_are_reported() -> None:
     silent = recording(spike_times_s=[], spike_channels=[], stimuli=Stimuli([], [], [], np.empty((0, 1)), []))
     assert {f.name: f.severity for f in recording_findings(silent)} == {"no-stimuli": "refuse", "no-spikes": "refuse"}
     electrodes = np.full((2, 2), UNKNOWN)

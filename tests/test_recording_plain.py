@@ -84,14 +84,12 @@ def test_spikes_out_of_order_are_those_with_a_later_one_anywhere_before_them(tim
         ({"stimulus_pattern": np.array(["3", "x" * 1001])}, "stimulus_pattern: expected names of at most 1,000"),
     ],
 )
-def test_what_no_recording_is_as_large_as_is_refused_by_name(
-    changed: dict[str, Any], words: str, tmp_path: Path
-) -> None:
+def test_implausibly_large_values_are_refused_by_name(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match=rf"a\.npz: .*{words}"):
         read_recording(npz(tmp_path, **{**SPIKES, **STIMULI, **changed}))
 
 
-def test_every_key_arrives_in_its_place(tmp_path: Path) -> None:
+def test_every_key_is_read_into_its_field(tmp_path: Path) -> None:
     recording = read_recording(
         npz(
             tmp_path,
@@ -287,7 +285,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_NPZ)
-def test_a_bad_npz_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+def test_a_bad_npz_is_refused_in_one_line_that_names_the_file(case: str, tmp_path: Path) -> None:
     changes, message = BAD_NPZ[case]
     arrays = changes if "missing" in case else SPIKES | STIMULI | changes
     with pytest.raises(InvalidFile, match=message) as caught:
@@ -306,7 +304,7 @@ ARRAYS = npst.arrays(
 @given(
     arrays=st.dictionaries(st.sampled_from([*KEYS, *OTHER_NAMES, *ROUTING]), ARRAYS, max_size=5), whole=st.booleans()
 )
-def test_any_arrays_at_all_are_read_or_are_one_clear_line(arrays: dict[str, Any], whole: bool, tmp_path: Path) -> None:
+def test_any_arrays_are_read_or_refused_in_one_line(arrays: dict[str, Any], whole: bool, tmp_path: Path) -> None:
     try:
         read_recording(npz(tmp_path, **((SPIKES | STIMULI if whole else {}) | arrays)))
     except InvalidFile as error:
@@ -314,7 +312,7 @@ def test_any_arrays_at_all_are_read_or_are_one_clear_line(arrays: dict[str, Any]
 
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.9, 0.99])
-def test_a_truncated_npz_is_one_clear_line(share: float, tmp_path: Path) -> None:
+def test_a_truncated_npz_is_refused_in_one_line(share: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
     content = path.read_bytes()
@@ -323,7 +321,7 @@ def test_a_truncated_npz_is_one_clear_line(share: float, tmp_path: Path) -> None
         read_recording(path)
 
 
-def test_a_damaged_npz_is_an_error_of_ours_or_harmless(tmp_path: Path) -> None:
+def test_a_damaged_npz_raises_our_error_or_is_harmless(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
     content = path.read_bytes()
@@ -382,7 +380,7 @@ def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
     assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.message
 
 
-def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tmp_path: Path) -> None:
+def test_unusual_headers_and_decimal_commas_are_read_and_reported(tmp_path: Path) -> None:
     spikes = "Time (s); CHANNEL;\n0,0031;17;\n1,5;21;\n;;\n"
     recording = read_recording(csv(tmp_path, spikes, "Time [s]\tFrequency-Hz\n0,25\t5\n0,5\t12,5\n"))
     assert recording.spike_times_s.tolist() == [0.0031, 1.5]
@@ -397,7 +395,7 @@ def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tm
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=8).map(sorted))
-def test_times_of_three_decimals_are_read_where_one_cannot_be_thousands(milliseconds: list[int]) -> None:
+def test_times_with_three_decimals_are_read_if_one_cannot_be_thousands(milliseconds: list[int]) -> None:
     cells = [f"{ms // 1000},{ms % 1000:03}" for ms in milliseconds]
     with tempfile.TemporaryDirectory() as folder:
         path = csv(Path(folder), "time;channel\n" + "".join(f"{cell};5\n" for cell in cells))
@@ -474,7 +472,7 @@ BAD_CSV = {
 
 
 @pytest.mark.parametrize("case", BAD_CSV)
-def test_a_bad_csv_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+def test_a_bad_csv_is_refused_in_one_line_that_names_the_file(case: str, tmp_path: Path) -> None:
     spikes, stimuli, message = BAD_CSV[case]
     with pytest.raises(InvalidFile, match=message) as caught:
         read_recording(csv(tmp_path, spikes, stimuli))
@@ -483,7 +481,7 @@ def test_a_bad_csv_is_one_clear_line_that_names_the_file(case: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
-def test_a_truncated_gzip_is_one_clear_line(share: float, tmp_path: Path) -> None:
+def test_a_truncated_gzip_is_refused_in_one_line(share: float, tmp_path: Path) -> None:
     text = "time,channel\n" + "\n".join(f"{t / 7},{t % 5}" for t in range(400))
     content = gzip.compress(text.encode())
     (tmp_path / "a_spikes.csv.gz").write_bytes(content[: int(len(content) * share)])
@@ -494,7 +492,7 @@ def test_a_truncated_gzip_is_one_clear_line(share: float, tmp_path: Path) -> Non
 # --- any file, folders -----------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
+def test_files_that_are_not_recordings_are_refused_in_one_line(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros(3))
     (tmp_path / "empty.nwb").touch()
     for name in ("b.nwb", "b.bin"):
@@ -546,7 +544,7 @@ def test_folders_are_read_in_the_order_of_the_cultures_clock(tmp_path: Path) -> 
     assert first_alone[0].equals(first)
 
 
-def test_two_recordings_of_one_time_and_empty_folders_are_refused(tmp_path: Path) -> None:
+def test_recordings_with_the_same_start_and_empty_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match=r"expected a folder of recordings .* found none in it"):
         read_recordings(tmp_path)
     with pytest.raises(InvalidArgument, match="paths: expected at least one file"):
@@ -588,7 +586,7 @@ def test_the_brainoware_recording(real_data: Path) -> None:
     np.testing.assert_allclose(np.diff(recording.stimuli.time_s), 5.0, atol=0.5)
 
 
-def test_a_file_of_responses_without_times_is_refused_by_its_keys(real_data: Path) -> None:
+def test_an_npz_of_counts_without_times_is_refused_by_its_keys(real_data: Path) -> None:
     said = r"expected times of spikes .*only counts \(culture0_spikes_per_electrode.*bring the times"
     with pytest.raises(AnimatError, match=said):
         read_recording(real_data / "rat_cortical_64ch_responses.npz")
@@ -609,7 +607,7 @@ def test_messages_say_what_is_missing(name: str, text: str, words: str, tmp_path
         read_source(tmp_path / name)
 
 
-def test_labels_in_text_and_a_negative_duration_are_said(tmp_path: Path) -> None:
+def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path) -> None:
     labels = {"channel_label": np.array(["17", "21", "40"])}
     numbers = {"spike_time_s": np.array([0.1, 0.2]), "spike_channel": np.array([17, 1])}
     with pytest.raises(InvalidFile, match="rows from 0 to 2, as these are numbers and channel_label is text, got 17"):

@@ -100,7 +100,7 @@ def test_bursts_of_a_table_are_those_of_its_recording_where_few_ratios_occur() -
         np.testing.assert_array_equal(responses.is_burst, active == 30)
 
 
-def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
+def test_what_a_table_does_not_state_is_assumed_and_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_pattern=["a", "b", "a"])
     table = table_of(tmp_path / "a.npz")
     assert not table.has_times
@@ -116,7 +116,7 @@ def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
     assert "6 spikes on 2 channels, from 0 min" in text
 
 
-def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
+def test_periods_instead_of_frequencies_cause_a_warning(tmp_path: Path) -> None:
     def warned(frequency_hz: list[float]) -> list[str]:
         np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_frequency_hz=frequency_hz)
         return [f.message for f in recording_findings(table_of(tmp_path / "a.npz")) if f.name == "other-frequencies"]
@@ -129,7 +129,7 @@ def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
     assert warned([0.2, 0.2, 0.2]) == warned([0.2, 0.5, 1.0]) == []
 
 
-def test_only_what_needs_spikes_refuses_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_commands_that_need_spikes_refuse_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
     assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1
     assert "got a response table, which only animat inspect, train and evaluate read" in capsys.readouterr().err
@@ -171,7 +171,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_table_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+def test_a_bad_table_is_refused_in_one_line_that_names_the_file(case: str, tmp_path: Path) -> None:
     text, message = BAD[case]
     (tmp_path / "a_responses.csv").write_text(text)
     with pytest.raises(InvalidFile, match=message) as caught:
@@ -180,7 +180,7 @@ def test_a_bad_table_is_one_clear_line_that_names_the_file(case: str, tmp_path: 
 
 
 @pytest.mark.parametrize("head", ["Rate (Hz) {}", "rate_hz_{}", "RATE-HZ-{}", "rate [Hz]_{}", "count_{}", "Count {}"])
-def test_channels_are_called_what_their_headers_say_after_the_kind(head: str, tmp_path: Path) -> None:
+def test_channels_are_named_by_the_rest_of_their_headers(head: str, tmp_path: Path) -> None:
     labels = ["12", "A1", "(3,4)"]
     header = ";".join(head.format(label) for label in labels)
     (tmp_path / "a_responses.csv").write_text(f"{header}\n1;2;3\n")
@@ -212,7 +212,7 @@ def test_spikes_with_columns_of_counts_are_spikes(name: str, header: str, tmp_pa
     assert source.spike_times_s.tolist() == [0.1, 0.2]
 
 
-def test_a_transposed_table_is_told(tmp_path: Path) -> None:
+def test_a_transposed_table_is_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", response_count=np.zeros((3, 5)), stimulus_pattern=np.arange(5))
     with pytest.raises(InvalidFile, match=r"expected a row for each of 5 stimuli, got \(3, 5\): transpose it"):
         read_source(tmp_path / "a.npz")

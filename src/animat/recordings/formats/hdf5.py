@@ -125,7 +125,7 @@ class Hdf5File:
         """All values of a dataset, or of one column of a table; text is returned as `str`.
 
         Raises:
-            InvalidFile: if there is none, it holds other types than numbers or text, or claims more values than the
+            InvalidFile: if there is none, its type is not numbers or text, or it claims more values than the
                 file can hold.
         """
         dataset = self.dataset(where)
