@@ -1,4 +1,4 @@
-"""Any recording to NWB. Oracles: nwbinspector, pynwb, the recording that went in, raw traces with known spikes."""
+"""Conversion to NWB. Oracles: nwbinspector, pynwb, the original recording, raw traces with known spikes."""
 
 from __future__ import annotations
 

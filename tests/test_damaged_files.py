@@ -18,7 +18,7 @@ from synthetic_recordings import synthetic_recording
 
 
 def damage(kind: str, seed: int, count: int, folder: Path) -> None:
-    """Damage and read `count` files in a process of its own."""
+    """Damage and read `count` files in a separate process."""
     done = subprocess.run(
         [
             sys.executable,

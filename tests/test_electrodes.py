@@ -1,4 +1,4 @@
-"""Array, scan, selection, patterns. Oracles: counting by hand and brute force over all sets."""
+"""Array, scan, selection, patterns. Oracles: manual counts and brute force over all sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stretches without events. Oracles: independent spikes, which have none by chance, cut, shifted and doubled."""
+"""Gaps without events. Oracles: independent spikes, which have none by chance, cut, shifted and doubled."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_a_late_first_event_causes_no_warning_if_the_start_is_stated() -> None:
 
 
 def poisson(silent_s: list[tuple[float, float]], duration_s: float = 1000.0) -> Recording:
-    """300 spikes a second on 20 channels, but none in these stretches."""
+    """300 spikes per second on 20 channels, but none in these gaps."""
     rng = np.random.default_rng(1)
     times = rng.uniform(0, duration_s, int(300 * duration_s))
     for start, stop in silent_s:

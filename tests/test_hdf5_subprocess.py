@@ -1,4 +1,4 @@
-"""HDF5 files are read in a process of their own. Oracles: the same reading here, and processes that were killed."""
+"""HDF5 files are read in a separate process. Oracles: reading in this process, and killed processes."""
 
 from __future__ import annotations
 

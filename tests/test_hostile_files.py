@@ -1,4 +1,4 @@
-"""Files made by hand to hang or crash: protocols, selections, checkpoints. Each is one line; none is waited for."""
+"""Files made to hang or crash a reader: protocols, selections, checkpoints. Each is refused in one line, in time."""
 
 from __future__ import annotations
 

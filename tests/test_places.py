@@ -107,7 +107,7 @@ def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
 
 
 def test_in_a_mixed_recording_a_place_may_follow_itself() -> None:
-    """As in a closed loop: a round of all places before any comes again would never show it."""
+    """As in a closed loop; rounds of all places would never show this."""
     protocol = Protocol((10.0,), "mixed", trials=500, places=LISTED)
     (block,) = make_schedule(protocol, np.zeros((100, 1), np.int64), 0, places=LISTED).blocks
     first = block.stimuli.electrodes[:, 0]

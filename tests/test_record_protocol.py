@@ -1,4 +1,4 @@
-"""`animat record --protocol`: what is recorded is what the file says, and a file that cannot be is told at once."""
+"""`animat record --protocol` records what the file states, and refuses an impossible file immediately."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def replayed(synthetic: Path, tmp_path: Path) -> list[str]:
-    """The command that records a replay of a synthetic recording, as far as the protocol."""
+    """The command that records a replay of a synthetic recording, up to the protocol."""
     return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(synthetic), "--out",
             str(tmp_path / "out")]  # fmt: skip
 

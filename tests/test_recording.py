@@ -1,4 +1,4 @@
-"""The recording noun: what it refuses, that it cannot be changed, and when two are equal. Hand-made cases."""
+"""`Recording`: what it refuses, its immutability and equality. Hand-made cases."""
 
 from __future__ import annotations
 

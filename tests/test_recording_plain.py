@@ -56,7 +56,7 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
 
 
 def said(recording: Recording) -> dict[str, str]:
-    """What was noticed when it was read, by name."""
+    """The names of the findings."""
     return {finding.name: finding.message for finding in recording.findings}
 
 

@@ -1,4 +1,4 @@
-"""Tables of responses without spikes. Oracles: recordings whose counts they are, hand-written files, a real table."""
+"""Response tables without spikes. Oracles: recordings with the same counts, hand-written files, a real table."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def test_a_choice_that_a_table_does_not_offer_is_refused(
 
 @pytest.fixture
 def rat(real_data: Path, tmp_path: Path) -> list[str]:
-    """A published table as docs/recordings.md brings it in, and the options that it takes."""
+    """A published table, converted as in docs/recordings.md, and its options."""
     with np.load(real_data / "rat_cortical_64ch_responses.npz") as data:
         counts, sources = data["culture0_spikes_per_electrode"], data["culture0_sources"]
     file = tmp_path / "rat.npz"

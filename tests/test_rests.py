@@ -1,4 +1,4 @@
-"""The place without electrodes: its trials take their time, nothing is delivered, the response is read as usual."""
+"""The place without electrodes: trials take their usual time, nothing is delivered, the response is read as usual."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_rest_is_explicit_and_not_a_set_that_is_empty_by_mistake() -> None:
 
 
 def test_a_culture_given_only_rests_is_undisturbed() -> None:
-    """The virtual culture's spikes are, to the last one, those of a culture that time passed for."""
+    """The virtual culture's spikes are exactly those of a culture that was left alone for the same time."""
     recording = recorded(small_culture(), NONE)
     assert len(recording.stimuli) == 12 and np.all(recording.stimuli.is_rest)
     with small_culture() as alone:

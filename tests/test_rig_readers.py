@@ -1,4 +1,4 @@
-"""Readers of MaxWell, CL1 and other programs' NWB. Oracles: files made row by row, pynwb's writer."""
+"""Readers of MaxWell, CL1 and NWB from other programs. Oracles: files made row by row, pynwb's writer."""
 
 from __future__ import annotations
 

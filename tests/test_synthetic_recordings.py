@@ -1,4 +1,4 @@
-"""Synthetic recordings: the truth that was put in is found. Oracles: the gamma's closed forms, scikit-image's Otsu."""
+"""Synthetic recordings: their known truth is recovered. Oracles: the gamma's closed forms, scikit-image's Otsu."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MEANS_HZ = {5: 30.0, 10: 36.0, 20: 42.0, 40: 48.0, 80: 54.0}
 
 
 def responses(recording: Recording) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """x and the ratio of active channels of each stimulus, counted one by one."""
+    """The response x and the active ratio of each stimulus, counted one by one."""
     x, ratio = [], []
     for time_s in recording.stimuli.time_s:
         first, last = np.searchsorted(recording.spike_times_s, [time_s + 0.002, time_s + 0.010])

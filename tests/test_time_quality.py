@@ -27,7 +27,7 @@ REAL = ("organoid_cartpole_maxone.npz", "brainoware_spikes.csv.gz")
 
 
 def in_unit(source: Recording, spikes: float, stimuli: float | None = None) -> Recording:
-    """The recording with times in a unit of which so many make a second."""
+    """The recording with spike and stimulus times in units of which `spikes` and `stimuli` make a second."""
     stimulus_s = source.stimuli.time_s * (spikes if stimuli is None else stimuli)
     spike_s = source.spike_times_s * spikes
     events = np.concatenate([spike_s, stimulus_s])

@@ -134,8 +134,10 @@ class Selection:
                 "selection.patterns: expected the same number of electrodes in each, got different ones"
             )
         columns = saved.recording, saved.stimulation, saved.patterns or np.empty((0, 0))
-        arrays = (np.array(electrodes, np.int64) for electrodes in columns)
-        return Selection(saved.array, *arrays, saved.rule, saved.seed, saved.scanned, saved.passed)
+        recording, stimulation, patterns = (np.array(electrodes, np.int64) for electrodes in columns)
+        return Selection(
+            saved.array, recording, stimulation, patterns, saved.rule, saved.seed, saved.scanned, saved.passed
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
