@@ -84,13 +84,6 @@ def detect_spikes(
     )
 
 
-def depths_uv(noise_uv: Float32[np.ndarray, " channels"], threshold: float) -> Float32[np.ndarray, " channels"]:
-    """The depth that a negative peak must have on each channel; infinite on dead channels."""
-    depth_uv = np.asarray(threshold * noise_uv, dtype=np.float32)
-    depth_uv[is_dead(noise_uv)] = np.inf
-    return depth_uv
-
-
 def is_dead(noise_uv: Float32[np.ndarray, " channels"]) -> np.ndarray:
     """Whether a channel has hardly any noise, so that no signal reaches it; shape (channels,)."""
     return np.asarray(noise_uv <= DEAD * np.median(noise_uv)) if len(noise_uv) else np.zeros(0, dtype=bool)
@@ -149,7 +142,7 @@ def _detect(
     rate_hz = traces.sampling_rate_hz
     margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
-    depth_uv = depths_uv(noise_uv, settings.threshold)
+    depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
 
     def of_block(piece: Piece, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         cleaned = piece.cleaned(columns, noise_uv[columns], rate_hz, settings)
