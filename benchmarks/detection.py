@@ -60,7 +60,7 @@ def write_traces(path: Path, channels: int, seconds: float) -> None:
 
 def measure(engine: str, path: Path, stimuli_hz: float) -> dict[str, float]:
     """One row, in this process."""
-    from animat.recordings.detection.finding_spikes import find_spikes
+    from animat.recordings.detection.spikes import detect_spikes
     from animat.recordings.formats.traces import read_dataset_uv
     from animat.recordings.raw import RawTraces
     from animat.recordings.recording import Channels
@@ -78,7 +78,7 @@ def measure(engine: str, path: Path, stimuli_hz: float) -> dict[str, float]:
         sample, channel = by_spikeinterface(path, n)
     else:
         pulses_s = np.arange(0.05, samples / RATE_HZ, 1 / stimuli_hz) if stimuli_hz > 0 else None
-        found = find_spikes(traces, pulses_s)
+        found = detect_spikes(traces, pulses_s)
         sample, channel = np.rint(found.time_s * RATE_HZ).astype(int), found.channel
     took_s, processor_s = time.perf_counter() - began, time.process_time() - began_processor
     spikes = {(s + d, c) for s, c in zip(sample.tolist(), channel.tolist(), strict=True) for d in (-1, 0, 1)}

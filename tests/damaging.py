@@ -20,8 +20,8 @@ import h5py
 import numpy as np
 
 from animat.errors import AnimatError
-from animat.recordings.apart import end_reader
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.hdf5_subprocess import end_reader
 from animat.recordings.reading import read_recording
 from animat.responses.inspection import inspect_recording
 from rig_files import (

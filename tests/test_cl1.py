@@ -20,7 +20,7 @@ from animat.cultures.replay import ReplayCulture
 from animat.cultures.same_culture import other_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.formats.stimulus_text import said
+from animat.recordings.formats.stimulus_text import parse_line
 from animat.recordings.recording import RecordedCulture
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE, Phase, Pulse
@@ -349,7 +349,7 @@ def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons,
         culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)], 0.01)
     ((frame, text),) = neurons.stream
     assert frame == neurons.pulses[0][0]
-    assert said(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 3, "presentation": 7}
+    assert parse_line(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 3, "presentation": 7}
     assert Pulse.from_list(json.loads(text)["phases"]) == CL1_PULSE
 
 

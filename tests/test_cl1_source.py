@@ -143,5 +143,5 @@ def test_settings_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
 
 def test_unless_told_otherwise_it_is_as_large_as_is_said_that_real_time_carries() -> None:
     docs = (Path(__file__).parent.parent / "docs" / "hardware.md").read_text()
-    assert f"It has {REAL_TIME_NEURONS} neurons unless you say otherwise" in docs
+    assert f"It has {REAL_TIME_NEURONS} neurons by default" in docs
     assert len(SimulatedCL1(1)._sees) == REAL_TIME_NEURONS

@@ -1,4 +1,4 @@
-"""Any recording to NWB. Oracles: nwbinspector, pynwb, the recording that went in, raw traces with known spikes."""
+"""Conversion to NWB. Oracles: nwbinspector, pynwb, the original recording, raw traces with known spikes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def rig_file(kind: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["maxwell", "cl1", "other nwb", "npz"])
-def test_what_is_converted_is_what_was_read(kind: str, tmp_path: Path) -> None:
+def test_the_converted_recording_equals_the_one_read(kind: str, tmp_path: Path) -> None:
     path = rig_file(kind, tmp_path)
     source = read_recording(path)
     convert_recording(path, tmp_path / "out.nwb", WHO, start_min=30.0)
@@ -66,7 +66,7 @@ def test_what_is_converted_is_what_was_read(kind: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(written.stimuli, name), getattr(source.stimuli, name))
 
 
-def test_what_the_file_says_of_the_subject_stays(tmp_path: Path) -> None:
+def test_the_subject_stated_in_the_file_is_kept(tmp_path: Path) -> None:
     path = rig_file("npz", tmp_path)
     convert_recording(path, tmp_path / "unknown.nwb", Origin(subject_id="c1"))
     convert_recording(path, tmp_path / "female.nwb", Origin(subject_id="c1", sex="F"))
@@ -110,7 +110,7 @@ def test_the_command_finds_spikes_in_raw_traces(tmp_path: Path, capsys: pytest.C
         assert file["general/subject/subject_id"][()] == b"c"
 
 
-def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reports_errors_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = rig_file("maxwell", tmp_path)
     assert main(["convert", str(path), "--out", str(tmp_path / "out.nwb"), "--raw"]) == 1
     said = capsys.readouterr().err
@@ -130,13 +130,13 @@ def test_the_command_says_in_one_line_what_is_wrong(tmp_path: Path, capsys: pyte
 
 @pytest.mark.parametrize("age", ["P42D", "P6W", "P1Y2M3DT4H", "P2.5W", "PT36H", "P20D/P22D", "P90Y/"])
 def test_an_age_is_a_duration(age: str) -> None:
-    assert Origin(subject_id="c", age=age).words()["age"] == age
+    assert Origin(subject_id="c", age=age).to_provenance()["age"] == age
 
 
 @pytest.mark.parametrize(
     "age", ["banana", "42", "P", "PT", "P42", "42D", "P1D2Y", "P1DT", "/P3D", "P3D/banana", "p3d", "P٣D"]
 )
-def test_an_age_that_is_none_is_refused_before_anything_is_read(
+def test_an_invalid_age_is_refused_before_anything_is_read(
     age: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out.nwb"
@@ -150,7 +150,9 @@ def test_an_age_that_is_none_is_refused_before_anything_is_read(
         Origin(recorded_at="yesterday")
 
 
-def test_spikes_without_traces_are_told_from_a_damaged_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_spikes_without_traces_are_distinguished_from_a_damaged_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a.csv").write_text("time_s,channel\n0.1,3\n")
     (tmp_path / "a.rhd").write_bytes(b"\xc6\x91\x12\xd6" + bytes(40))
     expected = {"a.rhd": "got another file; for traces in another format name it with --reader, such as intan"}
@@ -165,7 +167,7 @@ def test_spikes_without_traces_are_told_from_a_damaged_file(tmp_path: Path, caps
     assert "expected one recording, got a folder" in capsys.readouterr().err
 
 
-def test_text_under_the_name_of_hdf5_is_said_to_be_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_with_an_hdf5_name_is_reported_as_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.nwb").write_text("<html>not found</html>\n")
     for more in ([], ["--raw"]):
         assert main(["convert", str(tmp_path / "a.nwb"), "--out", str(tmp_path / "out.nwb"), *more]) == 1
@@ -180,14 +182,14 @@ def test_text_under_the_name_of_hdf5_is_said_to_be_that(tmp_path: Path, capsys: 
 def test_a_file_is_not_written_over_itself(tmp_path: Path) -> None:
     path = rig_file("maxwell", tmp_path)
     before = path.read_bytes()
-    with pytest.raises(InvalidArgument, match="--out: expected a name that is not taken"):
+    with pytest.raises(InvalidArgument, match="--out: expected a new file, got"):
         convert_recording(path, path)
     assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["x.csv", "x", "x.nwb.gz"])
-def test_what_is_written_is_called_nwb(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidArgument, match=r"^--out: expected a name that ends in \.nwb, as NWB is written, got "):
+def test_the_output_name_must_end_in_nwb(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgument, match=r"^--out: expected a name ending in \.nwb, as NWB is written, got "):
         convert_recording(rig_file("npz", tmp_path), tmp_path / name)
     assert not (tmp_path / name).exists()
 
@@ -271,14 +273,14 @@ def test_a_range_of_ages_begins_with_the_younger(age: str, fits: bool) -> None:
     if fits:
         assert Origin(age=age).age == age
     else:
-        with pytest.raises(InvalidArgument, match="age: expected a range from the younger to the older"):
+        with pytest.raises(InvalidArgument, match="age: expected a range with the younger age first"):
             Origin(age=age)
 
 
 @pytest.mark.parametrize("who", ["Jane Doe", "Doe, Jane; Max", ""])
 def test_an_experimenter_is_last_first(who: str) -> None:
     assert Origin(experimenter="Doe, Jane; Müller, Max").experimenter == "Doe, Jane; Müller, Max"
-    with pytest.raises(InvalidArgument, match="experimenter: expected Last, First, as NWB has it"):
+    with pytest.raises(InvalidArgument, match="experimenter: expected Last, First, several separated by semicolons"):
         Origin(experimenter=who)
 
 
@@ -291,7 +293,7 @@ def test_an_experimenter_is_last_first(who: str) -> None:
         ("2024-05-31T14:00Z", False),
     ],
 )
-def test_a_date_without_a_zone_is_said_to_be_taken_for_utc(date: str, is_told: bool, tmp_path: Path) -> None:
+def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_told: bool, tmp_path: Path) -> None:
     written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", Origin(recorded_at=date))
     told = {finding.name: finding for finding in written.findings}
     assert ("zone-unknown" in told) == is_told

@@ -11,14 +11,14 @@ import h5py
 import pytest
 
 from animat.errors import InvalidFile
-from animat.recordings import apart
+from animat.recordings import hdf5_subprocess
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from damaging import KINDS
 from synthetic_recordings import synthetic_recording
 
 
 def damage(kind: str, seed: int, count: int, folder: Path) -> None:
-    """Damage and read `count` files in a process of its own."""
+    """Damage and read `count` files in a separate process."""
     done = subprocess.run(
         [
             sys.executable,
@@ -41,23 +41,23 @@ def damage(kind: str, seed: int, count: int, folder: Path) -> None:
     print(done.stdout)
 
 
-# One library reads those of HDF5, in another process, whose crashes have tests of their own (`test_reading_apart`).
+# One library reads those of HDF5, in another process, whose crashes have tests of their own (`test_hdf5_subprocess`).
 HDF5 = ("nwb", "other-nwb", "maxwell", "old-maxwell", "cl1")
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.oracle] * (k in HDF5)) for k in KINDS])
-def test_a_hundred_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
+def test_a_hundred_damaged_files_are_read_or_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 1, 100, tmp_path)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_two_thousand_damaged_files_are_read_or_are_one_line(kind: str, tmp_path: Path) -> None:
+def test_two_thousand_damaged_files_are_read_or_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     damage(kind, 2, 2000, tmp_path)
 
 
 @pytest.mark.parametrize("where", ["processing", "processing/ecephys/animat_recording", "units/spike_times"])
-def test_a_part_that_is_damaged_is_not_taken_for_one_that_is_missing(where: str, tmp_path: Path) -> None:
+def test_a_damaged_part_is_not_reported_as_missing(where: str, tmp_path: Path) -> None:
     path = tmp_path / "recording.nwb"
     write_nwb(synthetic_recording(0, patterns=1, channels=20), path)
     with h5py.File(path) as file:
@@ -71,6 +71,6 @@ def test_a_part_that_is_damaged_is_not_taken_for_one_that_is_missing(where: str,
 
 @pytest.mark.oracle
 def test_a_reader_that_is_not_ready_in_time_does_not_blame_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "START_S", 0.0)
+    monkeypatch.setattr(hdf5_subprocess, "START_S", 0.0)
     with pytest.raises(InvalidFile, match=r"not ready after 0 s, is the machine busy\?"):
-        apart._start()
+        hdf5_subprocess._start()

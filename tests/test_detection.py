@@ -17,9 +17,9 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
 from animat.recordings.detection.artefacts import without_artefacts
 from animat.recordings.detection.band import band_pass
-from animat.recordings.detection.finding_spikes import FoundSpikes, find_spikes
 from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.settings import Detection
+from animat.recordings.detection.spikes import DetectedSpikes, detect_spikes
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.stimulation.pulse import PUBLISHED_PULSE
@@ -51,7 +51,7 @@ def noisy(
     return np.rint(voltage).astype(np.int16), truth
 
 
-def agreement(found: FoundSpikes, truth: list[Int64[np.ndarray, " n"]]) -> tuple[int, int, int]:
+def agreement(found: DetectedSpikes, truth: list[Int64[np.ndarray, " n"]]) -> tuple[int, int, int]:
     """Spikes found, missed and made up, within half a millisecond."""
     hit = missed = false = 0
     for column, at in enumerate(truth):
@@ -66,18 +66,18 @@ def agreement(found: FoundSpikes, truth: list[Int64[np.ndarray, " n"]]) -> tuple
 @pytest.fixture(scope="module")
 def known() -> tuple[RawTraces, list[Int64[np.ndarray, " n"]]]:
     voltage, truth = noisy(70, 6.0)
-    return RawTraces.of_array(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
+    return RawTraces.from_array(voltage, channels(70), RATE_HZ, start_s=-1.0, uv_per_step=0.1), truth
 
 
 @pytest.fixture(scope="module")
-def found_in_known(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> FoundSpikes:
-    return find_spikes(known[0], workers=1)
+def found_in_known(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> DetectedSpikes:
+    return detect_spikes(known[0], workers=1)
 
 
 def test_known_spikes_are_found_and_few_others(known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]]) -> None:
     traces, truth = known
-    found = find_spikes(traces)
-    shifted = FoundSpikes(found.time_s + 1.0, found.channel, found.noise_uv, found.findings)
+    found = detect_spikes(traces)
+    shifted = DetectedSpikes(found.time_s + 1.0, found.channel, found.noise_uv, found.findings)
     hit, missed, false = agreement(shifted, truth)
     assert hit > 1500
     assert missed + false <= 0.01 * hit
@@ -88,10 +88,10 @@ def test_known_spikes_are_found_and_few_others(known: tuple[RawTraces, list[Int6
 
 @pytest.mark.parametrize(("chunk_s", "workers"), [(0.1, 1), (0.3, 3), (10.0, 2)])
 def test_the_size_of_pieces_and_the_number_of_threads_change_nothing(
-    known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]], found_in_known: FoundSpikes, chunk_s: float, workers: int
+    known: tuple[RawTraces, list[Int64[np.ndarray, " n"]]], found_in_known: DetectedSpikes, chunk_s: float, workers: int
 ) -> None:
     whole = found_in_known
-    pieces = find_spikes(known[0], None, Detection(chunk_s=chunk_s), workers=workers)
+    pieces = detect_spikes(known[0], None, Detection(chunk_s=chunk_s), workers=workers)
     # A negative peak at the threshold itself can fall on either side by the rounding of single precision.
     assert abs(len(pieces.time_s) - len(whole.time_s)) <= 2
     both = set(zip(whole.time_s.tolist(), whole.channel.tolist(), strict=True)) & set(
@@ -131,7 +131,7 @@ def test_spikeinterface_finds_the_same_spikes(known: tuple[RawTraces, list[Int64
     from spikeinterface.sortingcomponents.peak_detection import detect_peaks
 
     traces = known[0]
-    ours = find_spikes(traces)
+    ours = detect_spikes(traces)
     recording = core.NumpyRecording([traces.read_uv(0, traces.samples)], RATE_HZ)
     recording.set_dummy_probe_from_locations(np.column_stack([np.arange(70) * 1e3, np.zeros(70)]))
     peaks = detect_peaks(
@@ -184,7 +184,7 @@ def stimulated() -> tuple[Traces, RawTraces]:
         x_um, y_um = culture.selection.array.position_um(culture.selection.recording)
     n = traces.voltage_uv.shape[1]
     table = Channels(np.arange(n).astype(str), np.arange(n), x_um, y_um)
-    return traces, RawTraces.of_array(traces.voltage_uv, table, traces.sampling_rate_hz)
+    return traces, RawTraces.from_array(traces.voltage_uv, table, traces.sampling_rate_hz)
 
 
 def in_window(
@@ -196,7 +196,7 @@ def in_window(
 
 def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tuple[Traces, RawTraces]) -> None:
     traces, source = stimulated
-    found = find_spikes(source, traces.stimulus_time_s, Detection())
+    found = detect_spikes(source, traces.stimulus_time_s, Detection())
     large = (traces.amplitude_uv > 8 * 2.4) & in_window(traces.spikes.time_s, traces.stimulus_time_s, (2, 10))
     kept = in_window(found.time_s, traces.stimulus_time_s, (2, 10))
     true_s, true_channel = traces.spikes.time_s, traces.spikes.channel
@@ -229,16 +229,16 @@ def test_responses_of_a_stimulated_culture_are_found_from_2_ms_on(stimulated: tu
 @pytest.mark.oracle
 def test_without_removing_artefacts_they_are_found_as_spikes(stimulated: tuple[Traces, RawTraces]) -> None:
     traces, source = stimulated
-    naive = find_spikes(source)
-    removed = find_spikes(source, traces.stimulus_time_s, Detection())
+    naive = detect_spikes(source)
+    removed = detect_spikes(source, traces.stimulus_time_s, Detection())
     count = [np.count_nonzero(in_window(f.time_s, traces.stimulus_time_s, (0, 10))) for f in (naive, removed)]
     assert count[0] > 1.3 * count[1]
 
 
 def test_a_window_is_not_eaten_unasked() -> None:
     assert Detection().blank_ms[1] <= 1.5
-    traces = RawTraces.of_array(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
-    found = find_spikes(traces, np.array([0.5]), Detection(blank_ms=(0.5, 3.0)))
+    traces = RawTraces.from_array(noisy(2, 1.0)[0], channels(2), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(traces, np.array([0.5]), Detection(blank_ms=(0.5, 3.0)))
     assert {f.name: f.severity for f in found.findings}["blanked"] == "warning"
 
 
@@ -267,8 +267,10 @@ def test_the_negative_peak_of_a_spike_in_coarse_steps_is_no_saturation(amplitude
         for channel, ms in enumerate(of_pulse):
             at = pulse + round(ms * 20)
             voltage[at - 20 : at + 41, channel] += amplitude * SPIKE_UV
-    traces = RawTraces.of_array(np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv)
-    found = find_spikes(traces, pulses / RATE_HZ, Detection())
+    traces = RawTraces.from_array(
+        np.rint(voltage / step_uv).astype(np.int16), channels(8), RATE_HZ, uv_per_step=step_uv
+    )
+    found = detect_spikes(traces, pulses / RATE_HZ, Detection())
     assert "saturated-channels" not in {finding.name for finding in found.findings}
     truth = [pulses + np.rint(late[:, channel] * 20).astype(np.int64) for channel in range(8)]
     hit, missed, _ = agreement(found, truth)
@@ -312,8 +314,8 @@ def test_a_decay_is_taken_away_and_spikes_on_it_are_left(tau_ms: float, size_uv:
 
 
 def test_pulses_in_quick_succession_and_at_the_ends_are_only_blanked() -> None:
-    traces = RawTraces.of_array(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
-    found = find_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), Detection())
+    traces = RawTraces.from_array(noisy(3, 0.5)[0], channels(3), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(traces, np.array([-0.001, 0.0, 0.1, 0.1005, 0.101, 0.4999, 0.5, 7.0]), Detection())
     assert np.all((found.time_s >= 0) & (found.time_s <= 0.5))
 
 
@@ -329,8 +331,8 @@ def test_who_is_saturated_for_long_is_blanked_to_its_end(until_ms: float, chunk_
     for start, stop in zip(first, last, strict=True):
         is_railed[start:stop] = True
     voltage[is_railed, 2] = 32_000
-    source = RawTraces.of_array(voltage, channels(6), RATE_HZ, uv_per_step=0.1)
-    found = find_spikes(source, pulses, Detection(chunk_s=chunk_s))
+    source = RawTraces.from_array(voltage, channels(6), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(source, pulses, Detection(chunk_s=chunk_s))
     sample = np.rint(found.time_s * RATE_HZ).astype(np.int64)
     on_it = sample[found.channel == 2]
     # Every spike found there is a true one, out of what is saturated and of the quarter of a millisecond after it.
@@ -358,8 +360,8 @@ def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(f
     for start_s in pulses[10:340:15]:
         is_railed[round(start_s * RATE_HZ) : round((start_s + 0.17) * RATE_HZ)] = True
     voltage[is_railed, 1] = 32_000
-    source = RawTraces.of_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
-    found = find_spikes(source, pulses, Detection(chunk_s=chunk_s))
+    source = RawTraces.from_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(source, pulses, Detection(chunk_s=chunk_s))
     on_it = np.rint(found.time_s[found.channel == 1] * RATE_HZ).astype(np.int64)
     assert not np.any(is_railed[on_it])
     assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1
@@ -387,10 +389,10 @@ def test_samples_that_are_no_numbers_are_blank_and_the_rest_of_the_channel_is_he
     lost[[10_000, 30_000], 1] = True
     lost[50_000:52_000, 1] = True
     lost[:, 3] = True
-    whole = find_spikes(RawTraces.of_array(voltage_uv, channels(4), RATE_HZ))
+    whole = detect_spikes(RawTraces.from_array(voltage_uv, channels(4), RATE_HZ))
     voltage_uv[lost] = np.nan
     voltage_uv[30_000, 1] = np.inf
-    found = find_spikes(RawTraces.of_array(voltage_uv, channels(4), RATE_HZ), np.array([1.0]))
+    found = detect_spikes(RawTraces.from_array(voltage_uv, channels(4), RATE_HZ), np.array([1.0]))
     assert np.all(np.isfinite(found.noise_uv)) and found.noise_uv[1] == pytest.approx(whole.noise_uv[1], rel=0.05)
     names = {f.name: f for f in found.findings}
     assert names["samples-lost"].value == lost.sum() and "2 of 4 channels" in names["samples-lost"].message
@@ -407,7 +409,7 @@ def test_dead_and_noisy_channels_are_said() -> None:
     voltage, _ = noisy(30, 1.0)
     voltage[:, 3] = 7
     voltage[:, 8] *= 20
-    found = find_spikes(RawTraces.of_array(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
+    found = detect_spikes(RawTraces.from_array(voltage, channels(30), RATE_HZ, uv_per_step=0.1))
     said = {finding.name: finding.value for finding in found.findings}
     assert (said["dead-channels"], said["noisy-channels"]) == (1, 1)
     assert 3 not in found.channel
@@ -423,9 +425,9 @@ def test_settings_that_cannot_be_are_refused(setting: str, value: object) -> Non
 
 
 def test_a_band_beyond_the_sampling_rate_is_refused() -> None:
-    traces = RawTraces.of_array(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
+    traces = RawTraces.from_array(np.zeros((4000, 1), np.int16), channels(1), 5000.0)
     with pytest.raises(InvalidArgument, match="less than half the sampling rate of 5000 Hz, got 3000 Hz"):
-        find_spikes(traces)
+        detect_spikes(traces)
 
 
 # --- from files ------------------------------------------------------------------------------------------------------
@@ -446,7 +448,7 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
     assert recording.channels.label.tolist() == ["3", "9", "40"]
     assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
     assert (recording.duration_s, len(recording.stimuli)) == (2.0, 1)
-    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
+    found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     hit, missed, false = agreement(found, [at[np.abs(at - 10_000) > 60] for at in truth])
     assert hit > 15
     assert missed == 0
@@ -454,7 +456,7 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
     assert "5 x median noise" in recording.provenance["spikes"]
     with h5py.File(path, "r+") as file:
         del file["wells/well000/rec0000/groups/routed/frame_nos"]
-    with pytest.raises(InvalidFile, match="by which they are aligned with stimuli, found none"):
+    with pytest.raises(InvalidFile, match="which aligns them with stimuli, found none"):
         read_traces(path, Detection())
     with h5py.File(path, "r+") as file:
         del file["wells/well000/rec0000/events"]
@@ -485,7 +487,7 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
     voltage, truth = noisy(2, 1.0, step_uv=1.0)
     write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
     recording = read_traces(tmp_path / "a.nwb", Detection())
-    found = FoundSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
+    found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     assert agreement(found, truth)[1] == 0
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
         del file["acquisition/traces/data"]

@@ -42,7 +42,7 @@ def test_the_example_of_the_cl1_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert recording.presentation.pulses == 5
 
 
-def test_the_first_commands_on_a_device_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_commands_on_a_device_run_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(monkeypatch)
     monkeypatch.chdir(tmp_path)
     steps = PAGE.split("## Before the first pulse")[1].split("## Limits")[0]

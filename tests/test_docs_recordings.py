@@ -1,4 +1,4 @@
-"""The examples of docs/recordings.md run as they are printed, one after the other."""
+"""The examples of docs/recordings.md run as printed, in order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Array, scan, selection, patterns. Oracles: counting by hand and brute force over all sets."""
+"""Array, scan, selection, patterns. Oracles: manual counts and brute force over all sets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from animat.stimulation.selection import Selection, SelectionRule, select_electr
 SMALL = ElectrodeArray("small", columns=20, rows=10, pitch_um=20.0, channels=60, stimulation_units=16)
 
 
-def test_the_maxone_is_as_large_as_the_paper_says() -> None:
+def test_the_maxone_has_the_size_stated_in_the_paper() -> None:
     assert len(MAXONE) == 26_400
     x_um, y_um = MAXONE.position_um(np.array([0, 219, 220, 26_399]))
     assert x_um.tolist() == [0.0, 219 * 17.5, 0.0, 219 * 17.5]
@@ -41,7 +41,7 @@ def test_scan_blocks_cover_every_electrode_once_in_26_blocks() -> None:
     assert len(blocks) == math.ceil(26_400 / 1024) == 26
     assert max(map(len, blocks)) <= 1024
     assert np.array_equal(np.concatenate(blocks), np.arange(26_400))
-    with pytest.raises(InvalidArgument, match="expected 1 to 1024 electrodes a block, got 2000"):
+    with pytest.raises(InvalidArgument, match="expected 1 to 1024 electrodes per block, got 2000"):
         MAXONE.scan_blocks(2000)
 
 
@@ -76,7 +76,7 @@ def test_recording_sites_pass_the_threshold_and_have_the_highest_rates() -> None
     assert (selection.scanned, selection.passed) == (200, len(passing))
 
 
-def test_with_a_spacing_the_best_of_the_neighbours_is_kept() -> None:
+def test_with_a_spacing_the_best_neighbour_is_kept() -> None:
     scan = scanned(SMALL)
     rule = SelectionRule(**(vars(RULE) | {"spacing_um": 30.0, "signal_to_noise": 4.0}))
     selection = select_electrodes(SMALL, scan, rule)
@@ -173,7 +173,7 @@ def test_every_pattern_is_equally_likely() -> None:
         ({"pattern_spacing_um": 500.0}, "ask for fewer patterns, fewer electrodes in each, a shorter distance"),
     ],
 )
-def test_what_cannot_be_had_is_refused_with_what_to_relax(rule: dict[str, Any], words: str) -> None:
+def test_criteria_that_cannot_be_met_are_refused_with_what_to_relax(rule: dict[str, Any], words: str) -> None:
     with pytest.raises(InvalidArgument, match=words):
         select_electrodes(SMALL, scanned(SMALL), SelectionRule(**(vars(RULE) | {"spacing_um": 0.0} | rule)))
 
@@ -203,10 +203,10 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
         Selection.load(tmp_path / "none.json")
 
 
-def test_a_scan_that_cannot_be_is_refused() -> None:
+def test_an_invalid_scan_is_refused() -> None:
     with pytest.raises(UnusableData, match=r"rate_hz: expected \d+ values in the scan, got shape"):
         scanned(SMALL, rate_hz=np.zeros(3))
     with pytest.raises(UnusableData, match="each electrode once"):
         scanned(SMALL, electrode=np.zeros(200))
     blocks = [scanned(SMALL, electrode=np.arange(200) + 200 * i) for i in range(2)]
-    assert len(ScannedActivity.of_blocks(blocks)) == 400
+    assert len(ScannedActivity.from_blocks(blocks)) == 400

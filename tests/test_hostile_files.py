@@ -1,4 +1,4 @@
-"""Files made by hand to hang or crash: protocols, selections, checkpoints. Each is one line; none is waited for."""
+"""Files made to hang or crash a reader: protocols, selections, checkpoints. Each is refused in one line, in time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SELECTION: dict[str, Any] = {
     ],
     ids=["nested", "digits", "more digits", "slow", "a list", "infinite", "long"],
 )
-def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
+def test_invalid_protocols_are_refused_in_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "p.json").write_text(text)
     with pytest.raises(InvalidFile, match=r"p\.json: ") as raised:
         read_protocol(tmp_path / "p.json")
@@ -58,12 +58,12 @@ def test_protocols_made_by_hand_are_one_line(text: str, tmp_path: Path) -> None:
         ({"recording": [1.5]}, "selection.recording: expected a whole number, got 1.5"),
         ({"recording": [10**30]}, "selection.recording: expected at most"),
         ({"recording": {}}, "selection.recording: expected a list"),
-        ({"patterns": [[1], [1, 2]]}, "selection.patterns: expected as many electrodes in each"),
+        ({"patterns": [[1], [1, 2]]}, "selection.patterns: expected the same number of electrodes in each"),
         ({"rule": {"spacing_um": "a"}}, "selection.rule.spacing_um: expected a number"),
         ({"seed": 1.5}, "expected a whole number, got 1.5"),
     ],
 )
-def test_selections_made_by_hand_are_one_line(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_invalid_selections_are_refused_in_one_line(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
     (tmp_path / "s.json").write_text(json.dumps(SELECTION))
     assert len(Selection.load(tmp_path / "s.json").recording) == 3
     (tmp_path / "s.json").write_text(json.dumps(SELECTION | changed))

@@ -17,7 +17,7 @@ from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.devices.maxone_sequences import dac_code
 from animat.cultures.devices.maxone_stream import EVENT_16, EVENT_24, ZmqSpikes
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
-from animat.recordings.formats.stimulus_text import said
+from animat.recordings.formats.stimulus_text import parse_line
 from animat.stimulation.array import MAXONE
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.protocol import Protocol
@@ -110,7 +110,7 @@ def test_what_comes_out_is_the_pulse_on_the_patterns_electrodes_and_nowhere_else
         assert [samples for samples, _ in pulse.phases] == [10, 10]
         np.testing.assert_allclose([mv for _, mv in pulse.phases], [-200, 200], atol=LSB_MV / 2)
         assert sum(samples * mv for samples, mv in pulse.phases) == 0
-    assert said(rig.events[0][1]) == {"electrodes": list(pattern), "pattern": 4}
+    assert parse_line(rig.events[0][1]) == {"electrodes": list(pattern), "pattern": 4}
 
 
 def test_pulses_that_do_not_balance_after_rounding_are_refused(rig: Rig) -> None:

@@ -60,7 +60,7 @@ def test_every_electrode_is_in_one_place_and_places_are_as_large(n: int, named: 
     "given_",
     ["thirds", [[1, 2], []], [[1, -2]], [[1.5]], [1, 2], {"left": [1]}, [[True]], [[1, 2], [2, 1]], 3],
 )
-def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, tmp_path: Path) -> None:
+def test_invalid_places_are_refused_and_their_file_is_named(given_: object, tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"^places: expected"):
         check_places(given_)
     file = tmp_path / "places.json"
@@ -73,7 +73,7 @@ def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, t
     file.write_text("[[1, 2]")
     with pytest.raises(
         InvalidFile,
-        match=r"places\.json: places: expected JSON as .*, got a mistake: .* line 1 column 8",
+        match=r"places\.json: places: expected JSON such as .*, got a mistake: .* line 1 column 8",
     ):
         read_places(str(file))
     with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):
@@ -107,7 +107,7 @@ def test_every_place_at_every_frequency_is_a_condition(order: str) -> None:
 
 
 def test_in_a_mixed_recording_a_place_may_follow_itself() -> None:
-    """As in a closed loop: a round of all places before any comes again would never show it."""
+    """As in a closed loop; rounds of all places would never show this."""
     protocol = Protocol((10.0,), "mixed", trials=500, places=LISTED)
     (block,) = make_schedule(protocol, np.zeros((100, 1), np.int64), 0, places=LISTED).blocks
     first = block.stimuli.electrodes[:, 0]
@@ -153,7 +153,7 @@ def test_the_command_says_how_to_train_on_places(
 
 
 @pytest.mark.parametrize(("hz", "by"), [((20.0,), "electrode"), ((5.0, 20.0), "frequency x electrode")])
-def test_places_are_conditions_where_none_are_asked_for(hz: tuple[float, ...], by: str) -> None:
+def test_places_are_the_default_conditions(hz: tuple[float, ...], by: str) -> None:
     protocol = Protocol(hz, "mixed", trials=20, places="halves", setup_s=0.0, pause_s=0.1)
     with small_culture() as culture:
         recording = culture.record(protocol)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from animat.recordings.findings import Finding
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.extraction import extract_responses
@@ -158,13 +158,11 @@ def test_channels_that_fire_as_no_neurons_do() -> None:
     rng = np.random.default_rng(0)
     usual = np.column_stack([rng.uniform(0, 10, 400), rng.integers(0, 30, 400)])
     hum = np.column_stack([np.arange(0, 10, 0.008), np.full(1250, 39)])
-    found = {f.name: f for f in noticed(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
+    found = {f.name: f for f in recording_findings(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
     assert (found["noisy-channels"].severity, found["noisy-channels"].value) == ("warning", 1)
-    assert (
-        "1 of 40 channels (39) fires as no neurons do and holds 76 % of all spikes" in found["noisy-channels"].message
-    )
+    assert "1 of 40 channels (39) fires as no neuron does and has 76 % of all spikes" in found["noisy-channels"].message
     assert (found["silent-channels"].severity, found["silent-channels"].value) == ("note", 9)
-    found = {f.name: f for f in noticed(recording(usual[:20], [1], 40, 10.0))}
+    found = {f.name: f for f in recording_findings(recording(usual[:20], [1], 40, 10.0))}
     assert found["silent-channels"].severity == "warning"
     assert "noisy-channels" not in found
 

@@ -1,4 +1,4 @@
-"""`animat record --protocol`: what is recorded is what the file says, and a file that cannot be is told at once."""
+"""`animat record --protocol` records what the file states, and refuses an impossible file immediately."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def replayed(synthetic: Path, tmp_path: Path) -> list[str]:
-    """The command that records a replay of a synthetic recording, as far as the protocol."""
+    """The command that records a replay of a synthetic recording, up to the protocol."""
     return ["record", "--culture", "replay", "--sessions", "1", "--recordings", str(synthetic), "--out",
             str(tmp_path / "out")]  # fmt: skip
 
 
-def test_a_culture_is_recorded_as_the_file_says(
+def test_a_culture_is_recorded_by_the_file(
     replayed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.json").write_text(MINE.to_json())
@@ -64,7 +64,7 @@ def test_a_culture_is_recorded_as_the_file_says(
     assert "got another (protocol.frequencies_hz[1]: 40.0 there, 20.0 now)" in capsys.readouterr().err
 
 
-def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path: Path) -> None:
+def test_what_the_file_leaves_out_takes_the_defaults(replayed: list[str], tmp_path: Path) -> None:
     """Patterns are as many as the culture has, which a replay of six has fewer of than usual; order and pulses too."""
     (tmp_path / "mine.json").write_text('{"trials": 6}')
     assert main([*replayed, "--protocol", str(tmp_path / "mine.json")]) == 0
@@ -72,7 +72,7 @@ def test_what_the_file_leaves_out_is_as_without_it(replayed: list[str], tmp_path
     assert recording.protocol == Protocol(order="mixed", patterns=6, trials=6, pulse=pulse_for("replay"))
 
 
-def test_electrodes_that_the_culture_does_not_have_are_told_with_their_file(
+def test_unknown_electrodes_are_reported_with_their_file(
     replayed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "mine.json"
@@ -131,7 +131,7 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
         (MINE.to_json(), ["--pulses", "1", "--trials", "100"], "got --pulses, --trials too"),
     ],
 )
-def test_what_cannot_be_is_one_line_before_a_culture_is_opened(
+def test_impossible_protocols_are_refused_before_a_culture_is_opened(
     culture: str,
     text: str | None,
     more: list[str],
@@ -162,7 +162,7 @@ def test_more_patterns_than_a_virtual_culture_has_are_refused_before_its_array_i
     assert not out.exists()
 
 
-def test_pulses_faster_than_the_response_window_are_warned_of(
+def test_pulses_faster_than_the_response_window_cause_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.cultures.series.record_series", lambda *_, **__: Series([], []))
@@ -184,7 +184,7 @@ def test_pulses_faster_than_the_response_window_are_warned_of(
         ({"paper": True, "pulses": 5}, 100),
     ],
 )
-def test_what_is_recorded_without_options_takes_less_than_the_interval(options: dict[str, Any], trials: int) -> None:
+def test_the_default_recording_takes_less_than_the_interval(options: dict[str, Any], trials: int) -> None:
     record = Record(**options)
     assert record._protocol().trials == trials
     check_interval(record._protocol(), 2, record.interval_min)
@@ -207,7 +207,7 @@ def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Pa
     assert float(whole) == pytest.approx(schedule.duration_s, abs=0.06)
 
 
-def test_what_is_no_protocol_is_refused_before_anything_is_delivered() -> None:
+def test_an_invalid_protocol_is_refused_before_anything_is_delivered() -> None:
     with FakeCulture() as culture:
         for other, got in (({"trials": 5}, r"\{'trials': 5\}"), (None, "None"), (Protocol, "<class")):
             with pytest.raises(InvalidArgument, match=rf"protocol: expected a Protocol, as .* makes one, got {got}"):

@@ -1,4 +1,4 @@
-"""The recording noun: what it refuses, that it cannot be changed, and when two are equal. Hand-made cases."""
+"""`Recording`: what it refuses, its immutability and equality. Hand-made cases."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 
 from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding, merged
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Channels, RecordedCulture, Recording
-from animat.recordings.told import from_words, in_words
+from animat.recordings.metadata import from_metadata, to_metadata
 from animat.stimulation.protocol import PAPER, Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
@@ -57,11 +57,11 @@ def recording(**changes: Any) -> Recording:
         ({"duration_s": 1.0}, r"spike_times_s: expected times within the recording \(-1 to 0 s\)"),
         ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
         ({"start_s": np.nan}, "start_s, duration_s: expected finite seconds"),
-        ({"start_min": np.nan}, "start_min: expected finite minutes, within a century, got nan"),
+        ({"start_min": np.nan}, "start_min: expected finite minutes within a century, got nan"),
         ({"sampling_rate_hz": 0.0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, or NaN"),
     ],
 )
-def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
+def test_a_recording_refuses_impossible_values(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(UnusableData, match=message):
         recording(**changes)
 
@@ -76,23 +76,23 @@ def test_a_recording_refuses_what_cannot_be(changes: dict[str, Any], message: st
         ),
         ({"frequency_hz": [0.0, 5.0]}, "expected positive frequencies"),
         ({"electrodes": [1, 2]}, r"stimuli.electrodes: expected shape \(stimuli, electrodes\)"),
-        ({"presentation": [1, 0]}, "stimuli.presentation: expected numbers that do not fall"),
+        ({"presentation": [1, 0]}, "stimuli.presentation: expected numbers that never fall over time"),
         ({"pattern": [1]}, "pattern: expected 2 values"),
     ],
 )
-def test_a_stimulus_table_refuses_what_cannot_be(changes: dict[str, Any], message: str) -> None:
+def test_a_stimulus_table_refuses_impossible_values(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(UnusableData, match=message):
         stimuli(**changes)
 
 
-def test_a_presentation_refuses_what_cannot_be() -> None:
+def test_a_presentation_refuses_impossible_values() -> None:
     with pytest.raises(InvalidArgument, match="pulses: expected at least 1, got 0"):
         Presentation("mixed", 0)
     with pytest.raises(InvalidArgument, match="order: expected 'blocked' or 'mixed'"):
         Presentation("shuffled")  # type: ignore[arg-type]
 
 
-def test_a_recording_cannot_be_changed_nor_does_it_hold_on_to_what_made_it() -> None:
+def test_a_recording_is_immutable_and_copies_its_inputs() -> None:
     times = np.array([-1.0, 0.5, 0.5])
     made = recording(spike_times_s=times, spike_channels=[2, 1, 0])
     times[0] = 7.0
@@ -125,12 +125,12 @@ def test_simultaneous_spikes_have_one_order() -> None:
         {"channels": channels(4)},
     ],
 )
-def test_recordings_that_differ_in_anything_are_not_equal(changes: dict[str, Any]) -> None:
+def test_recordings_that_differ_in_any_value_are_not_equal(changes: dict[str, Any]) -> None:
     assert recording().equals(recording())
     assert not recording(**changes).equals(recording())
 
 
-def test_the_response_is_read_after_the_last_pulse_of_a_presentation() -> None:
+def test_the_response_is_read_after_the_last_pulse_of_a_trial() -> None:
     table = Stimuli(np.arange(5.0), np.full(5, 5.0), np.zeros(5), np.zeros((5, 1)), np.array([0, 0, 0, 4, 4]))
     assert table.is_last_of_presentation.tolist() == [False, False, True, False, True]
 
@@ -139,16 +139,16 @@ def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
     noted = (Finding("a-thing", "warning", "something: odd"), Finding("another", "note", "less odd"))
     words = {"source": "virtual culture: of a test", "seed": "7", "of a rig": "its: words"}
     made = recording(provenance=words, protocol=PAPER, culture=RecordedCulture("virtual", 7), findings=noted)
-    again = from_words(in_words(made))
+    again = from_metadata(to_metadata(made))
     assert recording(**again).equals(made)
-    assert from_words({"source": "CL1 (device)", "pattern_seed": "3"})["culture"] == RecordedCulture("cl1", 3)
+    assert from_metadata({"source": "CL1 (device)", "pattern_seed": "3"})["culture"] == RecordedCulture("cl1", 3)
     given = {"source": "CL1 (the SDK's simulator) by animat.cultures.cl1", "pattern_seed": "none: they were given"}
-    assert from_words(given)["culture"] == RecordedCulture("cl1", None, is_simulated=True)
-    assert from_words({"source": "MaxOne by animat.cultures.maxone"})["culture"] == RecordedCulture("maxone")
-    assert from_words({"source": "rig.h5", "seed": "1"})["culture"] is None
+    assert from_metadata(given)["culture"] == RecordedCulture("cl1", None, is_simulated=True)
+    assert from_metadata({"source": "MaxOne by animat.cultures.maxone"})["culture"] == RecordedCulture("maxone")
+    assert from_metadata({"source": "rig.h5", "seed": "1"})["culture"] is None
     with pytest.raises(InvalidArgument, match="protocol: expected JSON"):
-        from_words({"protocol": "mixed"})
-    found = noticed(recording(findings=noted))
+        from_metadata({"protocol": "mixed"})
+    found = recording_findings(recording(findings=noted))
     assert [(f.name, f.severity, f.message) for f in found[:2]] == [
         ("a-thing", "warning", "something: odd"),
         ("another", "note", "less odd"),
@@ -161,10 +161,10 @@ def test_two_findings_of_one_name_are_both_kept() -> None:
     assert merged(noted) == (Finding("columns-left-out", "note", "x of a.csv; y of b.csv"),)
 
 
-def test_what_is_seen_in_the_data_is_said() -> None:
+def test_problems_in_the_data_are_reported() -> None:
     silent = recording(spike_times_s=[], spike_channels=[], stimuli=Stimuli([], [], [], np.empty((0, 1)), []))
-    assert {f.name: f.severity for f in noticed(silent)} == {"no-stimuli": "refuse", "no-spikes": "refuse"}
+    assert {f.name: f.severity for f in recording_findings(silent)} == {"no-stimuli": "refuse", "no-spikes": "refuse"}
     electrodes = np.full((2, 2), UNKNOWN)
     partly = recording(spike_channels=[0, 0, 0], stimuli=stimuli(electrodes=electrodes))
-    found = {f.name: f.value for f in noticed(partly)}
+    found = {f.name: f.value for f in recording_findings(partly)}
     assert found == {"silent-channels": 2.0, "stimulus-electrodes-unknown": 2.0, "presentation-unknown": None}

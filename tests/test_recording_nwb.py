@@ -129,7 +129,7 @@ def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(synthetic: Recording
         assert nwb.units.resolution == 1 / 20_000
 
 
-def test_who_recorded_what_goes_into_the_fields_of_nwb(synthetic: Recording, tmp_path: Path) -> None:
+def test_the_origin_is_written_to_nwbs_own_fields(synthetic: Recording, tmp_path: Path) -> None:
     import pynwb
 
     write_nwb(with_subject(synthetic), tmp_path / "a.nwb")
@@ -186,20 +186,20 @@ def with_subject(recording: Recording) -> Recording:
 
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_one_clear_line(synthetic: Recording, tmp_path: Path, share: float) -> None:
+def test_a_truncated_file_is_refused_in_one_line(synthetic: Recording, tmp_path: Path, share: float) -> None:
     path = tmp_path / "a.nwb"
     write_nwb(synthetic, path)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(
-        InvalidFile, match=r"a\.nwb: expected a whole (NWB|HDF5) recording, but it is cut off"
+        InvalidFile, match=r"a\.nwb: expected a complete (NWB|HDF5) recording, but it is cut off"
     ) as caught:
         read_recording(path)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.oracle
-def test_damage_anywhere_in_the_file_is_an_error_of_ours_or_harmless(synthetic: Recording, tmp_path: Path) -> None:
+def test_damage_anywhere_in_the_file_raises_our_error_or_is_harmless(synthetic: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
     write_nwb(synthetic, path)
     content = path.read_bytes()
@@ -267,7 +267,7 @@ except InvalidFile as error:
 
 
 @pytest.mark.oracle
-def test_a_full_disk_leaves_the_old_file_whole(synthetic: Recording, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_old_file_intact(synthetic: Recording, tmp_path: Path) -> None:
     path = tmp_path / "a.nwb"
     write_nwb(synthetic, path)
     before = path.read_bytes()
@@ -325,7 +325,7 @@ def test_a_cache_that_another_process_is_writing_is_not_read(tmp_path: Path) -> 
         {"provenance": {"source": "virtual culture of a colleague", "seed": "7"}},
     ],
 )
-def test_what_would_be_read_back_as_something_else_is_not_written(changed: dict[str, object], tmp_path: Path) -> None:
+def test_provenance_that_would_read_back_differently_is_not_written(changed: dict[str, object], tmp_path: Path) -> None:
     recording = replace(synthetic_recording(seed=1), **{"culture": None, "provenance": {}, **changed})
     with pytest.raises(InvalidArgument, match=r"^(provenance|culture): expected "):
         write_nwb(recording, tmp_path / "recording.nwb")

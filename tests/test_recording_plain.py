@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as npst
 from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.formats.npz import KEYS, OTHER_NAMES, ROUTING
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_recordings, read_source
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
@@ -35,7 +35,7 @@ def npz(folder: Path, **arrays: Any) -> Path:
 
 
 def names(recording: Recording) -> set[str]:
-    return {finding.name for finding in noticed(recording)}
+    return {finding.name for finding in recording_findings(recording)}
 
 
 # --- NPZ -------------------------------------------------------------------------------------------------------------
@@ -56,7 +56,7 @@ def test_the_required_keys_are_enough(tmp_path: Path) -> None:
 
 
 def said(recording: Recording) -> dict[str, str]:
-    """What was noticed when it was read, by name."""
+    """The names of the findings."""
     return {finding.name: finding.message for finding in recording.findings}
 
 
@@ -75,23 +75,21 @@ def test_spikes_out_of_order_are_those_with_a_later_one_anywhere_before_them(tim
         ({"stimulus_time_s": np.array([0.0, -1e300])}, "stimulus_time_s: expected times in seconds, within a century"),
         ({"sampling_rate_hz": 1e300}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz"),
         ({"stimulus_frequency_hz": np.array([1e300, 1])}, "frequency_hz: expected positive frequencies up to 1e.09 Hz"),
-        ({"start_min": -1e300}, "start_min: expected finite minutes, within a century, got -1e.300"),
-        ({"start_s": -1e300}, "start_s, duration_s: expected finite seconds, within a century, got -1e.300"),
-        ({"duration_s": 1e300}, "start_s, duration_s: expected finite seconds, within a century, got -0.25 and 1e.300"),
+        ({"start_min": -1e300}, "start_min: expected finite minutes within a century, got -1e.300"),
+        ({"start_s": -1e300}, "start_s, duration_s: expected finite seconds within a century, got -1e.300"),
+        ({"duration_s": 1e300}, "start_s, duration_s: expected finite seconds within a century, got -0.25 and 1e.300"),
         # Each of many rows would have room for it.
         ({"channel_label": np.array(["3", "x" * 1001])}, "channel_label: expected names of at most 1,000 characters"),
         ({"spike_channel": np.array(["3", "x" * 1001, "3"])}, "spike_channel: expected names of at most 1,000"),
         ({"stimulus_pattern": np.array(["3", "x" * 1001])}, "stimulus_pattern: expected names of at most 1,000"),
     ],
 )
-def test_what_no_recording_is_as_large_as_is_refused_by_name(
-    changed: dict[str, Any], words: str, tmp_path: Path
-) -> None:
+def test_implausibly_large_values_are_refused_by_name(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match=rf"a\.npz: .*{words}"):
         read_recording(npz(tmp_path, **{**SPIKES, **STIMULI, **changed}))
 
 
-def test_every_key_arrives_in_its_place(tmp_path: Path) -> None:
+def test_every_key_is_read_into_its_field(tmp_path: Path) -> None:
     recording = read_recording(
         npz(
             tmp_path,
@@ -228,7 +226,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "two lengths": (
         {"spike_channel": np.zeros(2)},
-        r"spike_channel: expected one channel a spike, shape \(3,\), got \(2,\)",
+        r"spike_channel: expected one channel per spike, shape \(3,\), got \(2,\)",
     ),
     "unknown label": (
         {"channel_label": np.array([3, 4])},
@@ -261,17 +259,17 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an electrode below 0": (
         {"stimulus_electrodes": np.array([[3, -1], [-7, -1]])},
-        "stimulus_electrodes: expected numbers of electrodes, .* got -7",
+        "stimulus_electrodes: expected electrode numbers, .* got -7",
     ),
-    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: expected, to know which 5"),
+    "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: required to know which 5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
-    "order as a number": ({"presentation_order": 1}, "presentation_order: expected a word, got 1"),
+    "order as a number": ({"presentation_order": 1}, "presentation_order: expected text, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
     "two rates": ({"sampling_rate_hz": np.ones(2)}, r"sampling_rate_hz: expected one value, got shape \(2,\)"),
     "no rate": ({"sampling_rate_hz": 0}, "sampling_rate_hz: expected a positive rate up to 1e.09 Hz, .*got 0"),
     "start that is not finite": (
         {"start_min": np.nan},
-        "start_min: expected finite minutes, within a century, got nan",
+        "start_min: expected finite minutes within a century, got nan",
     ),
     "duration too short": ({"duration_s": 1.0}, "expected times within the recording"),
     "negative duration": ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
@@ -287,7 +285,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_NPZ)
-def test_a_bad_npz_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+def test_a_bad_npz_is_refused_in_one_line_that_names_the_file(case: str, tmp_path: Path) -> None:
     changes, message = BAD_NPZ[case]
     arrays = changes if "missing" in case else SPIKES | STIMULI | changes
     with pytest.raises(InvalidFile, match=message) as caught:
@@ -306,7 +304,7 @@ ARRAYS = npst.arrays(
 @given(
     arrays=st.dictionaries(st.sampled_from([*KEYS, *OTHER_NAMES, *ROUTING]), ARRAYS, max_size=5), whole=st.booleans()
 )
-def test_any_arrays_at_all_are_read_or_are_one_clear_line(arrays: dict[str, Any], whole: bool, tmp_path: Path) -> None:
+def test_any_arrays_are_read_or_refused_in_one_line(arrays: dict[str, Any], whole: bool, tmp_path: Path) -> None:
     try:
         read_recording(npz(tmp_path, **((SPIKES | STIMULI if whole else {}) | arrays)))
     except InvalidFile as error:
@@ -314,16 +312,16 @@ def test_any_arrays_at_all_are_read_or_are_one_clear_line(arrays: dict[str, Any]
 
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.9, 0.99])
-def test_a_truncated_npz_is_one_clear_line(share: float, tmp_path: Path) -> None:
+def test_a_truncated_npz_is_refused_in_one_line(share: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(InvalidFile, match=r"a\.npz: expected a whole NPZ archive, but it is cut off or damaged"):
+    with pytest.raises(InvalidFile, match=r"a\.npz: expected a complete NPZ archive, but it is cut off or damaged"):
         read_recording(path)
 
 
-def test_a_damaged_npz_is_an_error_of_ours_or_harmless(tmp_path: Path) -> None:
+def test_a_damaged_npz_raises_our_error_or_is_harmless(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     path = npz(tmp_path, spike_time_s=rng.random(500), spike_channel=np.zeros(500), **STIMULI)
     content = path.read_bytes()
@@ -376,13 +374,13 @@ def test_csv_may_be_gzipped_and_have_a_byte_order_mark_and_windows_lines(tmp_pat
 def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
     recording = read_recording(csv(tmp_path, "time,channel\n0.5,1\n"))
     assert len(recording.stimuli) == 0
-    refusal = next(finding for finding in noticed(recording) if finding.name == "no-stimuli")
+    refusal = next(finding for finding in recording_findings(recording) if finding.name == "no-stimuli")
     assert refusal.severity == "refuse"
     assert "1 spikes but no stimuli" in refusal.message
     assert "a_stimuli.csv or a_stimuli.csv.gz was looked for" in refusal.message
 
 
-def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tmp_path: Path) -> None:
+def test_unusual_headers_and_decimal_commas_are_read_and_reported(tmp_path: Path) -> None:
     spikes = "Time (s); CHANNEL;\n0,0031;17;\n1,5;21;\n;;\n"
     recording = read_recording(csv(tmp_path, spikes, "Time [s]\tFrequency-Hz\n0,25\t5\n0,5\t12,5\n"))
     assert recording.spike_times_s.tolist() == [0.0031, 1.5]
@@ -397,7 +395,7 @@ def test_headers_and_decimal_commas_are_read_as_they_are_meant_and_it_is_said(tm
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=8).map(sorted))
-def test_times_of_three_decimals_are_read_where_one_cannot_be_thousands(milliseconds: list[int]) -> None:
+def test_times_with_three_decimals_are_read_if_one_cannot_be_thousands(milliseconds: list[int]) -> None:
     cells = [f"{ms // 1000},{ms % 1000:03}" for ms in milliseconds]
     with tempfile.TemporaryDirectory() as folder:
         path = csv(Path(folder), "time;channel\n" + "".join(f"{cell};5\n" for cell in cells))
@@ -435,21 +433,25 @@ BAD_CSV = {
         None,
         "line 2: .* got 3: .* decimal points, or sep.*semi",
     ),
-    "text with a comma": ("time,channel\n0.5,left, upper\n", None, "line 2: .* got 3: quote the text"),
+    "text with a comma": (
+        "time,channel\n0.5,left, upper\n",
+        None,
+        "line 2: .* got 3: quote text that contains the separator",
+    ),
     "commas that may be thousands": ("time;channel\n1,234;5\n", None, "line 2: .* decimal point, got '1,234'"),
     "commas and points": ("time;channel\n0.5;5\n0,5;5\n", None, "line 3: .* decimal point, got '0,5'"),
     "two headers of one name": ("Time,TIME,channel\n1,2,3\n", None, "line 1: expected one column time, got 'Time' and"),
     "spikes that are stimuli": ("time,frequency_hz\n1,5\n", None, "are spikes and stimuli swapped"),
-    "no header": ("0.5,3\n1,2\n", None, "line 1: expected a column .*found 0.5, 3: write the names"),
+    "no header": ("0.5,3\n1,2\n", None, "line 1: expected a column .*found 0.5, 3: add a line with the column names"),
     "the answer of a server": ("<html><body>404 not found</body></html>\n", None, "it is a web page, perhaps"),
     "blanks between columns": ("time channel\n1 2\n", None, "separate the columns by commas, semicolons or tabs"),
-    "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "take this first line out"),
+    "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "remove this first line"),
     "a quote that is not closed": (
         'time_s,channel\n0.1,a\n0.2,"b\n0.3,c\n',
         None,
         "line 3: expected a quote to be closed",
     ),
-    "times in milliseconds by name": ("time_ms,channel\n1,5\n", None, "bring the times of time_ms in seconds"),
+    "times in milliseconds by name": ("time_ms,channel\n1,5\n", None, "convert the times in time_ms to seconds"),
     "blank": ("\n\n", None, "expected a header line"),
     "stimuli without times": (
         "time,channel\n1,2\n",
@@ -470,7 +472,7 @@ BAD_CSV = {
 
 
 @pytest.mark.parametrize("case", BAD_CSV)
-def test_a_bad_csv_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+def test_a_bad_csv_is_refused_in_one_line_that_names_the_file(case: str, tmp_path: Path) -> None:
     spikes, stimuli, message = BAD_CSV[case]
     with pytest.raises(InvalidFile, match=message) as caught:
         read_recording(csv(tmp_path, spikes, stimuli))
@@ -479,18 +481,18 @@ def test_a_bad_csv_is_one_clear_line_that_names_the_file(case: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
-def test_a_truncated_gzip_is_one_clear_line(share: float, tmp_path: Path) -> None:
+def test_a_truncated_gzip_is_refused_in_one_line(share: float, tmp_path: Path) -> None:
     text = "time,channel\n" + "\n".join(f"{t / 7},{t % 5}" for t in range(400))
     content = gzip.compress(text.encode())
     (tmp_path / "a_spikes.csv.gz").write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(InvalidFile, match=r"expected a whole file, but it cannot be read or is cut off"):
+    with pytest.raises(InvalidFile, match=r"expected a complete file, but it cannot be read or is cut off"):
         read_recording(tmp_path / "a_spikes.csv.gz")
 
 
 # --- any file, folders -----------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
+def test_files_that_are_not_recordings_are_refused_in_one_line(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros(3))
     (tmp_path / "empty.nwb").touch()
     for name in ("b.nwb", "b.bin"):
@@ -507,14 +509,14 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
         "none.nwb": "no such file",
         "a.npy": "expected NPZ .* got NPY",
         "empty.nwb": "got an empty file",
-        "b.nwb": "expected HDF5 in a file of this name, got something else",
-        "b.bin": "expected a recording .NWB, MaxWell, CL1, NPZ or CSV., got a file of another kind",
+        "b.nwb": "expected HDF5 in a file with this name, got something else",
+        "b.bin": "expected a recording .NWB, MaxWell, CL1, NPZ or CSV., got an unknown kind of file",
         **{f"p{protocol}.pkl": "got a Python pickle, which is never read.*numpy.savez" for protocol in range(2, 6)},
         "latin.csv": "expected CSV .text in UTF-8., .* save it as CSV in UTF-8",
         "sheet.csv": "got text in UTF-16; save it as CSV in UTF-8",
         "m.mat": "got a MATLAB file; save its columns as CSV or NPZ",
         "sheet.xlsx": "got a spreadsheet; save its tables as CSV",
-        "a_stimuli.csv": "expected a file of spikes, got the stimuli beside it",
+        "a_stimuli.csv": "expected a spike file, got the stimuli that belong to one",
         ".": "got a folder; read_recordings reads folders",
     }.items():
         with pytest.raises(InvalidFile, match=message) as caught:
@@ -522,7 +524,7 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(InvalidArgument, match="start_min: expected finite minutes, got nan"):
         read_recording(tmp_path / "a.npy", start_min=float("nan"))
-    with pytest.raises(InvalidArgument, match="stimuli_path: expected only beside CSV"):
+    with pytest.raises(InvalidArgument, match="stimuli_path: expected only with CSV"):
         read_recording(npz(tmp_path, **SPIKES, **STIMULI), stimuli_path=tmp_path / "a_stimuli.csv")
 
 
@@ -542,7 +544,7 @@ def test_folders_are_read_in_the_order_of_the_cultures_clock(tmp_path: Path) -> 
     assert first_alone[0].equals(first)
 
 
-def test_two_recordings_of_one_time_and_empty_folders_are_refused(tmp_path: Path) -> None:
+def test_recordings_with_the_same_start_and_empty_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match=r"expected a folder of recordings .* found none in it"):
         read_recordings(tmp_path)
     with pytest.raises(InvalidArgument, match="paths: expected at least one file"):
@@ -584,7 +586,7 @@ def test_the_brainoware_recording(real_data: Path) -> None:
     np.testing.assert_allclose(np.diff(recording.stimuli.time_s), 5.0, atol=0.5)
 
 
-def test_a_file_of_responses_without_times_is_refused_by_its_keys(real_data: Path) -> None:
+def test_an_npz_of_counts_without_times_is_refused_by_its_keys(real_data: Path) -> None:
     said = r"expected times of spikes .*only counts \(culture0_spikes_per_electrode.*bring the times"
     with pytest.raises(AnimatError, match=said):
         read_recording(real_data / "rat_cortical_64ch_responses.npz")
@@ -605,7 +607,7 @@ def test_messages_say_what_is_missing(name: str, text: str, words: str, tmp_path
         read_source(tmp_path / name)
 
 
-def test_labels_in_text_and_a_negative_duration_are_said(tmp_path: Path) -> None:
+def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path) -> None:
     labels = {"channel_label": np.array(["17", "21", "40"])}
     numbers = {"spike_time_s": np.array([0.1, 0.2]), "spike_channel": np.array([17, 1])}
     with pytest.raises(InvalidFile, match="rows from 0 to 2, as these are numbers and channel_label is text, got 17"):

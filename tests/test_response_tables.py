@@ -1,4 +1,4 @@
-"""Tables of responses without spikes. Oracles: recordings whose counts they are, hand-written files, a real table."""
+"""Response tables without spikes. Oracles: recordings with the same counts, hand-written files, a real table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from animat.cli import main
 from animat.errors import AnimatError, InvalidFile
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_source, read_sources
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -100,7 +100,7 @@ def test_bursts_of_a_table_are_those_of_its_recording_where_few_ratios_occur() -
         np.testing.assert_array_equal(responses.is_burst, active == 30)
 
 
-def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
+def test_what_a_table_does_not_state_is_assumed_and_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_pattern=["a", "b", "a"])
     table = table_of(tmp_path / "a.npz")
     assert not table.has_times
@@ -110,16 +110,16 @@ def test_what_a_table_does_not_say_is_assumed_and_said(tmp_path: Path) -> None:
     assert responses.active_ratio.tolist() == [0.5, 0.0, 1.0]
     assert responses.time_s is None and not responses.presentations[0].is_rested.any()
     assert "window-assumed" in {f.name for f in responses.findings}
-    assert "stimulus-times-unknown" in {f.name for f in noticed(table)}
+    assert "stimulus-times-unknown" in {f.name for f in recording_findings(table)}
     text = inspection_text(inspect_recording(table, ByPattern()))
     assert "2.00 spikes in 2-10 ms per stimulus\n" in text
     assert "6 spikes on 2 channels, from 0 min" in text
 
 
-def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
+def test_periods_instead_of_frequencies_cause_a_warning(tmp_path: Path) -> None:
     def warned(frequency_hz: list[float]) -> list[str]:
         np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0], [2, 3]], stimulus_frequency_hz=frequency_hz)
-        return [f.message for f in noticed(table_of(tmp_path / "a.npz")) if f.name == "other-frequencies"]
+        return [f.message for f in recording_findings(table_of(tmp_path / "a.npz")) if f.name == "other-frequencies"]
 
     assert warned([0.2, 0.05, 0.0125]) == [
         "all frequencies are below 1 Hz, 0.0125 to 0.2: if they are periods in seconds, write 1 divided by each, "
@@ -129,11 +129,11 @@ def test_periods_in_place_of_frequencies_are_warned_of(tmp_path: Path) -> None:
     assert warned([0.2, 0.2, 0.2]) == warned([0.2, 0.5, 1.0]) == []
 
 
-def test_only_what_needs_spikes_refuses_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_commands_that_need_spikes_refuse_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]])
     assert main(["convert", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.nwb")]) == 1
-    assert "got a table of responses, which animat inspect, train and evaluate read" in capsys.readouterr().err
-    with pytest.raises(InvalidFile, match="this needs the times of spikes"):
+    assert "got a response table, which only animat inspect, train and evaluate read" in capsys.readouterr().err
+    with pytest.raises(InvalidFile, match="this needs spike times"):
         read_recording(tmp_path / "a.npz")
     (tmp_path / "b_responses.csv.gz").write_bytes(gzip.compress(b"count_1,start_min\n3,5\n"))
     assert [source.start_min for source in read_sources(tmp_path)] == [0.0, 5.0]
@@ -143,7 +143,7 @@ BAD = {
     "a negative count": ("count_1\n-2\n", "expected counts of 0 or more, got -2 for stimulus 1 on channel 1"),
     "a part of a spike": (
         "count_1\n0.5\n",
-        "whole, got 0.5 for stimulus 1 on channel 1; rates in Hz are called rate_hz",
+        "expected whole spike counts, got 0.5 for stimulus 1 on channel 1; if these are rates in Hz, name them rate_hz",
     ),
     "counts and rates": ("count_1,rate_hz_2\n1,2\n", "line 1: expected a column count_CHANNEL or rate_hz_.* got both"),
     "an empty count": ("count_1,count_2\n1,2\n1,\n", "line 3: count_2: expected a finite number, got an empty field"),
@@ -153,11 +153,14 @@ BAD = {
         "line 3: window_end_ms: expected the same in all lines, 9 as in the first, got 10",
     ),
     "a window backwards": ("count_1,window_start_ms,window_end_ms\n1,9,2\n", "window: expected 0 <= start < end"),
-    "a pair twice": ("trial,channel,count\n1,a,2\n1,b,2\n1,a,3\n", "line 4: expected one line a stimulus and channel"),
+    "a pair twice": (
+        "trial,channel,count\n1,a,2\n1,b,2\n1,a,3\n",
+        "line 4: expected one line per stimulus and channel",
+    ),
     "long without trials": ("channel,count\n1,2\n", "expected trial .or stimulus_time_s., channel, and count"),
     "a trial with two patterns": (
         "trial,pattern,channel,count\n1,left,a,1\n2,up,a,1\n1,right,b,1\n",
-        "line 4: stimulus_pattern: expected 'left' as in line 2, which is of the same stimulus, got 'right'",
+        "line 4: stimulus_pattern: expected 'left' as in line 2, of the same stimulus, got 'right'",
     ),
     "a trial with two frequencies": (
         "trial,frequency_hz,channel,count\n1,5,a,1\n1,,b,1\n",
@@ -168,7 +171,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_table_is_one_clear_line_that_names_the_file(case: str, tmp_path: Path) -> None:
+def test_a_bad_table_is_refused_in_one_line_that_names_the_file(case: str, tmp_path: Path) -> None:
     text, message = BAD[case]
     (tmp_path / "a_responses.csv").write_text(text)
     with pytest.raises(InvalidFile, match=message) as caught:
@@ -177,7 +180,7 @@ def test_a_bad_table_is_one_clear_line_that_names_the_file(case: str, tmp_path: 
 
 
 @pytest.mark.parametrize("head", ["Rate (Hz) {}", "rate_hz_{}", "RATE-HZ-{}", "rate [Hz]_{}", "count_{}", "Count {}"])
-def test_channels_are_called_what_their_headers_say_after_the_kind(head: str, tmp_path: Path) -> None:
+def test_channels_are_named_by_the_rest_of_their_headers(head: str, tmp_path: Path) -> None:
     labels = ["12", "A1", "(3,4)"]
     header = ";".join(head.format(label) for label in labels)
     (tmp_path / "a_responses.csv").write_text(f"{header}\n1;2;3\n")
@@ -209,7 +212,7 @@ def test_spikes_with_columns_of_counts_are_spikes(name: str, header: str, tmp_pa
     assert source.spike_times_s.tolist() == [0.1, 0.2]
 
 
-def test_a_transposed_table_is_told(tmp_path: Path) -> None:
+def test_a_transposed_table_is_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", response_count=np.zeros((3, 5)), stimulus_pattern=np.arange(5))
     with pytest.raises(InvalidFile, match=r"expected a row for each of 5 stimuli, got \(3, 5\): transpose it"):
         read_source(tmp_path / "a.npz")
@@ -232,7 +235,7 @@ def test_a_choice_that_a_table_does_not_offer_is_refused(
 
 @pytest.fixture
 def rat(real_data: Path, tmp_path: Path) -> list[str]:
-    """A published table as docs/recordings.md brings it in, and the options that it takes."""
+    """A published table, converted as in docs/recordings.md, and its options."""
     with np.load(real_data / "rat_cortical_64ch_responses.npz") as data:
         counts, sources = data["culture0_spikes_per_electrode"], data["culture0_sources"]
     file = tmp_path / "rat.npz"

@@ -1,4 +1,4 @@
-"""The place without electrodes: its trials take their time, nothing is delivered, the response is read as usual."""
+"""The place without electrodes: trials take their usual time, nothing is delivered, the response is read as usual."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_places_may_be_none_once() -> None:
             check_places(wrong)
 
 
-def test_a_rest_is_said_and_no_set_that_is_empty_by_mistake() -> None:
+def test_a_rest_is_explicit_and_not_a_set_that_is_empty_by_mistake() -> None:
     with pytest.raises(InvalidArgument, match="electrodes: expected none where nothing is delivered, got"):
         replace(REST, electrodes=(1,))
     with FakeCulture() as culture:
@@ -79,8 +79,8 @@ def test_a_rest_is_said_and_no_set_that_is_empty_by_mistake() -> None:
         assert culture.delivered == 0
 
 
-def test_a_culture_that_is_only_given_rests_is_one_that_is_left_alone() -> None:
-    """The virtual culture's spikes are, to the last one, those of a culture that time passed for."""
+def test_a_culture_given_only_rests_is_undisturbed() -> None:
+    """The virtual culture's spikes are exactly those of a culture that was left alone for the same time."""
     recording = recorded(small_culture(), NONE)
     assert len(recording.stimuli) == 12 and np.all(recording.stimuli.is_rest)
     with small_culture() as alone:
@@ -155,7 +155,7 @@ def test_after_an_emergency_stop_there_is_no_rest_either() -> None:
         culture.deliver([], 0.1)
 
 
-def test_stimuli_on_unknown_electrodes_are_no_rests() -> None:
+def test_stimuli_on_unknown_electrodes_are_not_rests() -> None:
     recording = recorded(small_culture(), NONE)
     unknown = replace(recording.stimuli, pattern=np.full(12, -1))
     assert not np.any(unknown.is_rest) and ByElectrode().assign(unknown).conditions == ()
@@ -231,7 +231,7 @@ def test_in_a_closed_loop_a_rest_is_a_trial_without_a_pulse(pulses: int, tmp_pat
     assert read_recording(session.recording_file).equals(recording) and session.ticks_file.read_bytes() == table
 
 
-def test_no_rest_comes_to_a_cl1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_rest_is_sent_to_a_cl1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     neurons = stand_in_cl.install(monkeypatch)
     with CL1Culture() as culture:
         run_session(culture, loop_of((1, 20, 40), CL1_PULSE, 2), [Agent("any", "", AnyCondition(2))], tmp_path)
@@ -241,7 +241,7 @@ def test_no_rest_comes_to_a_cl1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert 0 < n < len(list(session.ticks)) and len(neurons.pulses) == 2 * 3 * n
 
 
-def test_no_rest_comes_to_a_maxone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_rest_is_sent_to_a_maxone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = stand_in_maxlab.install(monkeypatch)
     picked = selection()
     sites = tuple(picked.stimulation[[0, 9, 31]].tolist())

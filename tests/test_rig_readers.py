@@ -1,4 +1,4 @@
-"""Readers of MaxWell, CL1 and other programs' NWB. Oracles: files made row by row, pynwb's writer."""
+"""Readers of MaxWell, CL1 and NWB from other programs. Oracles: files made row by row, pynwb's writer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
@@ -33,7 +33,7 @@ TABLE = mapping_table([3, 9, 40], [1000, 2000, 26_399])
 
 
 def found(recording: Recording) -> dict[str, str]:
-    return {finding.name: finding.message for finding in noticed(recording)}
+    return {finding.name: finding.message for finding in recording_findings(recording)}
 
 
 def said(frequency: float, presentation: int) -> str:
@@ -70,7 +70,7 @@ def test_maxwell_spikes_stimuli_and_electrodes(tmp_path: Path, linked: bool) -> 
     assert recording.provenance["recorded_at"].startswith("2023-11-14T22:13:20")
 
 
-def test_maxwell_events_with_strange_words_are_read_without_them(tmp_path: Path) -> None:
+def test_maxwell_events_with_unknown_text_are_read_without_it(tmp_path: Path) -> None:
     words = {"frequency_hz": 20, "order": [1, 2], "pulses": {"a": 1}, "electrodes": {"b": 2}, "pattern": "x"}
     path = write_maxwell(
         tmp_path / "a.h5",
@@ -83,7 +83,7 @@ def test_maxwell_events_with_strange_words_are_read_without_them(tmp_path: Path)
     assert recording.presentation is None
 
 
-def test_maxwell_channels_named_twice_are_one_channel(tmp_path: Path) -> None:
+def test_maxwell_channels_listed_twice_are_one_channel(tmp_path: Path) -> None:
     twice = mapping_table([3, 9, 9, 40, 40], [1000, 2000, 2000, 26_399, 7])
     path = write_maxwell(
         tmp_path / "a.h5", mapping=twice, spikes=spike_table([0.5, 0.6], [9, 40]), recorded=[3, 9, 40], events=None
@@ -91,7 +91,7 @@ def test_maxwell_channels_named_twice_are_one_channel(tmp_path: Path) -> None:
     recording = read_recording(path)
     assert recording.channels.label.tolist() == ["3", "9", "40"]
     assert recording.channels.electrode.tolist() == [1000, 2000, 26_399]
-    assert "names 2 channels again" in found(recording)["duplicate-channels"]
+    assert "repeats 2 channels; each counts once" in found(recording)["duplicate-channels"]
     assert "another electrode (1 times)" in found(recording)["duplicate-channels"]
     assert "no-stimuli" in found(recording)
 
@@ -103,17 +103,17 @@ def test_maxwell_only_recorded_channels_count_and_spikes_elsewhere_are_counted(t
     recording = read_recording(path)
     assert recording.channels.label.tolist() == ["3", "9"]
     assert recording.spike_times_s.tolist() == [0.5]
-    assert "2 of 3 spikes are on channels that no electrode is routed to" in found(recording)["spikes-not-routed"]
+    assert "2 of 3 spikes are on channels without a routed electrode" in found(recording)["spikes-not-routed"]
 
 
-def test_maxwell_without_groups_or_mapping_is_read_with_what_there_is(tmp_path: Path) -> None:
+def test_maxwell_is_read_without_groups_or_mapping(tmp_path: Path) -> None:
     spikes = spike_table([0.5, 0.25], [9, 40])
     recording = read_recording(write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spikes))
     assert recording.spike_times_s.tolist() == [0.0, 0.25]
     assert "the clock starts at the first spike" in found(recording)["clock-from-first-event"]
     recording = read_recording(write_maxwell(tmp_path / "b.h5", mapping=None, spikes=spikes))
     assert recording.channels.electrode.tolist() == [-1, -1]
-    assert "which electrode a channel reads is not known" in found(recording)["mapping-missing"]
+    assert "the electrodes of channels are not known" in found(recording)["mapping-missing"]
 
 
 def test_maxwell_without_spikes_says_what_to_do(tmp_path: Path) -> None:
@@ -151,7 +151,9 @@ def test_maxwell_raw_without_the_plugin_spikes_still_read(tmp_path: Path) -> Non
         compressed=True,
     )
     assert read_recording(path).spike_times_s.tolist() == [0.0005]
-    with pytest.raises(InvalidFile, match=r"compressed by filter 32001.*not installed.*HDF5_PLUGIN_PATH.*spikes that"):
+    with pytest.raises(
+        InvalidFile, match=r"compressed by filter 32001.*not installed.*HDF5_PLUGIN_PATH.*spikes detected by the rig"
+    ):
         read_traces(path)
 
 
@@ -172,7 +174,7 @@ def test_old_maxwell_reads_bits_as_stimuli(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("start", [0, 90_000_000])
-def test_cl1_spikes_and_stimuli_with_what_the_data_stream_says(tmp_path: Path, start: int) -> None:
+def test_cl1_spikes_and_stimuli_with_parameters_from_the_data_stream(tmp_path: Path, start: int) -> None:
     mark = tmp_path / "unpickled"
     path = write_cl1(
         tmp_path / "a",
@@ -217,7 +219,7 @@ def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\xd9\xff", packed_text("{" * 5000), packed_text("[]"), b"\xff" * 99])
-def test_what_the_data_stream_says_badly_is_left_out(tmp_path: Path, data: bytes) -> None:
+def test_invalid_parameters_in_the_data_stream_are_left_out(tmp_path: Path, data: bytes) -> None:
     path = write_cl1(tmp_path / "a.h5", spikes=[(5, 1)], stims=[(100, 2)], stream=[(50, data)])
     assert np.isnan(read_recording(path).stimuli.frequency_hz).all()
 
@@ -327,7 +329,7 @@ def test_links_to_other_files_are_never_followed(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file[f"{at}/spikes"]
         file[f"{at}/spikes"] = h5py.SoftLink(f"/{at}/spikes")
-    with pytest.raises(InvalidFile, match="links in a circle"):
+    with pytest.raises(InvalidFile, match="circular links"):
         read_recording(path)
 
 
@@ -337,19 +339,19 @@ def test_values_in_other_files_are_never_read(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["units/spike_times"]
         file.create_dataset("units/spike_times", (3,), "f8", external=[(str(tmp_path / "secret"), 0, 24)])
-    with pytest.raises(InvalidFile, match="they lie in other files, which are never opened"):
+    with pytest.raises(InvalidFile, match="they are in other files, which are never opened"):
         read_recording(path)
     with h5py.File(path, "r+") as file:
         del file["units/spike_times"]
         layout = h5py.VirtualLayout((3,), "f8")
         layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", (3,))
         file.create_virtual_dataset("units/spike_times", layout)
-    with pytest.raises(InvalidFile, match="they lie in other files, which are never opened"):
+    with pytest.raises(InvalidFile, match="they are in other files, which are never opened"):
         read_recording(path)
 
 
 @pytest.mark.parametrize("shape", [(2**40,), (2**62,), (2**31, 2**20)])
-def test_absurd_sizes_are_refused_before_memory_is_asked_for(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_absurd_sizes_are_refused_before_memory_is_allocated(tmp_path: Path, shape: tuple[int, ...]) -> None:
     path = other_nwb(tmp_path / "a.nwb")
     with h5py.File(path, "r+") as file:
         del file["units/spike_times"]
@@ -395,7 +397,7 @@ def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False
     return path
 
 
-def test_an_index_of_a_cl1_that_repeats_itself_tells_nothing_from_there_on(tmp_path: Path) -> None:
+def test_nothing_is_known_after_a_cl1s_index_repeats_itself(tmp_path: Path) -> None:
     said = [packed_text(json.dumps({"frequency_hz": hz, "pattern": n})) for n, hz in enumerate((5.0, 10.0, 20.0, 40.0))]
     frames = (1000, 2000, 3000, 4000)
     stims = [(frame, 2) for frame in frames]
@@ -412,9 +414,9 @@ def test_an_index_of_a_cl1_that_repeats_itself_tells_nothing_from_there_on(tmp_p
     assert "of the last 2 stimuli are not known" in lost.message
 
 
-def test_tables_that_may_be_stimuli_are_named_where_none_speaks_of_them(tmp_path: Path) -> None:
+def test_tables_that_may_be_stimuli_are_listed_if_none_is_named_like_stimuli(tmp_path: Path) -> None:
     path = write_trials(tmp_path / "a.nwb", None)
-    found = {f.name: f for f in noticed(read_recording(path))}
+    found = {f.name: f for f in recording_findings(read_recording(path))}
     listed = found["stimuli-elsewhere"].message
     assert found["no-stimuli"].severity == "refuse" and "intervals/sweeps" in listed and "--stimuli" in listed
     assert read_recording(path, stimuli="sweeps").stimuli.time_s.tolist() == pytest.approx([0.0, 0.2, 0.4])
@@ -428,12 +430,12 @@ def test_tables_that_may_be_stimuli_are_named_where_none_speaks_of_them(tmp_path
         (["7", "north", "9"], [[-1], [-1], [-1]]),
     ],
 )
-def test_electrodes_in_words_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
+def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
     recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
     assert recording.stimuli.electrodes.tolist() == read
 
 
 def test_the_advice_to_choose_names_the_commands_that_can(tmp_path: Path) -> None:
     path = other_nwb(tmp_path / "a.nwb", stimuli=("pulses", "events"))
-    with pytest.raises(InvalidFile, match="choose with --stimuli NAME, which animat inspect and animat convert have"):
+    with pytest.raises(InvalidFile, match="choose with --stimuli NAME in animat inspect or animat convert"):
         read_recording(path)

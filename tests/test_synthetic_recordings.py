@@ -1,4 +1,4 @@
-"""Synthetic recordings: the truth that was put in is found. Oracles: the gamma's closed forms, scikit-image's Otsu."""
+"""Synthetic recordings: their known truth is recovered. Oracles: the gamma's closed forms, scikit-image's Otsu."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from skimage.filters import threshold_otsu
 
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording, read_recordings
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
@@ -20,7 +20,7 @@ MEANS_HZ = {5: 30.0, 10: 36.0, 20: 42.0, 40: 48.0, 80: 54.0}
 
 
 def responses(recording: Recording) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """x and the ratio of active channels of each stimulus, counted one by one."""
+    """The response x and the active ratio of each stimulus, counted one by one."""
     x, ratio = [], []
     for time_s in recording.stimuli.time_s:
         first, last = np.searchsorted(recording.spike_times_s, [time_s + 0.002, time_s + 0.010])
@@ -71,7 +71,7 @@ def test_the_protocol_is_the_papers() -> None:
     xy_um = np.column_stack([used % 220, used // 220]) * 17.5
     distance_um = np.linalg.norm(xy_um[:, None] - xy_um[None], axis=-1)[~np.eye(32, dtype=bool)]
     assert distance_um.min() > 100
-    assert noticed(recording) == ()
+    assert recording_findings(recording) == ()
 
 
 def test_spikes_outside_the_window_come_at_the_background_rate() -> None:

@@ -14,7 +14,7 @@ from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import UnusableData
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import RecordedCulture, Recording
 from animat.responses.series import extract_series
@@ -27,7 +27,7 @@ REAL = ("organoid_cartpole_maxone.npz", "brainoware_spikes.csv.gz")
 
 
 def in_unit(source: Recording, spikes: float, stimuli: float | None = None) -> Recording:
-    """The recording with times in a unit of which so many make a second."""
+    """The recording with spike and stimulus times in units of which `spikes` and `stimuli` make a second."""
     stimulus_s = source.stimuli.time_s * (spikes if stimuli is None else stimuli)
     spike_s = source.spike_times_s * spikes
     events = np.concatenate([spike_s, stimulus_s])
@@ -46,7 +46,7 @@ def without_frequencies(source: Recording) -> Recording:
 
 
 def said(source: Recording) -> str | None:
-    return next((f.message for f in noticed(source) if f.name == "times-not-in-seconds"), None)
+    return next((f.message for f in recording_findings(source) if f.name == "times-not-in-seconds"), None)
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -81,7 +81,7 @@ def test_simulated_cultures_are_in_seconds_and_named_in_other_units(order: Order
 
 @settings(max_examples=30, deadline=None)
 @given(interval_s=st.floats(0.2, 600), frequencies=st.sampled_from([(5, 20), (5, 10, 20, 40, 80), (1, 100)]))
-def test_trains_named_by_their_frequency_and_given_at_a_steady_interval_are_in_seconds(
+def test_trains_presented_at_a_constant_interval_are_in_seconds(
     interval_s: float, frequencies: tuple[float, ...]
 ) -> None:
     # One row a train: the frequency is of the pulses within, and says nothing of the time to the next.
@@ -93,29 +93,29 @@ def test_trains_named_by_their_frequency_and_given_at_a_steady_interval_are_in_s
 
 @settings(max_examples=30, deadline=None)
 @given(frequencies=st.lists(st.floats(1, 100), min_size=2, max_size=6), pulses=st.sampled_from([35, 50, 100, 300]))
-def test_trains_back_to_back_a_row_each_are_never_refused(frequencies: list[float], pulses: int) -> None:
+def test_consecutive_trains_with_one_row_each_are_never_refused(frequencies: list[float], pulses: int) -> None:
     # The next train begins where the last one ends: intervals of pulses / f.
     frequency_hz = np.resize(frequencies, 60)
     stimulus_s = 1 + np.cumsum([0.0, *(pulses / frequency_hz[:-1])])
     spikes = [(t + 0.005, 0) for t in stimulus_s]
     source = of_spikes(spikes, stimulus_s, 4, stimulus_s[-1] + 60, frequency_hz=frequency_hz)
-    assert {f.severity for f in noticed(source) if f.name == "times-not-in-seconds"} <= {"warning"}
+    assert {f.severity for f in recording_findings(source) if f.name == "times-not-in-seconds"} <= {"warning"}
 
 
-def test_trains_back_to_back_are_asked_about() -> None:
+def test_consecutive_trains_cause_a_warning() -> None:
     frequency_hz = np.resize([5.0, 10.0, 20.0, 40.0], 60)
     stimulus_s = 1 + np.cumsum([0.0, *(100 / frequency_hz[:-1])])
     source = of_spikes([(1.005, 0)], stimulus_s, 4, stimulus_s[-1] + 60, frequency_hz=frequency_hz)
     assert "factor of 100: are they in another unit, or is each a train of pulses?" in str(said(source))
 
 
-def test_frequencies_that_are_nearly_alike_say_nothing_of_a_steady_interval() -> None:
+def test_similar_frequencies_do_not_prove_a_wrong_unit_of_a_constant_interval() -> None:
     stimulus_s = 10.0 * np.arange(1, 61)
     frequency_hz = np.resize([10.0, 10.2, 10.4], 60)
     assert said(of_spikes([(10.005, 0)], stimulus_s, 4, 620.0, frequency_hz=frequency_hz)) is None
 
 
-def test_a_quiet_culture_that_answers_is_in_seconds_however_long_it_is_recorded() -> None:
+def test_a_quiet_culture_that_responds_is_in_seconds_however_long_the_recording() -> None:
     # 40 channels, 12 h, a stimulus a minute that a third of the channels answer with two spikes.
     rng = np.random.default_rng(0)
     stimulus_s = 60.0 * np.arange(1, 720)
@@ -128,7 +128,7 @@ def test_a_quiet_culture_that_answers_is_in_seconds_however_long_it_is_recorded(
     ("per_s", "rate_hz", "unit"),
     [(1e3, 2.0, "milliseconds"), (1e3, 0.7, "milliseconds"), (20e3, 2.0, "samples"), (1e6, 2.0, "microseconds")],
 )
-def test_sorted_units_are_named_in_their_unit_first_and_doubt_is_said(
+def test_the_likeliest_unit_of_sorted_units_is_listed_first_with_perhaps(
     per_s: float, rate_hz: float, unit: str, sampling_rate_hz: float
 ) -> None:
     # 60 units that are refractory for 3 ms, and a stimulus a second.
@@ -171,39 +171,39 @@ def test_training_on_milliseconds_is_refused_unless_allowed(tmp_path: Path, caps
     assert len(extract_series([read_recording(tmp_path / "a.nwb")], allow=allowed)) == 1
 
 
-def test_more_stimuli_than_spikes_and_stimuli_of_one_time_are_said() -> None:
+def test_more_stimuli_than_spikes_and_simultaneous_stimuli_are_reported() -> None:
     source = answering({5.0: 3.0, 80.0: 6.0})
-    assert not {"more-stimuli-than-spikes", "simultaneous-stimuli"} & {f.name for f in noticed(source)}
+    assert not {"more-stimuli-than-spikes", "simultaneous-stimuli"} & {f.name for f in recording_findings(source)}
     few, many = source.stimuli.time_s[:20], np.linspace(0.1, source.duration_s, 200)
     swapped = of_spikes([(t, 0) for t in few], many, 1, source.duration_s)
-    names = {f.name: f for f in noticed(swapped)}
+    names = {f.name: f for f in recording_findings(swapped)}
     assert names["more-stimuli-than-spikes"].severity == "refuse"
     assert "are spikes and stimuli swapped?" in names["more-stimuli-than-spikes"].message
     # One unit, of which 70 % of the stimuli have one spike.
     sparse = of_spikes([(t + 0.005, 0) for t in many[:140]], many, 1, source.duration_s + 1)
-    assert {f.severity for f in noticed(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
+    assert {f.severity for f in recording_findings(sparse) if f.name == "more-stimuli-than-spikes"} == {"note"}
     twice = np.repeat(source.stimuli.time_s, 2)
     spikes = list(zip(source.spike_times_s.tolist(), source.spike_channels.tolist(), strict=True))
-    names = {f.name: f for f in noticed(of_spikes(spikes, twice, 40, source.duration_s))}
+    names = {f.name: f for f in recording_findings(of_spikes(spikes, twice, 40, source.duration_s))}
     assert names["simultaneous-stimuli"].message.startswith("120 of 240 stimuli")
     assert names["simultaneous-stimuli"].severity == "refuse"
     # Rows that belong to one presentation are read once.
     one = of_spikes(spikes, twice, 40, source.duration_s, presentation=np.repeat(np.arange(120), 2).tolist())
-    assert "simultaneous-stimuli" not in {f.name for f in noticed(one)}
+    assert "simultaneous-stimuli" not in {f.name for f in recording_findings(one)}
 
 
 def contradicted(stated_hz: np.ndarray) -> str | None:
     source = synthetic_recording(1, start_min=0.0, patterns=25, channels=16)
     stimuli = dataclasses.replace(source.stimuli, frequency_hz=stated_hz[: len(source.stimuli)])
-    found = noticed(dataclasses.replace(source, stimuli=stimuli))
+    found = recording_findings(dataclasses.replace(source, stimuli=stimuli))
     return next((f.message for f in found if f.name == "other-frequencies"), None)
 
 
-def test_frequencies_of_other_stimuli_are_warned_of() -> None:
+def test_frequencies_that_contradict_the_times_cause_a_warning() -> None:
     true_hz = synthetic_recording(1, start_min=0.0, patterns=25, channels=16).stimuli.frequency_hz
     assert contradicted(true_hz) is None
     swapped = np.select([true_hz == 5, true_hz == 80], [80.0, 5.0], true_hz)
-    assert "said to come at 5 Hz are 0.0125 s apart (median), not 0.2 s" in str(contradicted(swapped))
+    assert "with a stated frequency of 5 Hz are 0.0125 s apart (median), not 0.2 s" in str(contradicted(swapped))
     # Periods in place of frequencies.
     periods_s = str(contradicted(1 / true_hz))
     assert periods_s.endswith(": these are periods in seconds: write 1 divided by each, here 80")

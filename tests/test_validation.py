@@ -583,4 +583,4 @@ def test_a_recording_without_stimuli(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["validate", str(tmp_path / "quiet.npz")]) == 1
     (error,) = capsys.readouterr().err.strip().splitlines()
     assert "quiet.npz" in error
-    assert "bring the stimulus times too" in error
+    assert "provide the stimulus times too" in error

@@ -75,7 +75,7 @@ class Convert:
         from animat.progress import Bar
         from animat.recordings.conversion import Origin, convert_recording
         from animat.recordings.detection.settings import Detection
-        from animat.recordings.noticed import noticed
+        from animat.recordings.quality import recording_findings
 
         if self.recording.is_dir() and self.reader is None:
             raise InvalidFile(
@@ -114,7 +114,7 @@ class Convert:
             )
         n_spikes, n_stimuli = len(recording.spike_times_s), len(recording.stimuli)
         print(f"{self.out}: {n_spikes:,} spikes on {len(recording.channels):,} channels, {n_stimuli:,} stimuli")
-        findings = noticed(recording)
+        findings = recording_findings(recording)
         for finding in findings:
             print(f"  {finding.severity}: {finding.message}")
         return {

@@ -257,7 +257,7 @@ class VirtualCulture(ComputedCulture):
         self._progress.update(0, 1, f"scanning the array for {self._scan_s:g} s")
         spikes_of = np.bincount(tissue.advance(self._scan_s).neuron, minlength=len(tissue.x_um))
         blocks = [visibility.measure(block, spikes_of, self._scan_s, rng) for block in MAXONE.scan_blocks()]
-        return ScannedActivity.of_blocks(blocks)
+        return ScannedActivity.from_blocks(blocks)
 
     def _map_channels(self) -> None:
         """Look up the channels that see each neuron."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidFile
 from animat.recordings.recording import Recording
-from animat.recordings.told import in_words
+from animat.recordings.metadata import to_metadata
 from animat.writing import write_whole
 
 
@@ -85,9 +85,9 @@ def digest_of(path: Path) -> str:
     """
     if path.suffix != ".nwb":
         return sha256(path)
-    from animat.recordings.apart import read_hdf5_apart
+    from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 
-    return hashlib.sha256(_packed(read_hdf5_apart(path))).hexdigest()
+    return hashlib.sha256(_packed(read_hdf5_in_subprocess(path))).hexdigest()
 
 
 def _packed(recording: Recording) -> bytes:
@@ -99,7 +99,7 @@ def _packed(recording: Recording) -> bytes:
     words = {
         "numbers": {name: float(getattr(recording, name)) for name in numbers},
         "presentation": None if recording.presentation is None else asdict(recording.presentation),
-        "told": list(in_words(recording).items()),
+        "told": list(to_metadata(recording).items()),
     }
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)

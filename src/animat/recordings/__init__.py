@@ -1,5 +1,5 @@
-"""What was measured: the `Recording`, the files it comes from, and what was noticed about it.
+"""What was measured: the `Recording`, the file formats it is read from, and findings about its quality.
 
-`recording` holds the nouns, `reading` reads files in the `formats`, `columns` makes a recording of plain columns,
-`findings` and `noticed` say what is odd.
+`recording` defines the data, `reading` reads files in the `formats`, `columns` makes a recording from plain columns,
+and `findings` and `quality` report problems.
 """

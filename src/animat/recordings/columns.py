@@ -1,4 +1,4 @@
-"""From plain columns, as any laboratory has them, to a `Recording`: what every plain file format goes through."""
+"""Makes a `Recording` from plain columns, as any laboratory has them; all plain file formats use this."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
-from animat.recordings.empty_stretches import late_start
 from animat.recordings.findings import Finding, merged
+from animat.recordings.gaps import late_start
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Order, Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -20,34 +20,34 @@ from animat.tables import UNKNOWN, expect_times
 Column = np.ndarray[Any, Any]
 
 LONGEST_TEXT = 1_000
-"""Characters of a name: an array has room in each row for the longest of all."""
+"""Most characters of a name: an array reserves room for the longest name in every row."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlainColumns:
-    """Columns as a file brought them: unsorted, unchecked, most of them optional. `to_recording` checks them all.
+    """Columns as read from a file: unsorted, unchecked, most of them optional. `to_recording` checks them all.
 
     Attributes:
         spike_time_s: time of each spike in seconds, in any order, shape (spikes,).
         spike_channel: the channel of each spike, shape (spikes,). Looked up in `channel_label` if it is text, or if
-            the labels are numbers too. Numbers are else rows of the channel columns. Without any channel column the
-            distinct values are the channels, those that fired.
+            the labels are numbers too. Otherwise numbers are rows of the channel columns. Without any channel column,
+            the channels are the distinct values, those that fired.
         stimulus_time_s: start of each pulse in seconds, in any order, shape (stimuli,).
         channel_label: the rig's name of each channel, text or whole numbers, unique, shape (channels,).
-        channel_electrode: the electrode each channel reads, -1 for unknown, shape (channels,).
+        channel_electrode: the electrode each channel records, -1 for unknown, shape (channels,).
         channel_xy_um: the electrode's position, NaN for unknown, shape (channels, 2).
         stimulus_frequency_hz: NaN for unknown, shape (stimuli,).
         stimulus_pattern: whole numbers, -1 for unknown, or names, which are numbered in alphabetical order (an empty
-            one is unknown), shape (stimuli,).
+            name is unknown), shape (stimuli,).
         stimulus_electrodes: electrodes pulsed together, padded with -1, shape (stimuli, electrodes) or (stimuli,).
-        stimulus_presentation: presentation of each pulse, shape (stimuli,); by default, and where it is -1, a pulse is
-            one of its own.
+        stimulus_presentation: trial of each pulse, shape (stimuli,); by default, and where it is -1, each pulse is a
+            trial.
         sampling_rate_hz: of the raw signal, NaN for unknown.
         start_min: start on the culture's clock in minutes.
         start_s: start on the recording's clock; by default 0, or the first event if that is earlier.
         duration_s: by default up to the last event.
         presentation_order: `"blocked"` or `"mixed"`; by default not known.
-        presentation_pulses: pulses a trial.
+        presentation_pulses: pulses per trial.
     """
 
     spike_time_s: Column
@@ -68,17 +68,17 @@ class PlainColumns:
     presentation_pulses: int | None = None
 
     def to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...] = ()) -> Recording:
-        """Check and sort the columns and make a recording of them.
+        """Check and sort the columns and make a recording from them.
 
         Args:
-            findings: what was noticed so far; these and what is noticed here go with the recording.
+            findings: findings so far; they are kept in the recording together with those made here.
 
         Raises:
             UnusableData: naming the column, what was expected and what came.
         """
         for name in ("spike_channel", "channel_label", "stimulus_pattern"):
             dtype = np.asarray(getattr(self, name)).dtype
-            # Characters that every row of a column of text has room for.
+            # Characters for which every row of a text column has room.
             width = {"U": dtype.itemsize // 4, "S": dtype.itemsize}.get(dtype.kind, 0)
             if width > LONGEST_TEXT:
                 raise UnusableData(f"{name}: expected names of at most {LONGEST_TEXT:,} characters, got {width:,}")
@@ -113,7 +113,7 @@ class PlainColumns:
 
     def _channels(self, n_spikes: int, noted: list[Finding]) -> tuple[Channels, Int64[np.ndarray, " spikes"]]:
         """The channel table, and the row of each spike in it."""
-        values = _column("spike_channel", self.spike_channel, n_spikes, "one channel a spike")
+        values = _column("spike_channel", self.spike_channel, n_spikes, "one channel per spike")
         if nameless := int(np.count_nonzero(values == "" if _is_text(values) else values != values)):
             raise UnusableData(f"spike_channel: expected a channel for each spike, got {nameless} without one")
         if not _is_text(values):
@@ -122,19 +122,19 @@ class PlainColumns:
         for name in ("channel_label", "channel_electrode", "channel_xy_um"):
             if (column := getattr(self, name)) is not None:
                 if np.ndim(column) == 0:
-                    raise UnusableData(f"{name}: expected a value a channel, got a single one")
+                    raise UnusableData(f"{name}: expected one value per channel, got a single value")
                 lengths[name] = len(column)
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
             message = (
-                f"no table of channels: the {len(fired):,} that fired are taken for all; silent ones are not "
+                f"no channel table: the {len(fired):,} channels that fired are assumed to be all; silent ones are not "
                 "known, so rates per channel may be too high"
             )
             noted.append(Finding("silent-channels-unknown", "warning", message, float(len(fired))))
             return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
         if len(set(lengths.values())) > 1:
             raise UnusableData(
-                "channel columns: expected one row a channel in each, got "
+                "channel columns: expected one row per channel in each, got "
                 + ", ".join(f"{length} in {name}" for name, length in lengths.items())
             )
         n_channels = next(iter(lengths.values()))
@@ -143,7 +143,7 @@ class PlainColumns:
             labels = _whole("channel_label", labels)
         table = _channel_table(labels.astype(np.str_), self.channel_electrode, self.channel_xy_um)
         if self.channel_label is not None and (_is_text(values) or not _is_text(labels)):
-            return table, _looked_up(values.astype(np.str_), table.label)
+            return table, _rows_of(values.astype(np.str_), table.label)
         if _is_text(values):
             raise UnusableData("spike_channel: expected rows (whole numbers), as there is no channel_label; got text")
         outside = values[(values < 0) | (values >= n_channels)]
@@ -160,7 +160,7 @@ class PlainColumns:
         return _numbers("stimulus_frequency_hz", _column("stimulus_frequency_hz", self.stimulus_frequency_hz, n))
 
     def _patterns(self, n: int) -> tuple[Int64[np.ndarray, " stimuli"], dict[str, str]]:
-        """The pattern of each stimulus, and the names behind the numbers as provenance."""
+        """The pattern of each stimulus, and the patterns' names for the provenance."""
         if self.stimulus_pattern is None:
             return np.full(n, UNKNOWN), {}
         patterns = _column("stimulus_pattern", self.stimulus_pattern, n)
@@ -185,7 +185,7 @@ class PlainColumns:
         whole = _whole("stimulus_electrodes", electrodes)
         if whole.min(initial=UNKNOWN) < NOTHING:
             raise UnusableData(
-                f"stimulus_electrodes: expected numbers of electrodes, with {UNKNOWN} for none known and {NOTHING} for "
+                f"stimulus_electrodes: expected electrode numbers, with {UNKNOWN} for unknown and {NOTHING} for "
                 f"nothing delivered, got {whole.min()}"
             )
         return whole
@@ -197,23 +197,25 @@ class PlainColumns:
             column = _column("stimulus_presentation", self.stimulus_presentation, n)
             presentations: Int64[np.ndarray, " stimuli"] = _whole("stimulus_presentation", column)[in_time]
             unknown = presentations == UNKNOWN
-            # Numbers that fall are for `Stimuli` to refuse.
+            # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
                 return presentations
-            message = f"{unknown.sum():,} of {n:,} stimuli name no trial (-1): each of them is taken for a trial"
+            message = (
+                f"{unknown.sum():,} of {n:,} stimuli have no trial number (-1): each of them is treated as one trial"
+            )
             noted.append(Finding("trials-unknown", "note", message, float(unknown.sum())))
             return np.cumsum(np.append(True, np.diff(presentations) != 0) | unknown) - 1
         if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
             raise UnusableData(
-                f"stimulus_presentation: expected, to know which {self.presentation_pulses} pulses belong to one "
-                "presentation; it is missing"
+                f"stimulus_presentation: required to know which {self.presentation_pulses} pulses belong to one trial, "
+                "but missing"
             )
         return np.arange(n)
 
     def _presentation(self) -> Presentation | None:
         if self.presentation_order is None:
             if self.presentation_pulses is not None:
-                raise UnusableData("presentation_order: expected 'blocked' or 'mixed' beside presentation_pulses")
+                raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses")
             return None
         order: Order = self.presentation_order  # type: ignore[assignment]
         return Presentation(order, 1 if self.presentation_pulses is None else self.presentation_pulses)
@@ -229,16 +231,16 @@ class PlainColumns:
         return start_s, _duration_s(start_s, float(max([start_s, *events_s])))
 
 
-def started_at(recording: Recording, start_s: float) -> Recording:
-    """The recording with another start than it was read with, which is noted, and the end that it had.
+def with_start(recording: Recording, start_s: float) -> Recording:
+    """The recording with a new start, reported as a finding if it differs, and the same end.
 
     Raises:
-        UnusableData: if events come before it.
+        UnusableData: if events come before the new start.
     """
     duration_s = _duration_s(start_s, max(recording.stop_s, start_s))
     findings = tuple(finding for finding in recording.findings if finding.name != "start-unknown")
     if start_s != recording.start_s:
-        message = f"the recording starts at {start_s:.12g} s, as given, in place of {recording.start_s:.12g} s"
+        message = f"the recording starts at {start_s:.12g} s, as given, instead of {recording.start_s:.12g} s"
         findings += (Finding("start-given", "note", message, float(start_s)),)
     return replace(recording, start_s=float(start_s), duration_s=duration_s, findings=findings)
 
@@ -252,7 +254,7 @@ def _duration_s(start_s: float, stop_s: float) -> float:
 
 
 def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, float]:
-    """`start_s` and `duration_s` of so many frames from 0 on and all events, some of which may lie outside."""
+    """`start_s` and `duration_s` that cover `frames` frames from 0 on and all events, which may lie outside them."""
     every_s = np.concatenate(times_s)
     start_s = float(every_s.min(initial=0.0))
     # Half a frame more than the last event, so that no rounding puts it outside.
@@ -263,23 +265,23 @@ def recorded_span(frames: int, rate_hz: float, *times_s: Column) -> dict[str, fl
 def _in_time(
     name: str, column: Column, events: str, noted: list[Finding]
 ) -> tuple[Float64[np.ndarray, " events"], Int64[np.ndarray, " events"]]:
-    """The times sorted, and the (stable) order that sorts them; what was out of order is noted."""
+    """The sorted times and the (stable) order that sorts them; reports times that were out of order."""
     times_s = _numbers(name, np.asarray(column))
     if times_s.ndim != 1:
         raise UnusableData(f"{name}: expected one column of times in seconds, got shape {times_s.shape}")
     expect_times(name, times_s)
     order = np.argsort(times_s, kind="stable")
-    if early := out_of_order(times_s):
-        noted.append(unsorted(events, early, len(times_s)))
+    if early := count_out_of_order(times_s):
+        noted.append(unsorted_finding(events, early, len(times_s)))
     return times_s[order], order
 
 
-def out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
-    """How many times are earlier than one that stands anywhere before them, not only just before."""
+def count_out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
+    """How many times are earlier than any time listed before them, not only the one just before."""
     return int(np.count_nonzero(times_s < np.maximum.accumulate(times_s))) if len(times_s) else 0
 
 
-def unsorted(events: str, early: int, n: int) -> Finding:
+def unsorted_finding(events: str, early: int, n: int) -> Finding:
     """The note on events that were out of order in their file."""
     verbs = ("follows", "it was") if early == 1 else ("follow", "they were")
     message = f"{early:,} of {n:,} {events} {verbs[0]} a later one in the file; {verbs[1]} sorted by time"
@@ -295,7 +297,7 @@ def _channel_table(labels: Column, electrode: Column | None, xy_um: Column | Non
     return Channels(label=labels, electrode=electrodes, x_um=xy[:, 0], y_um=xy[:, 1])
 
 
-def _looked_up(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
+def _rows_of(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
     """The row of each value in the labels."""
     distinct, which = np.unique(values, return_inverse=True)
     row_of = {str(label): row for row, label in enumerate(labels)}
@@ -304,13 +306,13 @@ def _looked_up(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
     if len(unknown):
         n_spikes = np.count_nonzero(np.isin(values, unknown))
         raise UnusableData(
-            f"spike_channel: expected labels that channel_label names, got {n_spikes} spikes on "
+            f"spike_channel: expected labels listed in channel_label, got {n_spikes} spikes on "
             f"{len(unknown)} unknown channels (such as {str(unknown[0])!r})"
         )
     return rows[which.reshape(-1)]
 
 
-def _column(name: str, column: Column, n: int, expected: str = "one value a stimulus") -> Column:
+def _column(name: str, column: Column, n: int, expected: str = "one value per stimulus") -> Column:
     column = np.asarray(column)
     if column.shape != (n,):
         raise UnusableData(f"{name}: expected {expected}, shape ({n},), got {column.shape}")

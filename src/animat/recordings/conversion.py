@@ -1,11 +1,11 @@
-"""Any recording to animat's own NWB, with who recorded it and what of; raw traces become spikes on the way."""
+"""Converts any recording to animat's own NWB, with its origin, and detects spikes in raw traces on the way."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -27,33 +27,33 @@ DURATION = re.compile(
     r"(T(?=\d)(\d+(\.\d+)?H)?(\d+(\.\d+)?M)?(\d+(\.\d+)?S)?)?",
     re.ASCII,
 )
-"""ISO 8601: P, years, months, weeks and days, and after a T hours, minutes and seconds; one of them at least."""
+"""ISO 8601: P, years, months, weeks and days, and after a T hours, minutes and seconds; at least one of them."""
 
 DAYS = {"Y": 365.25, "M": 365.25 / 12, "W": 7.0, "D": 1.0}
 PERSON = re.compile(r"\s*[^,;]+,\s*[^,;]+")
 SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
-"""Genus and species, and perhaps the subspecies, or an address of NCBI's taxonomy."""
+"""Genus, species and optionally subspecies, or an address in NCBI's taxonomy."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Who recorded what, as NWB wants it; what is None stays as the file says.
+    """Who recorded what, in NWB's format; None keeps what the file states.
 
     Attributes:
-        subject_id: the culture's own name.
+        subject_id: name of the culture.
         species: in Latin, such as `Mus musculus`.
-        sex: `U` for unknown, as of most cultures.
-        age: ISO 8601 duration, such as `P42D`, or a range of two with a slash between, as NWB has it.
+        sex: `U` for unknown, as for most cultures.
+        age: ISO 8601 duration, such as `P42D`, or a range of two separated by a slash.
         subject_description: such as `dissociated cortical culture`.
         experimenter: `Last, First`; several separated by semicolons.
         institution, lab: where.
         keywords: separated by commas.
         recorded_at: ISO 8601 date.
-        experiment_description: in words.
+        experiment_description: as text.
 
     Raises:
-        InvalidArgument: for a `species` that is not in Latin, an `age` that is no duration, an `experimenter` without a
-            comma, or a `recorded_at` that is no date.
+        InvalidArgument: for a `species` that is not in Latin, an `age` that is not a duration, an `experimenter`
+            without a comma, or a `recorded_at` that is not a date.
     """
 
     subject_id: str | None = None
@@ -69,20 +69,20 @@ class Origin:
     experiment_description: str | None = None
 
     def __post_init__(self) -> None:
-        # Here and not when the file is written: finding spikes takes minutes.
+        # Checked here rather than when the file is written, as spike detection takes minutes.
         if self.species is not None and not SPECIES.fullmatch(self.species):
             expected = "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy"
             raise InvalidArgument(f"species: expected {expected}, got {self.species!r}")
         if self.age is not None:
             first, _, last = self.age.partition("/")
-            # The one duration of an age, or the two of a range, of which the last may be open.
+            # One duration, or two of a range, whose end may be open.
             if not all(map(DURATION.fullmatch, (first, last) if last else (first,))):
                 expected = "an ISO 8601 duration such as P42D (days), P6W or P3M"
                 raise InvalidArgument(f"age: expected {expected}, got {self.age!r}")
             if last and _days(last) < _days(first):
-                raise InvalidArgument(f"age: expected a range from the younger to the older, got {self.age!r}")
+                raise InvalidArgument(f"age: expected a range with the younger age first, got {self.age!r}")
         if self.experimenter is not None and not all(map(PERSON.fullmatch, self.experimenter.split(";"))):
-            expected = "Last, First, as NWB has it, several separated by semicolons"
+            expected = "Last, First, several separated by semicolons"
             raise InvalidArgument(f"experimenter: expected {expected}, got {self.experimenter!r}")
         if self.recorded_at is not None:
             try:
@@ -91,9 +91,9 @@ class Origin:
                 expected = "an ISO 8601 date such as 2024-05-31T14:00:00+09:00"
                 raise InvalidArgument(f"recorded_at: expected {expected}, got {self.recorded_at!r}") from error
 
-    def words(self) -> Mapping[str, str]:
-        """What is given, as entries of `Recording.provenance`."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+    def to_provenance(self) -> Mapping[str, str]:
+        """The values given, as entries of `Recording.provenance`."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 def convert_recording(
@@ -114,52 +114,52 @@ def convert_recording(
 
     Args:
         out: the NWB file, complete or absent.
-        detection: find the spikes in raw traces, in this way; None: take the spikes that the file has.
-        reader: the format's name for SpikeInterface; the spikes are then found in its traces.
+        detection: detect spikes in raw traces with these settings; None: use the file's own spikes.
+        reader: SpikeInterface's name of the format; spikes are then detected in its traces.
         stimuli_path, stimuli, part, start_min, start_s: as in `read_recording`.
-        progress: of finding spikes.
+        progress: of spike detection.
 
     Returns:
-        What was written.
+        The recording that was written.
 
     Raises:
-        InvalidFile: if the file cannot be read, or the new one not be written.
+        InvalidFile: if the file cannot be read, or the new one cannot be written.
         InvalidArgument: for a choice that the format does not offer, or an `out` that exists or does not end in .nwb.
     """
     path, out = Path(path), Path(out)
     if out.exists():
-        # It may be the recording itself, or its stimuli; whatever it is, somebody made it.
-        raise InvalidArgument(f"--out: expected a name that is not taken, got {out}, which exists; choose another")
+        # It may be the recording itself or its stimuli, and is someone's work in any case.
+        raise InvalidArgument(f"--out: expected a new file, got {out}, which exists; choose another name")
     if out.suffix != ".nwb":
-        raise InvalidArgument(f"--out: expected a name that ends in .nwb, as NWB is written, got {out}")
+        raise InvalidArgument(f"--out: expected a name ending in .nwb, as NWB is written, got {out}")
     if reader is not None and (stimuli is not None or part is not None):
         raise InvalidArgument(f"stimuli, part: expected none for traces read with a reader, got {stimuli or part!r}")
     if (detection is not None or reader is not None) and start_s is not None:
-        raise InvalidArgument(f"start_s: expected none beside raw traces, which say when they start, got {start_s:g}")
+        raise InvalidArgument(f"start_s: expected none for raw traces, which state their start, got {start_s:g}")
     if reader is None and detection is not None and stimuli_path is not None:
         raise InvalidArgument(
-            f"stimuli_path: expected only beside CSV spikes or traces read with a reader, got {stimuli_path}, but "
+            f"stimuli_path: expected only with CSV spikes or traces read with a reader, got {stimuli_path}, but "
             f"{path} holds its own stimuli"
         )
     if reader is not None:
         traces, base = open_with_spikeinterface(path, reader, stimuli_path=stimuli_path)
-        recording = _with_spikes_of(traces, base, detection, progress)
+        recording = _with_detected_spikes(traces, base, detection, progress)
     elif detection is not None:
         recording = read_traces(path, detection, part=part, stimuli=stimuli, progress=progress)
     else:
         recording = read_recording(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part, start_s=start_s)
-    words = {} if origin is None else origin.words()
-    # A subject without a sex is of an unknown one.
-    unsaid = {"sex": "U"} if "subject_id" in words else {}
+    given = {} if origin is None else origin.to_provenance()
+    # The sex of a subject is unknown unless stated.
+    default = {"sex": "U"} if "subject_id" in given else {}
     start_min = recording.start_min if start_min is None else start_min
-    recording = replace(recording, provenance={**unsaid, **recording.provenance, **words}, start_min=float(start_min))
+    recording = replace(recording, provenance={**default, **recording.provenance, **given}, start_min=float(start_min))
     recording = replace(recording, findings=(*recording.findings, *_without_zone(recording)))
     write_nwb(recording, out)
     return recording
 
 
 def _days(age: str) -> float:
-    """How long an ISO 8601 duration of `DURATION` is, in days; months and years are those of the mean calendar."""
+    """The length in days of an ISO 8601 duration that matches `DURATION`, with mean months and years."""
     date, _, time = age[1:].partition("T")
     days = sum(float(number) * DAYS[unit] for number, unit in re.findall(r"([\d.]+)([YMWD])", date))
     seconds = {"H": 3600.0, "M": 60.0, "S": 1.0}
@@ -167,7 +167,7 @@ def _days(age: str) -> float:
 
 
 def _without_zone(recording: Recording) -> Iterator[Finding]:
-    """A note on a date that names no time zone."""
+    """A note on a date without a time zone."""
     recorded_at = recording.provenance.get("recorded_at", "")
     try:
         is_without = datetime.fromisoformat(recorded_at).tzinfo is None
@@ -175,7 +175,7 @@ def _without_zone(recording: Recording) -> Iterator[Finding]:
         return
     if is_without and all(finding.name != "zone-unknown" for finding in recording.findings):
         message = (
-            f"recorded_at {recorded_at} names no time zone and is taken for UTC; add it, such as +09:00, after the time"
+            f"recorded_at {recorded_at} has no time zone and is taken as UTC; add one after the time, such as +09:00"
         )
         yield Finding("zone-unknown", "note", message)
 
@@ -188,11 +188,11 @@ def read_traces(
     stimuli: str | None = None,
     progress: Progress | None = None,
 ) -> Recording:
-    """Find the spikes in a file's raw traces (MaxWell, CL1, NWB) and make a recording of them.
+    """Detect the spikes in a file's raw traces (MaxWell, CL1, NWB) and make a recording from them.
 
     Args:
         part, stimuli: as in `read_recording`.
-        progress: told after each piece.
+        progress: updated after each piece.
 
     Raises:
         InvalidFile: if the file holds no raw traces, or they cannot be read.
@@ -201,41 +201,41 @@ def read_traces(
     path = Path(path)
     magic = first_bytes(path)
     if not magic.startswith(HDF5):
-        held = "another file"
+        kind = "another file"
         if magic.startswith(ZIP) or path.name.endswith(TEXT_NAMES):
-            held = f"{'NPZ' if magic.startswith(ZIP) else 'CSV'}, which holds spikes (leave out --raw to convert these)"
+            kind = f"{'NPZ' if magic.startswith(ZIP) else 'CSV'}, which holds spikes (leave out --raw to convert these)"
         raise InvalidFile(
-            f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {held}; for traces in another format name "
+            f"{path}: expected HDF5 with raw traces (MaxWell, CL1, NWB), got {kind}; for traces in another format name "
             "it with --reader, such as intan"
         )
     traces, base = open_traces(path, part=part, stimuli=stimuli)
-    return _with_spikes_of(traces, base, settings, progress)
+    return _with_detected_spikes(traces, base, settings, progress)
 
 
-def _with_spikes_of(
+def _with_detected_spikes(
     traces: RawTraces, base: Recording, settings: Detection | None, progress: Progress | None
 ) -> Recording:
-    """A recording with the spikes of its raw traces in place of its own; how they were found goes into its provenance.
+    """The recording with spikes detected in its raw traces instead of its own, and the settings in its provenance.
 
     Args:
         base: channels (those of the traces), stimuli, span and provenance.
     """
-    from animat.recordings.detection.finding_spikes import find_spikes
+    from animat.recordings.detection.spikes import detect_spikes
 
     settings = settings or Detection()
-    found = find_spikes(traces, base.stimuli.time_s, settings, progress=progress)
+    detected = detect_spikes(traces, base.stimuli.time_s, settings, progress=progress)
     band = "as recorded" if settings.band_hz is None else f"{settings.band_hz[0]:g}-{settings.band_hz[1]:g} Hz"
     how = (
         f"{band}, {settings.threshold:g} x median noise, dead time {settings.dead_time_ms:g} ms, blanked "
         f"{settings.blank_ms[0]:g} ms before to {settings.blank_ms[1]:g} ms after stimuli"
     )
-    # A spike is at its sample, which rounding may put an ulp outside of the span.
-    time_s = np.clip(found.time_s, base.start_s, base.stop_s)
+    # Rounding may put a spike's sample an ulp outside the span.
+    time_s = np.clip(detected.time_s, base.start_s, base.stop_s)
     return replace(
         base,
         spike_times_s=time_s,
-        spike_channels=found.channel,
+        spike_channels=detected.channel,
         sampling_rate_hz=traces.sampling_rate_hz,
         provenance={**base.provenance, "spikes": how},
-        findings=merged((*base.findings, *found.findings)),
+        findings=merged((*base.findings, *detected.findings)),
     )

@@ -1,4 +1,4 @@
-"""Raw traces: the voltage of all channels over time, read piece by piece from wherever it is kept."""
+"""Raw traces: the voltage of all channels over time, read piece by piece from any source."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ TILE_SAMPLES, TILE_CHANNELS = 256, 64
 
 
 def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np.ndarray, "samples channels"]:
-    """Traces in microvolts, each channel in one stretch of memory, as filters want it.
+    """Traces in microvolts, with each channel contiguous in memory, as filters need it.
 
     Args:
         steps: of any number type, in any layout, shape (samples, channels).
     """
     samples, channels = steps.shape
     rows = np.empty((channels, samples), dtype=np.float32)
-    # In tiles: a whole column of 1,024 channels' samples is a step of 4 KB each, for which caches have few places.
-    # Copied so, a second of 1,024 channels takes a quarter of the time.
+    # In tiles: with 1,024 channels, successive samples of a column are 4 KB apart, for which caches have few places.
+    # This takes a quarter of the time for a second of 1,024 channels.
     for first in range(0, channels, TILE_CHANNELS):
         block = slice(first, first + TILE_CHANNELS)
         for start in range(0, samples, TILE_SAMPLES):
@@ -35,14 +35,14 @@ def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np
 
 @dataclass(frozen=True, eq=False)
 class RawTraces:
-    """Raw traces of a recording. May be read from several threads.
+    """Raw traces of a recording. Can be read from several threads.
 
     Attributes:
-        read_uv: the voltage of samples `start` to `stop` of all channels, in microvolts, shape (samples, channels):
-            `read_uv(start, stop)`. What is read from it channel by channel is read faster where it lies so in memory
+        read_uv: `read_uv(start, stop)` returns the voltage of samples `start` to `stop` of all channels, in microvolts,
+            shape (samples, channels). Processing it by channel is faster if each channel is contiguous in memory
             (`in_microvolts`).
-        channels: the table of channels, one a column.
-        samples: how many each channel has.
+        channels: the channel table, one row per column.
+        samples: of each channel.
         start_s: time of the first sample on the recording's clock.
     """
 
@@ -53,7 +53,7 @@ class RawTraces:
     start_s: float = 0.0
 
     @classmethod
-    def of_array(
+    def from_array(
         cls,
         voltage_uv: np.ndarray[Any, Any],
         channels: Channels,
@@ -65,12 +65,12 @@ class RawTraces:
 
         Args:
             voltage_uv: shape (samples, channels), any number type.
-            channels: one a column.
+            channels: one per column.
             start_s: time of the first sample.
-            uv_per_step: what one step of `voltage_uv` is, 1 for microvolts.
+            uv_per_step: microvolts per step of `voltage_uv`.
 
         Raises:
-            InvalidArgument: for another shape.
+            InvalidArgument: for a wrong shape.
         """
         if voltage_uv.ndim != 2 or voltage_uv.shape[1] != len(channels):
             raise InvalidArgument(

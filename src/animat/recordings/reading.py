@@ -1,4 +1,4 @@
-"""Read recordings in any known format; the format is known by a file's content, not by its name."""
+"""Reads recordings in any known format, detected from the file's content, not its name."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
 from animat.plain_file import expect_plain_file, is_folder, is_nothing
-from animat.recordings.apart import read_hdf5_apart
-from animat.recordings.columns import started_at
+from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
 from animat.recordings.formats.npz import read_npz
-from animat.recordings.formats.responses_plain import (
+from animat.recordings.formats.response_files import (
     is_response_csv,
     is_response_npz,
     read_response_csv,
     read_response_npz,
 )
+from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 
@@ -39,11 +39,11 @@ OTHERS = {
     b"\xfe\xff": "text in UTF-16; save it as CSV in UTF-8",
     b"MATLAB": "a MATLAB file; save its columns as CSV or NPZ",
 }
-"""How files begin that are often given for recordings and are none, and what to do with them."""
+"""First bytes of files that are often mistaken for recordings, and what to do with them."""
 HDF5_NAMES = (".nwb", ".h5", ".hdf5")
 TEXT_NAMES = (".csv", ".csv.gz", ".tsv", ".txt")
 IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz", "*_responses.csv", "*_responses.csv.gz")
-"""Names that are taken from a folder for recordings."""
+"""Files in a folder that are read as recordings."""
 
 
 def read_recording(
@@ -55,24 +55,24 @@ def read_recording(
     start_min: float | None = None,
     start_s: float | None = None,
 ) -> Recording:
-    """Read one recording: NWB, MaxWell, CL1 (HDF5), NPZ (zip) or CSV (text, gzipped or not), known by its content.
+    """Read one recording: NWB, MaxWell, CL1 (HDF5), NPZ (zip) or CSV (text, gzipped or not), detected by its content.
 
     Args:
-        stimuli_path: the file of stimuli, for CSV only; by default the one beside the spikes.
-        stimuli: which of several things in a file are the stimuli: NWB of other programs, the name; MaxWell, the
-            events' type.
-        part: which recording of a MaxWell file that holds several, such as `well000/rec0000`.
-        start_min: when the recording started on the culture's clock, in minutes; by default what the file says.
-        start_s: when it started on the clock of its own times, in seconds, for a file that does not say so.
+        stimuli_path: the stimulus file, for CSV only; by default the one next to the spikes.
+        stimuli: which of several candidates in a file are the stimuli: in NWB from other programs, the name; in
+            MaxWell, the events' type.
+        part: which recording of a MaxWell file with several, such as `well000/rec0000`.
+        start_min: start on the culture's clock, in minutes; by default the one in the file.
+        start_s: start on the recording's own clock, in seconds, for a file that does not state it.
 
     Returns:
-        The recording, sorted and checked; what was noticed on the way is in its provenance (see
-        `animat.recordings.noticed`).
+        The recording, sorted and checked; problems noticed on the way are in its findings (see
+        `animat.recordings.quality`).
 
     Raises:
         InvalidFile: naming the file, what was expected and what came.
-        InvalidArgument: for a `stimuli_path` beside a file that holds its own stimuli, a choice that the format does
-            not offer, or a `start_min` or `start_s` not finite.
+        InvalidArgument: for a `stimuli_path` with a file that holds its own stimuli, a choice that the format does not
+            offer, or a `start_min` or `start_s` that is not finite.
     """
     path = Path(path)
     if start_min is not None and not np.isfinite(start_min):
@@ -82,12 +82,12 @@ def read_recording(
     source = _read(path, stimuli_path, stimuli, part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(
-            f"{path}: expected spikes, got a table of responses, which animat inspect, train and evaluate read; "
-            "this needs the times of spikes"
+            f"{path}: expected spikes, got a response table, which only animat inspect, train and evaluate read; "
+            "this needs spike times"
         )
     if start_s is not None:
         try:
-            source = started_at(source, start_s)
+            source = with_start(source, start_s)
         except UnusableData as error:
             raise InvalidFile(f"{path}: {error}") from error
     return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
@@ -96,7 +96,7 @@ def read_recording(
 def read_source(
     path: str | os.PathLike[str], *, stimuli: str | None = None, part: str | None = None
 ) -> Recording | ResponseTable:
-    """Read what responses can be had from: a recording, or a table of responses without spikes.
+    """Read any source of responses: a recording, or a response table without spikes.
 
     Args:
         stimuli, part: as in `read_recording`.
@@ -113,13 +113,13 @@ def _read(
     magic = first_bytes(path)
     if magic.startswith((HDF5, ZIP)) and stimuli_path is not None:
         raise InvalidArgument(
-            f"stimuli_path: expected only beside CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
+            f"stimuli_path: expected only with CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
         )
     if (stimuli is not None or part is not None) and not magic.startswith(HDF5):
         raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
         if magic.startswith(HDF5):
-            return read_hdf5_apart(path, part=part, stimuli=stimuli)
+            return read_hdf5_in_subprocess(path, part=part, stimuli=stimuli)
         if read_table := _response_reader(path, magic):
             return read_table(path)
         if magic.startswith(ZIP):
@@ -130,15 +130,15 @@ def _read(
             raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
         return _read_text(path, stimuli_path)
     except (UnusableData, InvalidArgument) as error:
-        # These name the column at fault but not the file.
+        # These name the column but not the file.
         raise InvalidFile(f"{path}: {error}") from error
     except (*DAMAGE, RecursionError, AssertionError) as error:
-        # What no reader foresaw: still a file that cannot be read, and one line.
+        # Errors that no reader anticipated: report them in one line too.
         raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
 
 
 def _response_reader(path: Path, magic: bytes) -> Callable[[Path], ResponseTable] | None:
-    """What reads a table of responses; None for any other file."""
+    """The reader of a response table; None for any other file."""
     if magic.startswith(ZIP):
         return read_response_npz if is_response_npz(path) else None
     is_text = not magic.startswith((HDF5, NPY)) and not _other_kind(path, magic)
@@ -147,7 +147,7 @@ def _response_reader(path: Path, magic: bytes) -> Callable[[Path], ResponseTable
     try:
         return read_response_csv if is_response_csv(path) else None
     except InvalidFile:
-        # Whoever reads it in full says better what is wrong with it.
+        # The full reader gives a better error.
         return None
 
 
@@ -158,8 +158,8 @@ def _read_text(path: Path, stimuli_path: str | os.PathLike[str] | None) -> Recor
         if path.suffix.lower() not in HDF5_NAMES or stimuli_path is not None:
             raise
         raise InvalidFile(
-            f"{path}: expected HDF5 in a file of this name, got something else (text, perhaps, or the answer of a "
-            "server in its place); copy it again"
+            f"{path}: expected HDF5 in a file with this name, got something else (perhaps text, or a server's error "
+            "page); copy it again"
         ) from error
 
 
@@ -167,22 +167,22 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
     """Read recordings from files and folders, in the order of the culture's clock.
 
     Args:
-        paths: files, or folders that hold `*.nwb`, `*.h5`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`; one or more.
+        paths: one or more files, or folders with `*.nwb`, `*.h5`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`.
 
     Returns:
         The recordings, sorted by `start_min`.
 
     Raises:
-        InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings of one time.
+        InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings with the same start.
         InvalidArgument: if no path is given.
     """
     return _in_order(list_recordings(paths), read_recording)
 
 
 def read_sources(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording | ResponseTable]:
-    """Read recordings, and tables of responses without spikes, in the order of the culture's clock.
+    """Read recordings and response tables in the order of the culture's clock.
 
-    Args and errors are those of `read_recordings`; tables in folders are `*.npz`, `*_responses.csv` and
+    Arguments and errors are those of `read_recordings`; response tables in folders are `*.npz`, `*_responses.csv` and
     `*_responses.csv.gz`.
     """
     return _in_order(list_recordings(paths), read_source)
@@ -193,21 +193,21 @@ def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
     for (earlier, file), (later, other) in pairwise(read):
         if earlier.start_min == later.start_min:
             raise InvalidFile(
-                f"{other}: expected recordings of different times, but this one and {file} both start at "
-                f"{later.start_min:g} min; leave one out, or give it another time (animat convert --start-min)"
+                f"{other}: expected recordings with different starts, but this one and {file} both start at "
+                f"{later.start_min:g} min; leave one out, or change its start (animat convert --start-min)"
             )
     return [recording for recording, _ in read]
 
 
 def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files of recordings among paths: files themselves, and the recordings in folders, in the order of names.
+    """The recording files among paths: files as given, and those in folders in the order of their names.
 
     Raises:
         InvalidFile: for a folder without recordings.
         InvalidArgument: if no path is given.
     """
-    given = [paths] if isinstance(paths, str | os.PathLike) else paths
-    files = [file for path in given for file in _files(Path(path))]
+    listed = [paths] if isinstance(paths, str | os.PathLike) else paths
+    files = [file for path in listed for file in _files(Path(path))]
     if not files:
         raise InvalidArgument("paths: expected at least one file or folder of recordings, got none")
     return files
@@ -219,30 +219,30 @@ def _files(path: Path) -> list[Path]:
             raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
         return [expect_plain_file(path)]
     try:
-        # A folder that cannot be read looks empty to glob.
+        # To glob, an unreadable folder looks empty.
         next(path.iterdir(), None)
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
-    # Hidden files are unfinished ones.
-    found = sorted({f for pattern in IN_FOLDERS for f in path.glob(pattern) if not f.name.startswith(".")})
-    if not found:
+    # Hidden files are unfinished.
+    files = sorted({f for pattern in IN_FOLDERS for f in path.glob(pattern) if not f.name.startswith(".")})
+    if not files:
         raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it")
-    return found
+    return files
 
 
 def _other_kind(path: Path, magic: bytes) -> str | None:
-    """What a file is that is no text, neither gzipped nor under a name of HDF5, which has an error of its own."""
+    """The kind of a file that is not text; None for text, gzipped files and HDF5 names, which have their own errors."""
     if path.suffix.lower() in HDF5_NAMES or magic.startswith(b"\x1f\x8b"):
         return None
     with path.open("rb") as file:
         is_binary = b"\0" in file.read(4096)
     # Text in UTF-16 is full of zeros, and a pickle need not have any.
     known = next((kind for begin, kind in OTHERS.items() if magic.startswith(begin)), None)
-    return known or ("a file of another kind" if is_binary else None)
+    return known or ("an unknown kind of file" if is_binary else None)
 
 
 def first_bytes(path: Path) -> bytes:
-    """How a file begins, which tells its kind; raises InvalidFile for what is no file, or empty."""
+    """A file's first bytes, which identify its format; raises InvalidFile if it is not a file, or empty."""
     if is_folder(path):
         raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders")
     try:

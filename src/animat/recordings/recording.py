@@ -1,4 +1,4 @@
-"""What was measured: spikes on channels, and the stimuli between them, as immutable arrays."""
+"""What was measured: spikes on channels, and stimuli, as immutable arrays."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, f
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """The table of recording channels: row i says where channel i sits.
+    """The table of recording channels: row i states where channel i is.
 
-    A *channel* is a row of this table; its `label` is what the rig called it (a channel number, a sorted unit's
-    number), its `electrode` the site on the array that it reads. The three are never interchangeable.
+    A *channel* is a row of this table; its `label` is its name on the rig (a channel number, a sorted unit's number),
+    its `electrode` the site on the array that it records. The three are never interchangeable.
 
     Attributes:
         label: the rig's own name of each channel, unique, shape (channels,), strings.
-        electrode: the electrode each channel reads, `UNKNOWN` where it is not known, shape (channels,).
-        x_um, y_um: the electrode's position in micrometres, NaN where it is not known, shape (channels,).
+        electrode: the electrode each channel records, `UNKNOWN` if not known, shape (channels,).
+        x_um, y_um: the electrode's position in micrometres, NaN if not known, shape (channels,).
     """
 
     __repr__, __reduce__ = briefly, made_anew
@@ -46,7 +46,7 @@ class Channels:
 
     @staticmethod
     def on(array: ElectrodeArray, electrode: Int64[np.ndarray, " channels"], label: Any = None) -> Channels:
-        """The table of channels that read these electrodes; without labels they are numbered from 0.
+        """The channel table for these electrodes; without labels, channels are numbered from 0.
 
         Raises:
             InvalidArgument: for an electrode that is not on the array.
@@ -69,11 +69,11 @@ _CULTURES = {"virtual": "virtual culture", "replay": "replay of recordings", "cl
 
 @dataclass(frozen=True)
 class RecordedCulture:
-    """Which culture a recording is of.
+    """The culture that was recorded.
 
     Attributes:
         kind: as `animat.cultures.kinds` names it.
-        seed: of a virtual culture, or of a CL1's patterns; None where none was drawn.
+        seed: of a virtual culture, or of a CL1's patterns; None if none was drawn.
         is_simulated: whether a simulator stands in for the device, as the CL1's SDK has one.
     """
 
@@ -95,21 +95,21 @@ class Recording:
     recording on the culture's clock.
 
     Attributes:
-        spike_times_s: times of all spikes, rising, shape (spikes,).
-        spike_channels: the row in `channels` of each spike, shape (spikes,). Spikes given at one and the same time
-            are put in the order of their channels, so that one set of spikes has one order.
-        sampling_rate_hz: of the raw signal the spikes were detected in, NaN where it is not known.
+        spike_times_s: times of all spikes, in ascending order, shape (spikes,).
+        spike_channels: the row in `channels` of each spike, shape (spikes,). Simultaneous spikes are sorted by channel,
+            so that a set of spikes has only one order.
+        sampling_rate_hz: of the raw signal in which the spikes were detected, NaN if not known.
         start_s: start of the recording on its own clock.
         duration_s: from `start_s`; all spikes and stimuli lie within.
         start_min: start on the culture's clock, in minutes.
-        presentation: how stimuli were presented, None where it is not known.
-        provenance: where the recording came from, words by words, for people.
-        protocol: that it was recorded by, None where it is not known.
-        culture: which one it is of, None where that is not known.
-        findings: what was noticed when it was read, or its spikes were found.
+        presentation: how stimuli were presented, None if not known.
+        provenance: where the recording came from, as text by keyword, for people.
+        protocol: with which it was recorded, None if not known.
+        culture: that was recorded, None if not known.
+        findings: made when the recording was read or its spikes were detected.
 
     Raises:
-        UnusableData: for times that are not finite or do not rise, or rows that no table names.
+        UnusableData: for times that are not finite or not in ascending order, or rows outside the tables.
     """
 
     __repr__, __reduce__ = briefly, made_anew
@@ -139,18 +139,18 @@ class Recording:
                 f"got {self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
             )
         self._order_simultaneous_spikes()
-        # Spikes and stimuli up to a century before and after 0 are two apart.
+        # Events up to a century before and after 0 are up to two centuries apart.
         if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
             length = ", the latter 0 or more" if self.duration_s < 0 else ""
             raise UnusableData(
-                f"start_s, duration_s: expected finite seconds, within a century{length}, got {self.start_s:g} and "
+                f"start_s, duration_s: expected finite seconds within a century{length}, got {self.start_s:g} and "
                 f"{self.duration_s:g}"
             )
         if not abs(self.start_min) <= CENTURY_S / 60:
-            raise UnusableData(f"start_min: expected finite minutes, within a century, got {self.start_min:g}")
+            raise UnusableData(f"start_min: expected finite minutes within a century, got {self.start_min:g}")
         if self.sampling_rate_hz <= 0 or self.sampling_rate_hz > FASTEST_HZ:
             raise UnusableData(
-                f"sampling_rate_hz: expected a positive rate up to {FASTEST_HZ:g} Hz, or NaN where it is not known, "
+                f"sampling_rate_hz: expected a positive rate up to {FASTEST_HZ:g} Hz, or NaN if not known, "
                 f"got {self.sampling_rate_hz:g}"
             )
         for name, times in (("spike_times_s", self.spike_times_s), ("stimuli.time_s", self.stimuli.time_s)):
@@ -161,7 +161,7 @@ class Recording:
                 )
 
     def _order_simultaneous_spikes(self) -> None:
-        # Files keep spikes by channel: without one order for ties, a recording would not read back equal.
+        # Files store spikes by channel: without a fixed order of ties, a recording would not read back equal.
         ties_fall = (np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)
         if np.any(ties_fall):
             channels = self.spike_channels[np.lexsort((self.spike_channels, self.spike_times_s))]
@@ -174,7 +174,7 @@ class Recording:
         return self.start_s + self.duration_s
 
     def equals(self, other: Recording) -> bool:
-        """Whether every array and every value of the two recordings is the same (NaN equals NaN)."""
+        """Whether all arrays and values of the two recordings are equal (NaN equals NaN)."""
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
 

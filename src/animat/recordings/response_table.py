@@ -1,4 +1,4 @@
-"""A table of responses: what each channel did after each stimulus, as a count or a rate, without times of spikes."""
+"""A response table: a count or a rate for each stimulus and channel, without spike times."""
 
 from __future__ import annotations
 
@@ -22,24 +22,25 @@ Kind = Literal["count", "rate_hz"]
 
 @dataclass(frozen=True, eq=False)
 class ResponseTable:
-    """What many laboratories publish in place of spikes: a count or a rate a stimulus and channel.
+    """A count or a rate for each stimulus and channel, which many laboratories publish instead of spikes.
 
     Attributes:
-        values: spikes in the window, or their rate in Hz, a row a stimulus in the order of presentation, shape
+        values: spikes in the window, or their rate in Hz, one row per stimulus in order of presentation, shape
             (stimuli, channels).
         kind: which of the two.
-        channels: the channel table, a row a column of `values`.
-        stimuli: the stimulus table, a row a row of `values`.
-        has_times: whether `stimuli.time_s` are times; False: they number the rows.
-        window_ms: the window after the stimulus that the spikes were counted in, None where it is not known.
+        channels: the channel table, one row per column of `values`.
+        stimuli: the stimulus table, one row per row of `values`.
+        has_times: whether `stimuli.time_s` are times; otherwise they number the rows.
+        window_ms: the window after the stimulus in which spikes were counted, None if not known.
         start_min: start on the culture's clock, in minutes.
-        presentation: how stimuli were presented, None where it is not known.
-        provenance: where the table came from, words by words, for people.
-        findings: what was noticed when it was read.
-        protocol: None, as none is told.
+        presentation: how stimuli were presented, None if not known.
+        provenance: where the table came from, as text by keyword, for people.
+        findings: made when it was read.
+        protocol: None, as files do not state it.
 
     Raises:
-        UnusableData: for values that are negative or not finite, counts that are not whole, or tables of other lengths.
+        UnusableData: for values that are negative or not finite, counts that are not whole, or tables of the wrong
+            length.
     """
 
     values: Float64[np.ndarray, "stimuli channels"]
@@ -60,26 +61,23 @@ class ResponseTable:
         shape = (len(self.stimuli), len(self.channels))
         if values.shape != shape:
             raise UnusableData(
-                f"responses: expected a row a stimulus and a column a channel, {shape}, got {values.shape}"
+                f"responses: expected one row per stimulus and one column per channel, {shape}, got {values.shape}"
             )
         wrong = ~np.isfinite(values) | (values < 0)
         if np.any(wrong):
             row, column = np.argwhere(wrong)[0]
+            kind = "counts" if self.kind == "count" else "rates in Hz"
             raise UnusableData(
-                f"responses: expected {self._words} of 0 or more, got {values[row, column]:g} for stimulus {row + 1} "
+                f"responses: expected {kind} of 0 or more, got {values[row, column]:g} for stimulus {row + 1} "
                 f"on channel {self.channels.label[column]} ({np.count_nonzero(wrong):,} such)"
             )
         if self.kind == "count" and np.any(values != np.round(values)):
             row, column = np.argwhere(values != np.round(values))[0]
             raise UnusableData(
-                f"responses: expected counts of spikes, which are whole, got {values[row, column]:g} for stimulus "
-                f"{row + 1} on channel {self.channels.label[column]}; rates in Hz are called rate_hz"
+                f"responses: expected whole spike counts, got {values[row, column]:g} for stimulus {row + 1} on "
+                f"channel {self.channels.label[column]}; if these are rates in Hz, name them rate_hz"
             )
         if self.window_ms is not None and not 0 <= self.window_ms[0] < self.window_ms[1] < np.inf:
             raise UnusableData(
                 f"window: expected 0 <= start < end in ms, got {self.window_ms[0]:g}, {self.window_ms[1]:g}"
             )
-
-    @property
-    def _words(self) -> str:
-        return "counts" if self.kind == "count" else "rates in Hz"

@@ -1,4 +1,4 @@
-"""Whether the times of a recording can be in seconds: stated frequencies, firing and length that cannot be true."""
+"""Detects times that cannot be in seconds, from impossible frequencies, firing rates and durations."""
 
 from __future__ import annotations
 
@@ -13,43 +13,40 @@ from animat.stimulation.stimulus import Stimuli
 NAME = "times-not-in-seconds"
 CONTRADICTED = "other-frequencies"
 FAR = 30.0
-"""Intervals are this many times as long, or as short, as stated frequencies say."""
+"""Intervals must be this many times as long, or as short, as stated by the frequencies."""
 AGREE = 0.05
-"""How far the frequencies may differ in by how much: a common unit is common to all."""
+"""Tolerance between the factors of the frequencies: a wrong unit gives all of them the same factor."""
 APART = 1.5
-"""The highest of the frequencies over the lowest, at least: a steady interval fits all that are nearly alike."""
+"""Smallest ratio of the highest to the lowest frequency: a constant interval fits all frequencies that are similar."""
 LONG_S = 2 * 3600.0
 FEW_HZ, MANY_HZ = 0.02, 200.0
-"""Median rate of the channels that fired, below and above which no recording is."""
+"""No recording has a median rate of the channels that fired below or above these."""
 SHORT_S, SHORT_SHARE = 0.5, 0.05
-"""In any recording at least this share of a channel's intervals is shorter: neurons fire in bursts."""
+"""In any recording at least this share of the intervals within channels is shorter: neurons fire in bursts."""
 LIKELY_HZ, LIKELY_SHORTEST_S = (FEW_HZ, 50.0), (0.00015, 0.05)
-"""Median rate of the channels that fired, and the shortest hundredth of a channel's intervals, in the right unit."""
+"""Median rate of the channels that fired, and first percentile of the intervals within channels, in the right unit."""
 USUAL_HZ, USUAL_SHORTEST_S = 1.0, 0.002
 USUAL_SAMPLING_HZ = 20_000.0
-"""Where a file does not say it; nearly all arrays are sampled at half to twice as much."""
+"""Assumed if a file does not state the rate; nearly all arrays are sampled at half to twice this rate."""
 SOON_S = 0.1
 ENOUGH_SPIKES, ENOUGH_STIMULI = 1000, 20
 
 
 def time_findings(recording: Recording) -> Iterator[Finding]:
-    """A finding on times that cannot be in seconds (`times-not-in-seconds`), or belie stated frequencies.
+    """A finding on times that cannot be in seconds (`times-not-in-seconds`), or contradict stated frequencies.
 
-    They cannot where the intervals between stimuli are the same multiple of what stated frequencies, 1.5 times apart or
-    more, ask for, and it is the multiple of a known unit; where a recording of more than two hours has hardly two
-    spikes of a channel within half a second and a median rate under 0.02 Hz, or no spike within 100 ms after any
-    stimulus; where the median channel fires at more than 200 Hz; or where nearly all stimuli come after the last spike.
-    Another multiple, above 30 or below 1/30, is warned of: trains of 100 pulses, a row each, have intervals 100 times
-    as long. Where no factor is common to all and stimuli come sooner than stated, in two thirds of the time or less,
-    the frequencies are warned of (`other-frequencies`); later ones may have pauses between them.
-
-    Args:
-        recording: with any spikes and stimuli.
+    Times cannot be in seconds if the intervals between stimuli are all the same multiple, that of a known unit, of
+    those of the stated frequencies, which are 1.5 times apart or more; if a recording of more than two hours has hardly
+    ever two spikes of a channel within half a second and a median rate under 0.02 Hz, or no spike within 100 ms after
+    any stimulus; if the median channel fires at more than 200 Hz; or if nearly all stimuli come after the last spike.
+    Any other multiple above 30 or below 1/30 is a warning: trains of 100 pulses, one row each, have intervals 100 times
+    as long. If there is no common factor and stimuli come sooner than stated, in two thirds of the time or less, there
+    is a warning on the frequencies (`other-frequencies`); stimuli that come later may have pauses between them.
     """
-    stated = _stated(recording.stimuli, recording.sampling_rate_hz)
+    stated = _common_factor(recording.stimuli, recording.sampling_rate_hz)
     if stated is not None and stated.severity == "refuse":
         yield stated
-    elif (reason := _fired(recording) or _apart(recording)) is not None:
+    elif (reason := _impossible_firing(recording) or _separate_clocks(recording)) is not None:
         yield Finding(NAME, "refuse", reason)
     elif stated is not None:
         yield stated
@@ -58,13 +55,9 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
 
 
 def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[Finding]:
-    """A finding on frequencies that belie the stimuli's times, or that look like periods where there are no times.
-
-    Args:
-        stimuli: with any frequencies.
-    """
+    """A finding on frequencies that contradict the stimuli's times, or, without times, that look like periods."""
     if has_times:
-        yield from _contradicted(stimuli)
+        yield from _sooner_than_stated(stimuli)
         return
     stated_hz = np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)])
     if len(stated_hz) > 1 and stated_hz[-1] < 1:
@@ -75,10 +68,10 @@ def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[
         yield Finding(CONTRADICTED, "warning", message)
 
 
-def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
-    """Stated frequencies against real intervals."""
+def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
+    """A finding if all intervals are the same multiple of those of the stated frequencies."""
     interval_s = np.diff(stimuli.time_s)
-    # A pulse may be said to be at the frequency of the interval before it, or of the one after it.
+    # A pulse's frequency may be that of the interval before it, or of the one after it.
     for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
         known = ~np.isnan(frequency_hz) & (interval_s > 0)
         distinct = np.unique(frequency_hz[known])
@@ -90,8 +83,8 @@ def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
             example_s = float(np.median(interval_s[known & (frequency_hz == distinct[0])]))
             unit = _unit(multiple, sampling_rate_hz)
             message = (
-                f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those of {distinct[0]:g} Hz would be "
-                f"{example_s:g} s apart, not {1 / distinct[0]:g} s, and those of others are off by the same factor of "
+                f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those at {distinct[0]:g} Hz would be "
+                f"{example_s:g} s apart, not {1 / distinct[0]:g} s, and the others are off by the same factor of "
                 f"{_plain(multiple)}: "
                 + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?")
             )
@@ -99,10 +92,10 @@ def _stated(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
     return None
 
 
-def _contradicted(stimuli: Stimuli) -> Iterator[Finding]:
-    """Stimuli that come sooner than their stated frequency lets them."""
+def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
+    """A finding on stimuli that come sooner than their stated frequency allows."""
     intervals_s, sooner = np.diff(stimuli.time_s), []
-    # A pulse may be said to be at the frequency of the interval before it, or of the one after it.
+    # A pulse's frequency may be that of the interval before it, or of the one after it.
     for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
         known = ~np.isnan(frequency_hz) & (intervals_s > 0)
         of = {f: (intervals_s * f)[known & (frequency_hz == f)] for f in np.unique(frequency_hz[known])}
@@ -116,17 +109,17 @@ def _contradicted(stimuli: Stimuli) -> Iterator[Finding]:
     remedy = (
         f"these are periods in seconds: write 1 divided by each, here {1 / stated_hz:g}"
         if is_period
-        else "correct the frequencies, or sort the stimuli by their times (--conditions interval:5,10)"
+        else "correct the frequencies, or group the stimuli by their times (--conditions interval:5,10)"
     )
     message = (
-        f"stimuli that are said to come at {stated_hz:g} Hz are {interval_s:.3g} s apart (median), not "
+        f"stimuli with a stated frequency of {stated_hz:g} Hz are {interval_s:.3g} s apart (median), not "
         f"{1 / stated_hz:.3g} s: {remedy}"
     )
     yield Finding(CONTRADICTED, "warning", message, least)
 
 
 def _unit(multiple: float, sampling_rate_hz: float) -> str | None:
-    """The unit that times are in, and what to do; None where it is none that is known."""
+    """The unit of the times and what to do; None if it is unknown."""
     named = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes", 1 / 3600: "hours"}
     for factor, unit in named.items():
         if abs(multiple / factor - 1) < AGREE:
@@ -141,8 +134,8 @@ def _plain(number: float) -> str:
     return f"{number:,.0f}" if number >= FAR else f"{number:.3g}"
 
 
-def _fired(recording: Recording) -> str | None:
-    """How long and how fast the channels fired, if they fired."""
+def _impossible_firing(recording: Recording) -> str | None:
+    """Why spike times cannot be in seconds, from the duration and the rates; None if they can."""
     times_s, n_spikes = recording.spike_times_s, len(recording.spike_times_s)
     count = np.bincount(recording.spike_channels, minlength=len(recording.channels))
     if n_spikes < ENOUGH_SPIKES or recording.duration_s < 1:
@@ -176,7 +169,7 @@ def _fired(recording: Recording) -> str | None:
 
 
 def _unit_of_spikes(median_hz: float, shortest_s: float, sampling_rate_hz: float) -> str:
-    """The units in which rate and shortest intervals are those of neurons, the likeliest first, and what to do."""
+    """Units that give rates and shortest intervals typical of neurons, the likeliest first, and what to do."""
     is_known = bool(np.isfinite(sampling_rate_hz))
     rate_hz = sampling_rate_hz if is_known else USUAL_SAMPLING_HZ
     units = {
@@ -195,8 +188,8 @@ def _unit_of_spikes(median_hz: float, shortest_s: float, sampling_rate_hz: float
     return ("perhaps " if len(fits) > 1 else "") + "times are in " + ", or in ".join(likeliest)
 
 
-def _apart(recording: Recording) -> str | None:
-    """Spikes and stimuli on different clocks."""
+def _separate_clocks(recording: Recording) -> str | None:
+    """Why spikes and stimuli must have different clocks; None if they need not."""
     spike_s, stimulus_s = recording.spike_times_s, recording.stimuli.time_s
     if len(spike_s) < ENOUGH_SPIKES or len(stimulus_s) < ENOUGH_STIMULI:
         return None
@@ -209,5 +202,5 @@ def _apart(recording: Recording) -> str | None:
     )
     return (
         f"times cannot all be in seconds: {100 * max(after, before):.0f} % of the stimuli come {where}: stimuli and "
-        "spikes have different units or clocks; bring both in seconds of one clock"
+        "spikes have different units or clocks; provide both in seconds on the same clock"
     )

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from animat.recordings.findings import Finding
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.records import as_json
@@ -228,6 +228,6 @@ def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> t
     in_responses = [f for f in responses.findings if f.name != "no-stimuli"]
     names = {finding.name for finding in in_responses}
     findings = {f.name + f.message: f for f in in_responses}
-    findings |= {f.name + f.message: f for f in noticed(source) if f.name not in names}
+    findings |= {f.name + f.message: f for f in recording_findings(source) if f.name not in names}
     gravity = {"refuse": 0, "warning": 1, "note": 2}
     return tuple(sorted(findings.values(), key=lambda finding: gravity[finding.severity]))

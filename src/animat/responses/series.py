@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_several, in_min
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.conditions import Conditions
@@ -73,7 +73,7 @@ def extract_series(
         except (UnusableData, Mismatch) as error:
             # The argument that it begins with stays at the front.
             raise type(error)(f"{error} (the recording at {in_min(recording.start_min)})") from error
-        for finding in (*noticed(recording), *responses.findings):
+        for finding in (*recording_findings(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
                 raise UnusableData(
                     f"the recording at {in_min(recording.start_min)}: {finding.message} (to allow it: "

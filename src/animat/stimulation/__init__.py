@@ -1,1 +1,1 @@
-"""What is delivered to a culture, and where on its array: pulses, patterns, the selection of electrodes, protocols."""
+"""What is delivered to a culture and where on its array: pulses, patterns, electrode selections and protocols."""

@@ -1,4 +1,4 @@
-"""An array of electrodes on a rectangular grid: electrode numbers, positions, and the blocks that it is scanned in."""
+"""A rectangular electrode array: electrode numbers, positions, and the blocks in which it is scanned."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class ElectrodeArray:
     """A grid of electrodes numbered row by row: electrode = row x columns + column, from 0.
 
     Attributes:
-        name: what it is called.
+        name: its display name.
         columns, rows: of the grid.
         pitch_um: distance between neighbours, in both directions.
         channels: electrodes that can be recorded at once.
         stimulation_units: electrodes that can be stimulated at once.
 
     Raises:
-        InvalidArgument: for counts that are no whole numbers above 0, or a distance that is none.
+        InvalidArgument: for counts that are not whole numbers above 0, or a pitch that is not a number above 0.
     """
 
     name: str
@@ -60,23 +60,23 @@ class ElectrodeArray:
     def distance_um(
         self, electrodes: Int64[np.ndarray, " electrodes"] | int, others: Int64[np.ndarray, " others"] | int
     ) -> Float64[np.ndarray, "electrodes others"]:
-        """The distance of every electrode to every other one given."""
+        """The distance from each of `electrodes` to each of `others`."""
         x_um, y_um = self.position_um(electrodes)
         other_x_um, other_y_um = self.position_um(others)
         return np.asarray(np.hypot(x_um[:, None] - other_x_um[None, :], y_um[:, None] - other_y_um[None, :]))
 
     def scan_blocks(self, size: int | None = None) -> list[Int64[np.ndarray, " electrodes"]]:
-        """All electrodes, in order, in as few blocks as can be recorded one after the other.
+        """All electrodes, in order, in as few blocks as possible, each of which can be recorded at once.
 
         Args:
-            size: electrodes of a block; by default as many as can be recorded at once.
+            size: most electrodes in a block; by default as many as can be recorded at once.
 
         Raises:
             InvalidArgument: for a block that is empty or larger than what can be recorded at once.
         """
         size = self.channels if size is None else size
         if not 1 <= size <= self.channels:
-            raise InvalidArgument(f"size: expected 1 to {self.channels} electrodes a block, got {size}")
+            raise InvalidArgument(f"size: expected 1 to {self.channels} electrodes per block, got {size}")
         blocks = -(-len(self) // size)
         return [np.asarray(block) for block in np.array_split(np.arange(len(self), dtype=np.int64), blocks)]
 

@@ -1,4 +1,4 @@
-"""Stimulation patterns: sets of electrodes that are pulsed together, none near another."""
+"""Stimulation patterns: sets of electrodes that are pulsed together, no two of them close to each other."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ def draw_patterns(
     size: int = 5,
     spacing_um: float = 100.0,
 ) -> Int64[np.ndarray, "patterns size"]:
-    """Draw different patterns of electrodes, every two of a pattern more than `spacing_um` apart.
+    """Draw distinct patterns of electrodes, every two electrodes of a pattern more than `spacing_um` apart.
 
     Every set that keeps the distance is equally likely.
 
     Args:
         array: where the electrodes are.
         electrodes: to choose from.
-        seed: decides the draw; 0 or more.
+        seed: of the draw; 0 or more.
         patterns: how many, no two of them the same set.
         size: electrodes in each.
         spacing_um: the distance that every pair must exceed.
 
     Returns:
-        Electrodes of each pattern, rising.
+        Electrodes of each pattern, in ascending order.
 
     Raises:
-        InvalidArgument: if too few were found; it says how many and what to relax. For a seed below 0.
+        InvalidArgument: if too few were found, with how many and what to relax; for a seed below 0.
 
     Source: the paper's methods (5 of 32 electrodes, more than 100 um apart, 100 patterns).
     """
@@ -50,18 +50,18 @@ def draw_patterns(
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 5])
     is_far = array.distance_um(electrodes, electrodes) > spacing_um
-    found: dict[tuple[int, ...], None] = {}
+    drawn: dict[tuple[int, ...], None] = {}
     if size <= len(electrodes):
         for _ in range(_TRIES_A_PATTERN * patterns):
             chosen = np.sort(rng.choice(len(electrodes), size, replace=False))
             if all(is_far[i, j] for i, j in itertools.combinations(chosen, 2)):
-                found[tuple(chosen.tolist())] = None
-                if len(found) == patterns:
+                drawn[tuple(chosen.tolist())] = None
+                if len(drawn) == patterns:
                     break
-    if len(found) < patterns:
+    if len(drawn) < patterns:
         raise InvalidArgument(
             f"patterns: expected {patterns} different sets of {size} electrodes with every pair more than "
-            f"{spacing_um:g} um apart, but random draws among {len(electrodes)} electrodes found only {len(found)}: "
+            f"{spacing_um:g} um apart, but random draws among {len(electrodes)} electrodes found only {len(drawn)}: "
             "ask for fewer patterns, fewer electrodes in each, a shorter distance, or more stimulation sites"
         )
-    return electrodes[np.array(list(found), dtype=np.int64).reshape(patterns, size)]
+    return electrodes[np.array(list(drawn), dtype=np.int64).reshape(patterns, size)]

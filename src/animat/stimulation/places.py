@@ -14,25 +14,25 @@ from animat.records import in_file, json_data
 from animat.tables import evenly
 
 CUT = {"halves": (2, 1), "quadrants": (2, 2)}
-"""Columns and rows that electrodes are cut into, as many electrodes in each as can be."""
+"""Columns and rows into which electrodes are divided, as evenly as possible."""
 NAMED = (*CUT, "corners")
 SITES = 8
-"""Of a corner: with five the commands part less clearly, and more than are needed tire a culture."""
+"""Electrodes of a corner: with five the commands are less distinct, and more than necessary tire a culture."""
 _MOST_BYTES = 2**20
 _MOST_PLACES = 1000
 
 NONE: Literal["none"] = "none"
-"""The place without electrodes: its trials take their time, and nothing is delivered."""
+"""The place without electrodes: its trials take their usual time, but nothing is delivered."""
 
 Places = str | tuple[tuple[int, ...] | Literal["none"], ...]
 """One of `NAMED`, or the electrodes of each place, one of which may be `NONE`."""
 
 
 def check_places(given: Any) -> Places:
-    """Places as a protocol has them, lists as tuples.
+    """Check places and return them with lists as tuples.
 
     Raises:
-        InvalidArgument: for another name, or what is no list of groups of electrodes, each group once.
+        InvalidArgument: for an unknown name, or anything but a list of distinct groups of electrodes.
     """
     if isinstance(given, str) and given in NAMED:
         return given
@@ -40,7 +40,7 @@ def check_places(given: Any) -> Places:
     is_listed = groups is not None and all(isinstance(place, list | tuple) and place for place in groups)
     if not is_listed or not all(type(e) is int and 0 <= e < 2**63 for place in groups or () for e in place):
         raise InvalidArgument(
-            f"places: expected {', '.join(NAMED)}, or groups of numbers of electrodes as [[1, 2], [3, 4]], one of "
+            f"places: expected {', '.join(NAMED)}, or groups of electrode numbers such as [[1, 2], [3, 4]], one of "
             f'which may be "{NONE}", got {shown(given)}'
         )
     places = tuple(NONE if place == NONE else tuple(sorted(set(place))) for place in given)
@@ -50,7 +50,7 @@ def check_places(given: Any) -> Places:
 
 
 def read_places(text: str | os.PathLike[str]) -> Places:
-    """One of `NAMED`, or the places in a file of JSON: a list of lists of electrodes.
+    """One of `NAMED`, or the places in a JSON file: a list of lists of electrodes.
 
     Raises:
         InvalidFile: naming the file, what was expected and what came.
@@ -60,16 +60,16 @@ def read_places(text: str | os.PathLike[str]) -> Places:
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
-        raise InvalidFile(f"{error}; places that have names are {', '.join(NAMED)}") from error
+        raise InvalidFile(f"{error}; named places are {', '.join(NAMED)}") from error
     with in_file(text):
-        places = check_places(json_data(written, "places", "JSON as [[1, 2], [3, 4]]"))
+        places = check_places(json_data(written, "places", "JSON such as [[1, 2], [3, 4]]"))
         if not places:
-            raise InvalidArgument("places: expected groups of electrodes as [[1, 2], [3, 4]], got none")
+            raise InvalidArgument("places: expected groups of electrodes such as [[1, 2], [3, 4]], got none")
         return places
 
 
 def count_places(places: Places) -> int:
-    """How many there are."""
+    """How many places there are."""
     return (int(np.prod(CUT[places])) if places in CUT else 4) if isinstance(places, str) else len(places)
 
 
@@ -79,17 +79,17 @@ def electrodes_of(
     x_um: Float64[np.ndarray, " electrodes"],
     y_um: Float64[np.ndarray, " electrodes"],
 ) -> tuple[tuple[int, ...], ...]:
-    """The electrodes of each place on an array; none of `NONE`.
+    """The electrodes of each place on an array; for `NONE`, no electrodes.
 
-    Halves are those with the smaller and the larger x; each is cut by y for quadrants. Electrodes at the same x (or y)
-    go by their numbers. Corners are what puts two commands, read from the halves, into all four corners: `SITES`
-    electrodes spread over the left half, as many over the right one, both together, and one of the left.
+    Halves have the smaller and the larger x; quadrants divide each half by y. Electrodes at the same x (or y) are
+    ordered by number. Corners drive two commands, read from the halves, into all four corners: `SITES` electrodes
+    spread over the left half, as many over the right half, both together, and one electrode of the left.
 
     Args:
-        electrodes: that can be stimulated.
+        electrodes: those that can be stimulated.
 
     Raises:
-        InvalidArgument: for named places of electrodes that are too few, or whose positions are not known.
+        InvalidArgument: for named places if there are too few electrodes, or positions are not known.
     """
     if not isinstance(places, str):
         return tuple(() if place == NONE else place for place in places)
@@ -105,13 +105,13 @@ def electrodes_of(
     if places == "corners":
         y_of_um = dict(zip(electrodes.tolist(), y_um.tolist(), strict=True))
         halves = electrodes_of("halves", electrodes, x_um, y_um)
-        # Of each half some electrodes, evenly from its smallest to its largest y.
+        # `SITES` electrodes of each half, evenly spaced from its smallest to its largest y.
         sorted_halves = (sorted(half, key=lambda electrode: (y_of_um[electrode], electrode)) for half in halves)
         left, right = (tuple(sorted(half[rank] for rank in evenly(len(half), SITES))) for half in sorted_halves)
         return left, right, tuple(sorted(left + right)), left[:1]
     columns, rows = CUT[places]
-    found = []
+    quadrants = []
     for column in np.array_split(np.lexsort((electrodes, x_um)), columns):
         in_order = column[np.lexsort((electrodes[column], y_um[column]))]
-        found += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
-    return tuple(found)
+        quadrants += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
+    return tuple(quadrants)

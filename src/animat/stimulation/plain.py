@@ -1,4 +1,4 @@
-"""Numbers as Python's own, copied once: nothing can change what was checked."""
+"""Numbers copied as Python's own types, so that nothing can change them after they are checked."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from animat.errors import InvalidArgument
 
 
 def number(name: str, value: Any) -> float:
-    """A number of any type as a float, NaN and infinity included.
+    """A number of any type as a float, including NaN and infinity.
 
     Raises:
-        InvalidArgument: naming the argument, for anything else, True and False among it.
+        InvalidArgument: naming the argument, for anything else, including True and False.
     """
     if type(value) is float:
         return value
@@ -30,7 +30,7 @@ def whole_number(name: str, value: Any) -> int:
     """A whole number of any type as an int.
 
     Raises:
-        InvalidArgument: naming the argument, for anything else, True and False among it.
+        InvalidArgument: naming the argument, for anything else, including True and False.
     """
     if type(value) is int:
         return value
@@ -40,15 +40,14 @@ def whole_number(name: str, value: Any) -> int:
         return int(value)
     if isinstance(value, float) and value.is_integer():
         return int(value)
-    told = f"{value}" if isinstance(value, Real) else _kind(value)
-    raise InvalidArgument(f"{name}: expected a whole number, got {told}")
+    raise InvalidArgument(f"{name}: expected a whole number, got {value if isinstance(value, Real) else _kind(value)}")
 
 
 def seconds(name: str, value: Any) -> float:
-    """A time in seconds as a float, from a float64 or a whole number; NaN and infinity included.
+    """A time in seconds as a float, from a float64 or a whole number; including NaN and infinity.
 
     Raises:
-        InvalidArgument: naming the argument, for what is less precise: float32 is 1 ms off after 10,000 s.
+        InvalidArgument: naming the argument, for less precise types: float32 is 1 ms off after 10,000 s.
     """
     if type(value) is float:
         return value

@@ -1,4 +1,4 @@
-"""How stimuli are presented: what must be the same when a culture is recorded and when a robot is driven by it."""
+"""How stimuli are presented, which must be the same when recording a culture and when driving a robot with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LONGEST_S = 86_400
 _LONGEST_RECORDING_S = 7 * 86_400
 _MOST_BYTES = 2**20
 _FORMER = {"presentations": "trials"}
-"""What files of before call attributes of a protocol."""
+"""Former names of a protocol's attributes, still read from older files."""
 
 Count = Annotated[Whole, Field(ge=1, le=1_000_000)]
 Pulses = Annotated[Whole, Field(ge=1, le=_MOST_PULSES)]
@@ -32,10 +32,10 @@ Frequency = Annotated[Number, Field(gt=0, le=10_000)]
 
 @record
 class Presentation:
-    """The order of the stimulus frequencies and the pulses of one trial; it travels with the data.
+    """The order of the stimulus frequencies and the pulses per trial, kept with the data.
 
-    A culture has a memory: at 80 Hz it answers otherwise in a block of 80 Hz than between other frequencies. So a
-    simulator, and a policy trained on it, holds for the presentation that it was recorded with.
+    A culture has memory: it responds differently to 80 Hz in a block of 80 Hz than between other frequencies. So a
+    simulator, and a policy trained on it, is valid only for the presentation it was recorded with.
 
     Attributes:
         order: `"blocked"`, all stimuli of a frequency together (the paper), or `"mixed"`, a frequency drawn at random
@@ -43,7 +43,7 @@ class Presentation:
         pulses: pulses 1/f apart in one trial; the response is read after the last one (the paper: 1).
 
     Raises:
-        InvalidArgument: for another order, or fewer pulses than one.
+        InvalidArgument: for an unknown order, or fewer than one pulse.
     """
 
     order: Order
@@ -57,21 +57,21 @@ class Presentation:
 class Protocol:
     """What is done in one recording; with patterns and a seed it becomes a `Schedule` (`animat.stimulation.schedule`).
 
-    Every pulse comes 1/f after the one before it, f being the frequency of its own trial, and the response is
-    read after the last pulse of a trial. The defaults are the paper's: five frequencies as blocks in random
-    order, each of 100 patterns once at each, one pulse a trial.
+    Every pulse comes 1/f after the previous one, f being the frequency of its own trial, and the response is read
+    after the last pulse of a trial. The defaults are the paper's: five frequencies as blocks in random order, each of
+    100 patterns once at each frequency, one pulse per trial.
 
     Attributes:
         frequencies_hz: the conditions, each once.
-        order: `"blocked"` or `"mixed"`: the conditions' trials shuffled together, as a closed loop meets them.
-        pulses: of one trial, with different patterns where there are enough.
-        patterns: how many of the culture's patterns are used, the first ones; 1 repeats one pattern.
+        order: `"blocked"` or `"mixed"`: the conditions' trials shuffled together, as in a closed loop.
+        pulses: per trial, with different patterns where there are enough.
+        patterns: use this many of the culture's patterns, the first ones; 1 repeats one pattern.
         trials: at each frequency; each pattern is read equally often, in random order.
-        places: groups of electrodes, `"corners"`, `"halves"` or `"quadrants"` (`animat.stimulation.places`), in place
-            of patterns: each at each frequency is then a condition of its own, presented as often, all pulses on the
-            whole group. One of the groups may be `"none"`: its trials deliver nothing.
-        setup_s: before each block (mixed: before the one block), the time that setting up takes. Nothing is recorded
-            meanwhile, and the recording's clock leaves it out.
+        places: groups of electrodes, `"corners"`, `"halves"` or `"quadrants"` (`animat.stimulation.places`), instead
+            of patterns: each place at each frequency is then a condition, presented equally often, with all pulses on
+            the whole group. One of the groups may be `"none"`: its trials deliver nothing.
+        setup_s: set-up time before each block (mixed: before the only block). It is not recorded, and the recording's
+            clock leaves it out.
         pause_s: recorded without stimuli before each block.
         tail_s: recorded after the last pulse of each block.
         pulse: what every electrode delivers.
@@ -114,12 +114,12 @@ class Protocol:
 
     @property
     def presentation(self) -> Presentation:
-        """The part of it that must be the same when a robot is driven."""
+        """The part of the protocol that must be the same when a robot is driven."""
         return Presentation(self.order, self.pulses)
 
     @property
     def n_places(self) -> int:
-        """How many places there are; 0: the culture's patterns are used."""
+        """How many places there are; 0 if the culture's patterns are used."""
         return count_places(self.places)
 
     @property
@@ -128,20 +128,20 @@ class Protocol:
         return self.places == (NONE,)
 
     def to_json(self) -> str:
-        """As one line of JSON, the way a recording's file keeps it under `"protocol"`."""
+        """As one line of JSON, as stored under `"protocol"` in a recording's file."""
         data = vars(self) | {"pulse": self.pulse.to_list()}
         if not self.places:
-            # A series knows its own protocol by its text, and those of before have no places.
+            # A series compares protocols by their text, and older ones have no places.
             del data["places"]
         return json.dumps(data)
 
     @staticmethod
     def from_json(text: str, defaults: Protocol | None = None) -> Protocol:
-        """From what `to_json` gave.
+        """From the output of `to_json`.
 
         Args:
-            text: an object of JSON whose keys are the attributes.
-            defaults: what a key that is left out stands for; None: the defaults above, and the pulse must be given.
+            text: a JSON object whose keys are the attributes.
+            defaults: values for keys that are left out; None: the defaults above, except that the pulse is required.
 
         Raises:
             InvalidArgument: for anything else, naming the key, what was expected and what came.
@@ -157,11 +157,10 @@ class Protocol:
 
 
 def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
-    """Read a protocol from a file of JSON, as `Protocol.to_json` writes it.
+    """Read a protocol from a JSON file, as `Protocol.to_json` writes it.
 
     Args:
-        path: of the file.
-        defaults: what a key that is left out stands for; None: the defaults of `Protocol`.
+        defaults: values for keys that are left out; None: the defaults of `Protocol`.
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -174,9 +173,9 @@ PAPER = Protocol()
 """The paper's recording."""
 
 CLOSED_LOOP = Protocol(order="mixed", trials=1000)
-"""What a closed loop needs: frequencies mixed at random, one pulse a trial, and so many of each that a simulator
-with memory finds responses with a similar history."""
+"""What a closed loop needs: frequencies mixed at random, one pulse per trial, and enough trials of each for a simulator
+with memory to find responses with a similar history."""
 
 TWO_COMMANDS = replace(CLOSED_LOOP, places="corners", frequencies_hz=(20.0,))
-"""What a closed loop with two commands needs: stimuli that differ in place alone. A culture is then stimulated as often
-whatever is chosen; of several frequencies a policy takes the fastest all the time, which no recording has shown."""
+"""What a closed loop with two commands needs: stimuli that differ only in place. A culture is then stimulated equally
+often whatever is chosen; with several frequencies a policy always takes the fastest, which no recording has shown."""

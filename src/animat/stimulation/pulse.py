@@ -1,4 +1,4 @@
-"""What one electrode delivers: phases of constant voltage or current make a pulse."""
+"""What one electrode delivers: a pulse made of phases of constant voltage or current."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Kind = Literal["voltage", "current"]
 
 @record
 class Phase:
-    """A stretch of constant voltage or current: exactly one of the two amplitudes is given.
+    """A phase of constant voltage or current: exactly one of the two amplitudes is given.
 
     Numbers of any type are copied as floats.
 
     Attributes:
-        duration_us: how long, above 0.
+        duration_us: above 0.
         amplitude_mv: of a voltage phase; negative is cathodic.
         amplitude_ua: of a current phase; negative is cathodic.
 
     Raises:
-        InvalidArgument: for both amplitudes or none, a number that is not finite, or no duration.
+        InvalidArgument: for both amplitudes or neither, a number that is not finite, or no duration.
     """
 
     duration_us: Positive
@@ -52,10 +52,10 @@ class Phase:
 
     @property
     def charge(self) -> float:
-        """Amplitude times duration: nC of a current phase.
+        """Amplitude times duration, in nC for a current phase.
 
-        For a voltage phase it is in mV ms, which stands for the charge: how much flows depends on the electrode's
-        impedance, which is not known.
+        For a voltage phase it is in mV ms, as a proxy for the charge, which depends on the electrode's unknown
+        impedance.
         """
         return self.amplitude * self.duration_us / 1000
 
@@ -67,10 +67,10 @@ class Phase:
 
 @record
 class Pulse:
-    """Phases that follow each other without a gap, all of one kind.
+    """Phases that follow each other without a gap, all of the same kind.
 
     Raises:
-        InvalidArgument: for no phase, phases of both kinds, or what is no phase.
+        InvalidArgument: for no phases, phases of both kinds, or anything that is not a phase.
     """
 
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)]
@@ -100,7 +100,7 @@ class Pulse:
 
     @staticmethod
     def from_list(phases: Pulse | Sequence[Mapping[str, Any]]) -> Pulse:
-        """From what `to_list` gave; a pulse is one already.
+        """From the output of `to_list`; a pulse is returned as it is.
 
         Raises:
             InvalidArgument: for anything else.
@@ -113,8 +113,8 @@ class Pulse:
 
 
 PUBLISHED_PULSE = Pulse((Phase(500.0, amplitude_mv=-200.0), Phase(400.0, amplitude_mv=200.0)))
-"""The paper's pulse as printed: 100 mV ms against 80, so it is not balanced; only the virtual culture's limits allow
-that (method, section 1)."""
+"""The paper's pulse as printed. It is not balanced (100 mV ms against 80), which only the limits of simulated cultures
+allow (method, section 1)."""
 
 BALANCED_PULSE = Pulse((Phase(500.0, amplitude_mv=-200.0), Phase(500.0, amplitude_mv=200.0)))
-"""The published pulse with its second phase as long as its first."""
+"""The published pulse with a second phase as long as the first."""

@@ -1,4 +1,4 @@
-"""What a scan of spontaneous activity found at each electrode, and what can be told from it."""
+"""What a scan of spontaneous activity measured at each electrode, and what follows from it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from animat.tables import freeze
 
 @dataclass(frozen=True, eq=False)
 class ScannedActivity:
-    """Spontaneous activity of scanned electrodes, one row an electrode. Arrays are read-only.
+    """Spontaneous activity of scanned electrodes, one row per electrode. Arrays are read-only.
 
     Attributes:
         electrode: number on the array, each once, shape (electrodes,).
         rate_hz: spikes per second, shape (electrodes,).
-        amplitude_uv: mean size of the spikes' trough, NaN without spikes, shape (electrodes,).
+        amplitude_uv: mean size of the spikes' negative peak, NaN without spikes, shape (electrodes,).
         noise_uv: root mean square of the noise, shape (electrodes,).
         trough_to_peak_ms: of the mean waveform, NaN without spikes, shape (electrodes,).
         recovery_ms: from its peak back to half of it, NaN without spikes, shape (electrodes,).
@@ -41,26 +41,26 @@ class ScannedActivity:
 
     @property
     def signal_to_noise(self) -> Float64[np.ndarray, " electrodes"]:
-        """Mean size of the spikes over the noise; 0 without spikes."""
+        """Mean spike amplitude over noise; 0 without spikes."""
         ratio = np.zeros(len(self))
         np.divide(self.amplitude_uv, self.noise_uv, out=ratio, where=self.noise_uv > 0)
         return np.nan_to_num(ratio, nan=0.0)
 
     @property
     def excitatory_score(self) -> Float64[np.ndarray, " electrodes"]:
-        """How much the waveform looks like an excitatory neuron's, from 0 to 1; 0 without spikes.
+        """How closely the waveform resembles an excitatory neuron's, from 0 to 1; 0 without spikes.
 
             score = 1 / (1 + exp(-((trough_to_peak - 0.35 ms) / 0.05 ms + (recovery - 0.35 ms) / 0.1 ms) / 2))
 
-        Excitatory neurons have a longer trough-to-peak time (0.4-0.5 ms is common practice) and recover more slowly.
-        That waveforms tell types apart is contested, in culture above all, so it is a soft score and no label.
+        Excitatory neurons have a longer trough-to-peak time (0.4-0.5 ms is a common threshold) and recover more slowly.
+        Whether waveforms tell types apart is contested, especially in culture, so this is a soft score and not a label.
         """
         longer = (self.trough_to_peak_ms - 0.35) / 0.05
         slower = (self.recovery_ms - 0.35) / 0.1
         return np.nan_to_num(1 / (1 + np.exp(-np.clip((longer + slower) / 2, -50, 50))), nan=0.0)
 
     @staticmethod
-    def of_blocks(blocks: list[ScannedActivity]) -> ScannedActivity:
+    def from_blocks(blocks: list[ScannedActivity]) -> ScannedActivity:
         """The blocks of a scan as one table."""
         names = ("electrode", *_MEASURED)
         return ScannedActivity(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})

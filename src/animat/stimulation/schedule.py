@@ -1,4 +1,4 @@
-"""A protocol made definite: which pattern is pulsed when, from a seed."""
+"""Draws a protocol's schedule from a seed: which pattern is pulsed when."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from animat.stimulation.stimulus import NOTHING, Stimuli, Stimulus
 from animat.tables import UNKNOWN, padded
 
 TICK_S = 50e-6
-"""Stimuli start on a grid of 50 us, a sample at 20 kHz: what stimulation hardware can time exactly."""
+"""Stimuli start on a grid of 50 us, one sample at 20 kHz, which stimulation hardware can time exactly."""
 _GAP_S = 0.005
-"""Between two pulses at least, for a block to be cut there."""
+"""Shortest gap between two pulses in which a block may be cut."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A stretch of stimulation without a break.
+    """Continuous stimulation without a break.
 
     Attributes:
-        setup_s: passes before it, unrecorded.
-        duration_s: recorded.
-        stimuli: their times counted from the block's recorded start; presentations numbered through all blocks.
+        setup_s: unrecorded time before it.
+        duration_s: recorded time.
+        stimuli: with times from the block's recorded start, and trials numbered through all blocks.
     """
 
     setup_s: float
@@ -35,10 +35,10 @@ class Block:
     stimuli: Stimuli
 
     def stretches(self, least_s: float) -> tuple[Block, ...]:
-        """The block in stretches, without set-up, that come one right after the other; cut between presentations.
+        """The block cut between trials into consecutive stretches without set-up.
 
         Args:
-            least_s: how long each is but for the last; it is cut in the next gap between pulses.
+            least_s: shortest stretch except for the last; each is cut in the next gap between pulses.
         """
         time_s, presentation = self.stimuli.time_s, self.stimuli.presentation
         begins = 1 + np.flatnonzero((np.diff(presentation) != 0) & (np.diff(time_s) >= _GAP_S))
@@ -59,9 +59,9 @@ class Schedule:
     """All stimuli of one recording, block by block.
 
     Attributes:
-        protocol: that it follows.
-        seed: that decided every draw.
-        blocks: in the order of time.
+        protocol: the protocol it follows.
+        seed: of every draw.
+        blocks: in order of time.
     """
 
     protocol: Protocol
@@ -70,30 +70,30 @@ class Schedule:
 
     @property
     def duration_s(self) -> float:
-        """How long it takes, set-up included."""
+        """Total duration, including set-up."""
         return sum(block.setup_s + block.duration_s for block in self.blocks)
 
     @property
     def recorded_s(self) -> float:
-        """How much of that is recorded."""
+        """Recorded part of the duration."""
         return sum(block.duration_s for block in self.blocks)
 
     def __len__(self) -> int:
         return sum(len(block.stimuli) for block in self.blocks)
 
     def deliveries(self, block: Block) -> list[Stimulus]:
-        """The stimuli of a block as they are delivered."""
+        """The stimuli of a block for delivery."""
         table = block.stimuli
         columns = table.time_s, table.electrodes, table.frequency_hz, table.pattern, table.presentation
         return [
             Stimulus(time_s, tuple(e for e in on if e != UNKNOWN), self.protocol.pulse, frequency_hz, pattern, number)
-            for time_s, on, frequency_hz, pattern, number in zip(*(each.tolist() for each in columns), strict=True)
+            for time_s, on, frequency_hz, pattern, number in zip(*(column.tolist() for column in columns), strict=True)
         ]
 
 
 def _between(stimuli: Stimuli, first: int, last: int, start_s: float) -> Stimuli:
-    """Rows of a table, their times counted from a start."""
-    columns = {each.name: getattr(stimuli, each.name)[first:last] for each in fields(Stimuli)}
+    """Rows of a table, with times relative to `start_s`."""
+    columns = {field.name: getattr(stimuli, field.name)[first:last] for field in fields(Stimuli)}
     return Stimuli(**columns | {"time_s": on_ticks(columns["time_s"] - start_s)})
 
 
@@ -108,13 +108,13 @@ def make_schedule(
 
     Args:
         protocol: what to do.
-        patterns: the culture's patterns, electrodes of each, padded with -1.
+        patterns: the electrodes of each of the culture's patterns, padded with -1.
         seed: zero or more.
-        places: electrodes of each of the protocol's places, where it has any; of one that is none, none.
+        places: the electrodes of each of the protocol's places, if it has any; empty for `"none"`.
 
     Raises:
-        InvalidArgument: if the culture has fewer patterns than the protocol uses, for other places than it has, or for
-            a negative seed.
+        InvalidArgument: if the culture has fewer patterns than the protocol uses, if the number of places is not the
+            protocol's, or for a negative seed.
     """
     if len(places) != protocol.n_places:
         raise InvalidArgument(f"places: expected electrodes of {protocol.n_places}, got those of {len(places)}")
@@ -126,21 +126,21 @@ def make_schedule(
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 7])
-    n_frequencies, each = len(protocol.frequencies_hz), protocol.trials
+    n_frequencies, trials = len(protocol.frequencies_hz), protocol.trials
     n_conditions = n_frequencies * max(1, len(places))
     if protocol.order == "blocked":
-        orders = [np.full(each, condition) for condition in rng.permutation(n_conditions)]
+        orders = [np.full(trials, condition) for condition in rng.permutation(n_conditions)]
     else:
-        orders = [rng.permutation(np.repeat(np.arange(n_conditions), each))]
+        orders = [rng.permutation(np.repeat(np.arange(n_conditions), trials))]
     if places:
-        # A place that is a pattern of the culture has its number.
+        # A place that is one of the culture's patterns has its number.
         number_of = {frozenset(row) - {UNKNOWN}: i for i, row in enumerate(patterns.tolist())}
         number = np.array([number_of.get(frozenset(place), UNKNOWN) if place else NOTHING for place in places])
         electrodes = padded(places)
     else:
         number, electrodes = np.arange(len(patterns)), patterns
-        # Each pattern as often as the others, one round after the other, each round in random order.
-        rounds = range(-(-each // protocol.patterns))
+        # Each pattern equally often, round by round, each round in random order.
+        rounds = range(-(-trials // protocol.patterns))
         left = [
             iter([pattern for _ in rounds for pattern in rng.permutation(protocol.patterns).tolist()])
             for _ in range(n_frequencies)
@@ -158,8 +158,8 @@ def make_schedule(
 
 
 def on_ticks(time_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
-    """Times moved to the grid of `TICK_S`."""
-    # A division by a whole number is rounded once; a product with 50e-6 would be off by the error of that number.
+    """Times rounded to the grid of `TICK_S`."""
+    # Division by a whole number is rounded once; multiplying by 50e-6 would add the rounding error of that number.
     return np.asarray(np.rint(time_s / TICK_S) / round(1 / TICK_S))
 
 
@@ -182,7 +182,7 @@ def _block(
 
 
 def _train(rng: np.random.Generator, protocol: Protocol, last: int) -> Int64[np.ndarray, " pulses"]:
-    """The patterns of a presentation's pulses: different ones, as long as there are; the last one is given."""
+    """The patterns of a trial's pulses, different ones as far as possible, ending with `last`."""
     before = protocol.pulses - 1
     if protocol.patterns == 1:
         return np.full(protocol.pulses, last)

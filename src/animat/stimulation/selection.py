@@ -1,4 +1,4 @@
-"""Which electrodes record, which stimulate, and in which patterns: chosen from a scan, kept as a value."""
+"""Which electrodes record, which stimulate, and in which patterns: chosen from a scan, and saved as a file."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _MOST_BYTES = 2**24
 
 @record
 class SelectionRule:
-    """What is asked of a selection; the defaults are the paper's where it gives them.
+    """The criteria of a selection; the defaults are the paper's where it states them.
 
     Attributes:
         recording_sites: at most this many channels.
-        signal_to_noise: the least an electrode must have to be recorded.
+        signal_to_noise: smallest ratio for an electrode to be recorded.
         spacing_um: an electrode is left out if a neighbour within this distance has a better signal-to-noise ratio, so
             that a neuron is not counted on every electrode around it; 0 leaves none out.
         stimulation_sites: exactly this many.
@@ -51,7 +51,7 @@ Electrode = Annotated[Whole, Field(ge=0, le=2**63 - 1)]
 
 @record
 class _Saved:
-    """A selection as its file holds it."""
+    """A selection as stored in its file."""
 
     format: Literal["animat electrode selection 1"]
     array: ElectrodeArray
@@ -66,16 +66,17 @@ class _Saved:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Recording sites, stimulation sites and patterns on an array: to save, to plot, and to give to hardware.
+    """Recording sites, stimulation sites and patterns on an array, to save, plot and pass to hardware.
 
     Attributes:
-        array: what the electrode numbers refer to.
+        array: to which the electrode numbers refer.
         recording: electrodes that are recorded, channel by channel, shape (channels,).
         stimulation: electrodes that stimulate, shape (sites,).
         patterns: electrodes pulsed together, all of them stimulation sites, shape (patterns, size).
-        seed: that decided the patterns.
-        scanned: electrodes that were scanned.
-        passed: electrodes that passed the threshold and the spacing.
+        rule: the criteria.
+        seed: of the patterns' draw.
+        scanned: number of electrodes scanned.
+        passed: number of electrodes that met the threshold and the spacing.
     """
 
     __repr__ = briefly
@@ -100,9 +101,9 @@ class Selection:
             electrodes = getattr(self, name)
             if len(np.unique(electrodes)) != len(electrodes):
                 raise InvalidArgument(f"selection.{name}: expected each electrode once, got some twice or more")
-        strange = self.patterns[~np.isin(self.patterns, self.stimulation)]
-        if strange.size:
-            raise InvalidArgument(f"selection.patterns: expected stimulation sites only, got electrode {strange[0]}")
+        others = self.patterns[~np.isin(self.patterns, self.stimulation)]
+        if others.size:
+            raise InvalidArgument(f"selection.patterns: expected stimulation sites only, got electrode {others[0]}")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Selection) and self.to_dict() == other.to_dict()
@@ -122,16 +123,18 @@ class Selection:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Selection:
-        """From what `to_dict` gave.
+        """From the output of `to_dict`.
 
         Raises:
             InvalidArgument: for anything else.
         """
         saved = read_record(_Saved, data, "selection")
         if len(set(map(len, saved.patterns))) > 1:
-            raise InvalidArgument("selection.patterns: expected as many electrodes in each, got other numbers in some")
-        given = saved.recording, saved.stimulation, saved.patterns or np.empty((0, 0))
-        recording, stimulation, patterns = (np.array(electrodes, np.int64) for electrodes in given)
+            raise InvalidArgument(
+                "selection.patterns: expected the same number of electrodes in each, got different ones"
+            )
+        columns = saved.recording, saved.stimulation, saved.patterns or np.empty((0, 0))
+        recording, stimulation, patterns = (np.array(electrodes, np.int64) for electrodes in columns)
         return Selection(
             saved.array, recording, stimulation, patterns, saved.rule, saved.seed, saved.scanned, saved.passed
         )
@@ -142,10 +145,10 @@ class Selection:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Selection:
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
         Raises:
-            InvalidFile: if the file is missing, damaged, or something else.
+            InvalidFile: if the file is missing, damaged, or not a selection.
         """
         text = read_plain_text(path, _MOST_BYTES)
         try:
@@ -164,12 +167,12 @@ def select_electrodes(
     product of spike amplitude and excitatory score, since stimulation is most reliable where the spike is largest.
 
     Args:
-        seed: decides the patterns.
+        seed: of the patterns' draw.
 
     Raises:
-        InvalidArgument: for what cannot be had, with what to relax.
+        InvalidArgument: for criteria that cannot be met, with what to relax.
 
-    Source: the paper's methods; the spacing and the score are ours (it says "by spike shape and amplitude").
+    Source: the paper's methods; the spacing and the score are ours (the paper says "by spike shape and amplitude").
     """
     rule = rule or SelectionRule()
     for name, most in (("recording_sites", array.channels), ("stimulation_sites", array.stimulation_units)):
@@ -186,7 +189,7 @@ def select_electrodes(
             f"of {len(scan)} electrodes pass a signal-to-noise ratio of {rule.signal_to_noise:g}{best}: lower the "
             "ratio or the spacing, scan for longer, or ask for fewer sites"
         )
-    # Ties are broken by the electrode's number, so that one scan gives one selection.
+    # Ties are broken by electrode number, so that a scan always gives the same selection.
     recording = passed[np.lexsort((scan.electrode[passed], -scan.rate_hz[passed]))][: rule.recording_sites]
     if len(recording) < rule.stimulation_sites:
         raise InvalidArgument(
@@ -210,7 +213,7 @@ def _is_best_nearby(
     ratio: Float64[np.ndarray, " electrodes"],
     spacing_um: float,
 ) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Whether no electrode within the spacing has a higher ratio; of two equal ones the first number stays."""
+    """Whether no electrode within the spacing has a higher ratio; of two equal ones the lower number wins."""
     column, row = electrode % array.columns, electrode // array.columns
     grid = np.full((array.rows, array.columns), -np.inf)
     grid[row, column] = ratio

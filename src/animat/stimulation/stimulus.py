@@ -1,4 +1,4 @@
-"""What is delivered to a culture: a pulse on electrodes at a time, and the table of many."""
+"""A stimulus, which is one pulse on some electrodes at a time, and the table of a recording's stimuli."""
 
 from __future__ import annotations
 
@@ -17,27 +17,26 @@ from animat.tables import FASTEST_HZ, UNKNOWN, briefly, expect_rising_times, fre
 
 _ONLY_INT = frozenset({int})
 NOTHING = -2
-"""Stands for the pattern of a stimulus without electrodes, of the place `animat.stimulation.places.NONE`."""
+"""The pattern of a stimulus without electrodes, at the place `animat.stimulation.places.NONE`."""
 
 
 @dataclass(frozen=True)
 class Stimulus:
     """One pulse on one or several electrodes at once.
 
-    What is given is copied as Python's own numbers: electrodes may be a list or an array of whole numbers.
+    Arguments are copied as Python's own numbers: electrodes may be a list or an array of whole numbers.
 
     Attributes:
-        time_s: its start, counted from the start of the delivery that it is part of; float64 or a whole number.
+        time_s: its start, relative to the start of its delivery; float64 or a whole number.
         electrodes: numbers on the array.
         pulse: what each electrode delivers.
-        frequency_hz: the frequency it is presented at, NaN where it has none.
-        pattern: index of the pattern that the electrodes make, -1 where they make none; `NOTHING` where nothing is
-            delivered.
-        presentation: number of the presentation it belongs to.
+        frequency_hz: the frequency at which it is presented, NaN if it has none.
+        pattern: index of the pattern that the electrodes form, -1 if they form none; `NOTHING` if nothing is delivered.
+        presentation: number of its trial.
 
     Raises:
-        InvalidArgument: for numbers of another type, a time in float32 among them, what is no pulse, or electrodes
-            where nothing is delivered.
+        InvalidArgument: for numbers of the wrong type, including a time in float32, a pulse that is not a `Pulse`, or
+            electrodes where nothing is delivered.
     """
 
     time_s: float
@@ -48,7 +47,7 @@ class Stimulus:
     presentation: int = 0
 
     def __post_init__(self) -> None:
-        # A closed loop makes five an action: what is plain already is left as it is.
+        # A closed loop makes five per action: values that are already plain are left as they are.
         if type(self.time_s) is not float:
             object.__setattr__(self, "time_s", seconds("time_s", self.time_s))
         if type(self.electrodes) is not tuple or not _ONLY_INT.issuperset(map(type, self.electrodes)):
@@ -67,15 +66,15 @@ class Stimulus:
 
     @property
     def is_rest(self) -> bool:
-        """Whether nothing is delivered; a stimulus that has no electrodes by mistake is none, and is refused."""
+        """Whether nothing is delivered; a stimulus without electrodes by mistake is not a rest, and is refused."""
         return self.pattern == NOTHING
 
 
 def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
-    """Stimuli that cannot change, in a tuple of their own; one of a subclass as the `Stimulus` its attributes make.
+    """A tuple of stimuli that cannot change; those of a subclass are copied as plain `Stimulus`.
 
     Raises:
-        InvalidArgument: for what is no stimulus.
+        InvalidArgument: for anything that is not a stimulus.
     """
     if not isinstance(stimuli, Iterable):
         raise InvalidArgument(f"stimuli: expected several Stimulus, got {type(stimuli).__name__}")
@@ -84,30 +83,30 @@ def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
 
 def _plain_electrodes(electrodes: Any) -> tuple[int, ...]:
     try:
-        given = tuple(electrodes)
+        listed = tuple(electrodes)
     except TypeError as error:
         raise InvalidArgument(f"electrodes: expected several, got {type(electrodes).__name__}") from error
-    return tuple(whole_number("electrodes", electrode) for electrode in given)
+    return tuple(whole_number("electrodes", electrode) for electrode in listed)
 
 
 def _plain_stimulus(stimulus: Any) -> Stimulus:
     if not isinstance(stimulus, Stimulus):
         raise InvalidArgument(f"stimuli: expected Stimulus, got {type(stimulus).__name__}")
-    return Stimulus(**{each.name: getattr(stimulus, each.name) for each in fields(Stimulus)})
+    return Stimulus(**{field.name: getattr(stimulus, field.name) for field in fields(Stimulus)})
 
 
 @dataclass(frozen=True, eq=False)
 class Stimuli:
-    """The table of stimulation pulses, one row a pulse, in the order of time.
+    """The table of stimulation pulses, one row per pulse, in order of time.
 
     Attributes:
         time_s: start of each pulse on the recording's clock, shape (stimuli,).
-        frequency_hz: the stimulus frequency it was presented at, NaN where it is not known, shape (stimuli,).
-        pattern: index of the stimulation pattern, `UNKNOWN` where it is not known, `NOTHING` where nothing was
-            delivered, shape (stimuli,).
+        frequency_hz: the frequency at which it was presented, NaN if not known, shape (stimuli,).
+        pattern: index of the stimulation pattern, `UNKNOWN` if not known, `NOTHING` if nothing was delivered, shape
+            (stimuli,).
         electrodes: electrodes pulsed together, padded with `UNKNOWN`, shape (stimuli, electrodes).
-        presentation: number of the presentation each pulse belongs to; a response is read after the last pulse of a
-            presentation, shape (stimuli,).
+        presentation: number of each pulse's trial; a response is read after the last pulse of a trial, shape
+            (stimuli,).
     """
 
     __repr__, __reduce__ = briefly, made_anew
@@ -134,14 +133,14 @@ class Stimuli:
                 f"{known[wrong][0]:g}"
             )
         if np.any(np.diff(self.presentation) < 0):
-            raise UnusableData("stimuli.presentation: expected numbers that do not fall as time goes on")
+            raise UnusableData("stimuli.presentation: expected numbers that never fall over time")
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     @property
     def is_last_of_presentation(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Whether a pulse is the last one of its presentation, the one whose response is read; shape (stimuli,)."""
+        """Whether a pulse is the last one of its trial, the one whose response is read; shape (stimuli,)."""
         return is_last_of(self.presentation)
 
     @property
@@ -151,5 +150,5 @@ class Stimuli:
 
 
 def is_last_of(presentation: Int64[np.ndarray, " stimuli"]) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Whether each pulse is the last one of its presentation, by the presentations' numbers; shape (stimuli,)."""
+    """Whether each pulse is the last one of its trial, by the trials' numbers; shape (stimuli,)."""
     return np.append(presentation[1:] != presentation[:-1], True)[: len(presentation)]

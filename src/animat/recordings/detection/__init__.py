@@ -1,5 +1,5 @@
-"""Raw traces to spikes: `settings` says how, `finding_spikes` does it, in chunks and on all cores.
+"""Detects spikes in raw traces: `spikes` does so by the `settings`, in chunks and on all cores.
 
-`artefacts` removes what a stimulus leaves in the traces, `band` filters, `negative_peaks` finds spikes and says how
-large a channel's noise is.
+`artefacts` removes stimulation artefacts from the traces, `band` filters them, and `negative_peaks` finds spikes and
+estimates each channel's noise.
 """

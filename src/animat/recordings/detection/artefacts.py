@@ -1,17 +1,18 @@
-"""What a stimulus leaves in raw traces, and its removal, so that as little of the response as possible goes with it.
+"""Removal of the artefacts that stimuli leave in raw traces, at the least cost to the responses.
 
-Around a stimulus, three things are done to each channel, in this order:
+Each channel is treated in three steps around a stimulus:
 
-1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse the trace is a straight line, and nothing is looked for.
-2. *Saturation*: a channel whose amplifier saturates, as those near a stimulated electrode do, is blanked on until it
-   comes out of it: at the rail if that is known, else while the trace does not move for 0.4 ms on end and is far from
-   where it was. A spike's negative peak in coarse steps stands still for a shorter time. Whoever is still saturated
-   20 ms after the pulse (`recovery_ms`) is followed to the end of that, or to the next pulse.
-3. *Recovery*: what decays afterwards is fitted by a exp(-t / tau) + b, tau from some 0.2 to 16 ms, and the
-   exponential is taken away; what is far off the fit (spikes) hardly counts in it. Nothing is blanked.
+1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse a straight line replaces the trace. No spikes are searched
+   for there.
+2. *Saturation*: a saturated channel, usually near a stimulated electrode, stays blanked until its amplifier recovers.
+   If its rail is known, it is saturated at the rail. Otherwise it is saturated while the trace stays still for 0.4 ms,
+   far from where it was before the pulse. The negative peak of a spike in coarse steps stays still for less. A channel
+   that is still saturated 20 ms after the pulse (`recovery_ms`) is followed until it recovers, or to the next pulse.
+3. *Recovery*: a exp(-t / tau) + b is fitted to the trace afterwards, with tau from about 0.2 to 16 ms, and the
+   exponential is subtracted. The fit is robust against spikes. Nothing is blanked.
 
-Amplifiers recover in more ways than one exponential. What is left where they do is seen in the recording as spikes at
-one time after stimuli, and said there (`animat.responses.quality.timing`).
+Some amplifiers do not recover exponentially. What then remains shows up as spikes at a fixed time after the stimuli,
+and `animat.responses.quality.timing` reports it.
 """
 
 from __future__ import annotations
@@ -27,15 +28,17 @@ from animat.recordings.detection.settings import Detection
 TAUS_MS = (0.3, 0.5, 0.8, 1.2, 2.0, 3.5, 5.0, 8.0)
 GAUSS_NEWTON_STEPS = 8
 FAR = 20.0
-"""Noises from where the trace was, beyond which it may be saturated where it does not move."""
+"""Distance from rest, in standard deviations of the noise, beyond which a still trace counts as saturated."""
 UNSETTLED = 2.0
-"""Noises off, on average over half a millisecond after blanking, beyond which recovery is fitted."""
+"""Mean distance from rest in the half millisecond after blanking, in standard deviations of the noise, beyond which a
+recovery is fitted."""
 FLAT_MS, FLAT_SHARE = 0.4, 0.005
-"""How long a saturated amplifier stands still at least, and how far it moves at most, of its distance from rest."""
+"""How long a saturated trace stays still at least, and how far it moves at most, as a share of its distance from
+rest."""
 SETTLE_MS = 0.25
-"""After an amplifier came out of saturation, as its first samples lie on no exponential."""
+"""Blanked after an amplifier recovers: its first samples do not lie on an exponential."""
 PAUSE_MS = 1.0
-"""For which one that has been saturated for long may move in between."""
+"""How long the trace of an amplifier that has been saturated for more than `recovery_ms` may move in between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +47,9 @@ class Cleaned:
 
     Attributes:
         voltage_uv: shape (channels, samples).
-        is_blank: where nothing is to be looked for, shape (channels, samples); None where nothing is blanked.
-        saturated: channels that were blanked longer, for each stimulus in the stretch, shape (stimuli,).
-        longest_ms: how long after its stimulus the longest of them was blanked, shape (stimuli,).
+        is_blank: samples in which no spikes are searched for, shape (channels, samples); None if nothing is blanked.
+        saturated: number of saturated channels after each stimulus in the stretch, shape (stimuli,).
+        longest_ms: time after each stimulus until which the last of them was blanked, shape (stimuli,).
     """
 
     voltage_uv: Float32[np.ndarray, "channels samples"]
@@ -66,12 +69,13 @@ def without_artefacts(
     """Remove artefacts from a stretch of traces, in place.
 
     Args:
-        voltage_uv: as recorded, one row a channel; changed.
-        stimulus: sample of each pulse in the stretch, rising; may be outside it, by as much as is blanked or followed.
-        noise_uv: of each channel, to tell a large deviation from a small one.
+        voltage_uv: recorded traces, one row per channel; changed.
+        stimulus: sample of each pulse, ascending; pulses outside the stretch count if their artefacts reach into it.
+        noise_uv: standard deviation of each channel's noise.
+        rate_hz: sampling rate.
         settings: how long to blank.
-        rest_uv: of each channel, before the pulses before the stretch; a channel that is far from there and does not
-            move just before the first pulse has been saturated since one of them.
+        rest_uv: voltage of each channel before the last pulses before the stretch; a channel that stays still far from
+            it just before the first pulse is still saturated.
     """
     samples = voltage_uv.shape[1]
     saturated, longest_ms = np.zeros(len(stimulus), np.int64), np.zeros(len(stimulus), np.float32)
@@ -97,13 +101,13 @@ def without_artefacts(
         if end <= 0 or start >= samples:
             continue
         if stop <= end:
-            # The next pulse comes before this one is over: nothing but blanking can be done.
-            _bridge(voltage_uv, is_blank, start, np.full(len(voltage_uv), end), is_held)
+            # The next pulse comes before this one is over: all we can do is blank.
+            _blank(voltage_uv, is_blank, start, np.full(len(voltage_uv), end), is_held)
             continue
         before_uv = np.median(voltage_uv[:, max(start - round(2 * per_ms), 0) : max(start, 1)], axis=1)
-        # What is saturated since the pulse before is not at rest.
+        # A channel that is still saturated since the previous pulse is not at rest.
         rest_uv = np.where(is_held, rest_uv, before_uv)
-        # From the pulse on: what stands still at the blank's end did so before.
+        # From the pulse on: a channel that is still at the end of the blank was still before.
         pulse = max(at, 0)
         saturated_until = _saturated_until(voltage_uv[:, pulse:stop] - rest_uv[:, None], noise_uv, settings, flat)
         until = np.maximum(pulse + saturated_until, end)
@@ -119,8 +123,8 @@ def without_artefacts(
         longest_ms[i] = (int(until.max()) - at) / per_ms if saturated[i] else 0.0
         stops = np.full(len(until), stop)
         stops[longer] = np.minimum(until[longer] + follow, limit)
-        _take_away_recovery(voltage_uv, until, stops, rest_uv, noise_uv, per_ms)
-        _bridge(voltage_uv, is_blank, start, until, is_held)
+        _subtract_recovery(voltage_uv, until, stops, rest_uv, noise_uv, per_ms)
+        _blank(voltage_uv, is_blank, start, until, is_held)
     return Cleaned(voltage_uv, is_blank, saturated, longest_ms)
 
 
@@ -131,13 +135,12 @@ def _saturated_until(
     flat: int,
     pause: int | None = None,
 ) -> Int64[np.ndarray, " channels"]:
-    """How many samples of each channel's trace go by until its amplifier has come out of saturation.
+    """The number of samples until each channel's amplifier has recovered from saturation.
 
-    Without a known rail, it is saturated in stretches of `flat` samples that are far from rest and in which it moves by
-    next to nothing.
+    If its rail is not known, it is saturated where `flat` samples in a row are far from rest and hardly differ.
 
     Args:
-        pause: samples after which it does not count that it is saturated again; None: however many.
+        pause: samples without saturation after which a later saturation is ignored; None: none is ignored.
     """
     until = np.zeros(len(trace_uv), np.int64)
     size_uv, rail_uv = np.abs(trace_uv), settings.saturation_uv
@@ -163,16 +166,16 @@ def _saturated_until(
     return until
 
 
-def _bridge(
+def _blank(
     voltage_uv: Float32[np.ndarray, "channels samples"],
     is_blank: Bool[np.ndarray, "channels samples"],
     start: int,
     until: Int64[np.ndarray, " channels"],
     is_held: Bool[np.ndarray, " channels"],
 ) -> None:
-    """A straight line over the blanked stretch of each channel, between means of half a millisecond or so beside it.
+    """Draw a straight line over the blanked stretch of each channel, between the means of ten samples on either side.
 
-    Of one that is saturated beyond it (`is_held`), at the mean before.
+    For a channel that stays saturated beyond it (`is_held`), the line stays at the mean before.
     """
     for stop in np.unique(until).tolist():
         if stop <= start:
@@ -191,7 +194,7 @@ def _bridge(
         is_blank[chosen, start:stop] = True
 
 
-def _take_away_recovery(
+def _subtract_recovery(
     voltage_uv: Float32[np.ndarray, "channels samples"],
     until: Int64[np.ndarray, " channels"],
     stops: Int64[np.ndarray, " channels"],
@@ -199,7 +202,7 @@ def _take_away_recovery(
     noise_uv: Float32[np.ndarray, " channels"],
     per_ms: float,
 ) -> None:
-    """Fit a exp(-t / tau) + b to what follows on each unsettled channel, and take the exponential away."""
+    """Fit a exp(-t / tau) + b to the trace of each unsettled channel after blanking, and subtract the exponential."""
     for start, stop in np.unique(np.column_stack([until, stops]), axis=0).tolist():
         length = stop - start
         if length < round(2 * per_ms):
@@ -219,10 +222,10 @@ def _fitted(
     t_ms: Float64[np.ndarray, " samples"],
     noise_uv: Float32[np.ndarray, " rows"],
 ) -> Float64[np.ndarray, "rows samples"]:
-    """The exponential a exp(-k t) of the robust least-squares fit a exp(-k t) + b of each row.
+    """The exponential a exp(-k t) of the robust least-squares fit a exp(-k t) + b to each row.
 
-    The best of a few k is the start of Gauss-Newton steps on a, k and b. Residuals are clipped, at four noises or at
-    three times their own median if that is more, so that spikes do not draw the fit.
+    Gauss-Newton steps on a, k and b start from the best of a few k. Residuals are clipped at four standard deviations
+    of the noise, or at three times their own median if that is more, so that spikes do not distort the fit.
     """
     best = np.full(len(trace_uv), np.inf)
     a, b, k = (np.zeros(len(trace_uv)) for _ in range(3))
@@ -239,7 +242,7 @@ def _fitted(
         residual = np.clip(residual, -limit, limit)
         jacobian = np.stack([shape, -a[:, None] * t_ms * shape, np.ones_like(shape)], axis=1)
         normal = jacobian @ jacobian.transpose(0, 2, 1)
-        # A little of the diagonal keeps it solvable where a row has no exponential at all.
+        # A little on the diagonal keeps it solvable for a row without any exponential.
         normal += 1e-9 * np.einsum("rii->ri", normal)[:, :, None] * np.eye(3) + 1e-12 * np.eye(3)
         step = np.linalg.solve(normal, jacobian @ residual[:, :, None])[:, :, 0]
         a, b = a + step[:, 0], b + step[:, 2]
@@ -249,7 +252,7 @@ def _fitted(
 
 @lru_cache(maxsize=32)
 def _starts(samples: int, step_ms: float) -> list[tuple[float, Float64[np.ndarray, "samples 2"], np.ndarray]]:
-    """Of each k that the fit starts from: k, exp(-k t) and 1 at every sample, and the pseudoinverse of these."""
+    """For each k that the fit starts from: k, exp(-k t) and 1 at every sample, and the pseudoinverse of these."""
     t_ms = np.arange(samples) * step_ms
     bases = [(1 / tau, np.column_stack([np.exp(-t_ms / tau), np.ones(samples)])) for tau in TAUS_MS]
     return [(rate, basis, np.linalg.pinv(basis)) for rate, basis in bases]

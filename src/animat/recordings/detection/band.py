@@ -12,12 +12,12 @@ from animat.errors import InvalidArgument
 
 ORDER = 3
 MARGIN_S = 0.05
-"""A stretch needs this much more on both sides: its ends meet in the transform, and what that does dies away by e in
-3 ms at 100 Hz."""
+"""Margin that a piece needs on both sides: the transform is circular, and the resulting transient at its ends decays by
+e in 3 ms at 100 Hz."""
 
 
 def check_band(band_hz: tuple[float, float], rate_hz: float) -> None:
-    """Refuse a band that the sampling rate does not hold.
+    """Refuse a band beyond the Nyquist frequency.
 
     Raises:
         InvalidArgument: if its upper end is not below half the sampling rate.
@@ -32,14 +32,14 @@ def check_band(band_hz: tuple[float, float], rate_hz: float) -> None:
 def band_pass(
     voltage_uv: Float32[np.ndarray, "channels samples"], band_hz: tuple[float, float], rate_hz: float
 ) -> Float32[np.ndarray, "channels samples"]:
-    """Filter each row; `MARGIN_S` at both ends is not to be used.
+    """Filter each row; do not use `MARGIN_S` at both ends.
 
-    The gain at frequency f is |H(f)|^2, H a Butterworth band-pass of order 3: what filtering forwards and backwards
-    gives, without its two passes.
+    The gain at frequency f is |H(f)|^2, H being a Butterworth band-pass of order 3: the result of filtering forwards
+    and backwards, without the two passes.
 
     Args:
-        voltage_uv: one row a channel.
-        band_hz: at which |H|^2 is a half.
+        voltage_uv: one row per channel.
+        band_hz: frequencies at which |H|^2 is a half.
     """
     samples = voltage_uv.shape[1]
     length = fft.next_fast_len(samples, real=True)

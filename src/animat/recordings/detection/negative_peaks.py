@@ -1,4 +1,5 @@
-"""Spikes as negative peaks, below a threshold and whatever is around them; and the noise that thresholds are of."""
+"""Finds spikes as negative peaks below a threshold and below their neighbourhood, and estimates the noise that sets
+thresholds."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 SAMPLES = 2500
-"""Of a channel that are looked at, about."""
+"""Approximate number of samples used per channel."""
 NORMAL = 0.6745
-"""Median of |x| over the standard deviation of x, of a normal distribution."""
+"""Ratio of the median of |x| to the standard deviation of x for a normal distribution."""
 
 
 def median_noise_uv(
@@ -17,22 +18,22 @@ def median_noise_uv(
     """Standard deviation of each channel's noise: median(|v - median(v)|) / 0.6745.
 
     Args:
-        voltage_uv: filtered traces, one row a channel.
+        voltage_uv: filtered traces, one row per channel.
         is_blank: samples that do not count.
     """
     if is_blank is not None and is_blank.any():
-        # A sample counts where no channel is blanked, if there are enough; a few long blanks do not move a median.
+        # A sample counts if no channel is blanked, if there are enough; a few long blanks do not shift a median.
         kept = ~is_blank.any(axis=0)
         if np.count_nonzero(kept) >= 0.5 * voltage_uv.shape[1]:
             voltage_uv = voltage_uv[:, kept]
-    # Neighbouring samples of a filtered trace say the same: every few of them tell as much.
+    # Neighbouring samples of a filtered trace are correlated: a subset of them is as informative.
     voltage_uv = voltage_uv[:, :: max(voltage_uv.shape[1] // SAMPLES, 1)]
     return np.asarray(_median(np.abs(voltage_uv - _median(voltage_uv)[:, None])) / NORMAL, dtype=np.float32)
 
 
 def _median(values: Float32[np.ndarray, "rows values"]) -> Float32[np.ndarray, " rows"]:
-    """Of each row; of the two middle values of an even number, the upper one: one partition, where numpy's takes three,
-    and several times as long."""
+    """The median of each row, for an even number the upper of the two middle values: one partition, while numpy's
+    median does three and takes several times as long."""
     middle = values.shape[1] // 2
     return np.asarray(np.partition(values, middle, axis=1)[:, middle], dtype=np.float32)
 
@@ -46,27 +47,27 @@ def find_negative_peaks(
 ) -> tuple[Int64[np.ndarray, " peaks"], Int64[np.ndarray, " peaks"]]:
     """Rows and samples of the negative peaks.
 
-    A sample t is one if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples; of equal ones, the first.
+    A sample t is a peak if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples; of equal ones, the first.
 
     Args:
-        voltage_uv: filtered, one row a channel.
-        depth_uv: that a negative peak must exceed on each channel; infinite where nothing is to be found.
+        voltage_uv: filtered, one row per channel.
+        depth_uv: depth that a negative peak must exceed on each channel; infinite to find none.
         apart: half the width of the neighbourhood, in samples, at least 1.
-        first, last: look for negative peaks at samples from `first` on, below `last`.
+        first, last: range of samples to search, excluding `last`.
     """
     inner = voltage_uv[:, first:last]
-    # A few of all samples: the neighbourhood is looked at for these only.
+    # The neighbourhood is checked for these few samples only.
     row, column = np.nonzero(inner < -depth_uv[:, None])
     column = column + first
     before, after = np.maximum(column - 1, 0), np.minimum(column + 1, voltage_uv.shape[1] - 1)
-    here = voltage_uv[row, column]
-    low = (here <= voltage_uv[row, before]) & (here <= voltage_uv[row, after])
-    row, column, here = row[low], column[low], here[low]
+    peak_uv = voltage_uv[row, column]
+    low = (peak_uv <= voltage_uv[row, before]) & (peak_uv <= voltage_uv[row, after])
+    row, column, peak_uv = row[low], column[low], peak_uv[low]
     if not len(row):
         return row.astype(np.int64), column.astype(np.int64)
     padded = np.pad(voltage_uv, ((0, 0), (apart, apart)), constant_values=np.inf)
     around = padded[row[:, None], column[:, None] + np.arange(2 * apart + 1)[None, :]]
-    is_least = np.all(here[:, None] < around[:, :apart], axis=1) & np.all(
-        here[:, None] <= around[:, apart + 1 :], axis=1
+    is_least = np.all(peak_uv[:, None] < around[:, :apart], axis=1) & np.all(
+        peak_uv[:, None] <= around[:, apart + 1 :], axis=1
     )
     return row[is_least].astype(np.int64), column[is_least].astype(np.int64)

@@ -1,4 +1,4 @@
-"""Raw traces in pieces, each with a margin on both sides and without artefacts: what is filtered."""
+"""Raw traces in pieces with a margin on both sides, from which artefacts are removed before they are filtered."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from animat.recordings.detection.settings import Detection
 from animat.recordings.raw import RawTraces
 
 FOLLOWED_S, CLOSE_S, REST_S = 1.0, 0.025, 0.005
-"""How long before a piece a pulse may have saturated an amplifier that still is; how soon after another pulse the
-trace is not yet at rest; and how much of the trace before a pulse shows where it rests."""
+"""How long before a piece a pulse may have saturated an amplifier that still is saturated; how long after a pulse a
+trace is not yet at rest; and how much of the trace before a pulse shows its resting voltage."""
 
 REST_PULSES = 5
-"""An amplifier may be saturated before some of them."""
+"""Pulses at which the resting voltage is looked up, as an amplifier may be saturated at some of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,14 +25,15 @@ class Piece:
 
     Attributes:
         start, stop: samples of the recording.
-        margin: more on both sides; beyond the recording's ends, its last samples are repeated.
-        lead: samples before the first margin, from just before the last pulse; they are only cleaned, not searched.
-        voltage_uv: finite, shape (lead + samples + 2 margin, channels).
-        is_lost: where it was not, and is a straight line, of the same shape; None where it always was.
-        stimulus: samples of the pulses in it, counted from the first row of `voltage_uv`.
-        first_stimulus: which of all pulses the first of these is.
-        rests_uv: where each channel was before a few pulses of the last second that are not in the piece, shape
-            (pulses, channels); None if there are none.
+        margin: samples on either side; beyond the ends of the recording its first or last sample is repeated.
+        lead: samples before the first margin, from just before the last pulse. They are only needed for the removal of
+            artefacts.
+        voltage_uv: finite voltages, shape (lead + samples + 2 margin, channels).
+        is_lost: samples that were not finite and are interpolated, of the same shape; None if there are none.
+        stimulus: samples of the pulses in the piece, counted from the first row of `voltage_uv`.
+        first_stimulus: index of the first of these among all pulses.
+        rests_uv: resting voltages at a few earlier pulses of the last second, shape (pulses, channels); None if there
+            are no such pulses.
     """
 
     start: int
@@ -47,7 +48,7 @@ class Piece:
 
     @property
     def owned(self) -> np.ndarray:
-        """Which of its stimuli lie between `start` and `stop`, and not in a margin."""
+        """Which of its stimuli lie between `start` and `stop`, not in a margin."""
         at = self.stimulus - self.lead - self.margin
         return np.asarray((at >= 0) & (at < self.stop - self.start))
 
@@ -59,18 +60,20 @@ class Piece:
         rate_hz: float,
         settings: Detection,
     ) -> Cleaned:
-        """Some of its channels without artefacts, one a row, and without the lead; lost samples are blank in it.
+        """Some of the channels, one per row, without artefacts and without the lead; lost samples are blank.
 
         Args:
             columns: the channels.
-            noise_uv, level_uv: their noise, and where they usually are: an amplifier at rest is nearer to that than a
-                saturated one.
+            noise_uv: standard deviation of their noise.
+            level_uv: their usual voltage. It is closer to that of an amplifier at rest than to that of a saturated one.
+            rate_hz: sampling rate.
+            settings: how long to blank.
         """
         rows = np.array(self.voltage_uv[:, columns].T, order="C")
         rest_uv = None
         if self.rests_uv is not None:
             rests_uv = self.rests_uv[:, columns]
-            # Lost samples are nowhere.
+            # Without samples there is no distance.
             nearest = np.nan_to_num(np.abs(rests_uv - level_uv), nan=np.inf).argmin(axis=0)
             rest_uv = rests_uv[nearest, np.arange(len(nearest))]
         cleaned = without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings, rest_uv)
@@ -85,12 +88,12 @@ class Piece:
         )
 
     def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
-        """Some of its channels as they were recorded, one a row and without the lead; not to be changed."""
+        """Some of the channels as recorded, one per row and without the lead."""
         return np.ascontiguousarray(self.voltage_uv[self.lead :, columns].T)
 
     @property
     def lost(self) -> Int64[np.ndarray, " channels"]:
-        """How many samples of each channel between `start` and `stop` are no finite numbers."""
+        """The number of samples of each channel between `start` and `stop` that are not finite."""
         first = self.lead + self.margin
         inside = slice(first, first + self.stop - self.start)
         n_channels = self.voltage_uv.shape[1]
@@ -100,14 +103,15 @@ class Piece:
 
 
 def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start: int, stop: int, margin: int) -> Piece:
-    """Read a piece, with a lead where a pulse came in the second before.
+    """Read a piece, with a lead if there was a pulse in the second before.
 
-    An amplifier may be saturated since an earlier pulse than the lead begins with. Where it was before shows that.
+    An amplifier may be saturated since an even earlier pulse, so resting voltages are read before some of these.
 
     Args:
-        stimulus: sample of every pulse of the recording, rising.
+        traces: of the recording.
+        stimulus: sample of every pulse of the recording, ascending.
         start, stop: samples of the recording.
-        margin: samples more on both sides.
+        margin: samples on either side.
     """
     begin = start - margin
     followed, close, rest = (round(seconds * traces.sampling_rate_hz) for seconds in (FOLLOWED_S, CLOSE_S, REST_S))
@@ -138,7 +142,7 @@ def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start
 def _rests_uv(
     traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], rest: int
 ) -> Float32[np.ndarray, "pulses channels"] | None:
-    """Where each channel was before a few of these pulses, evenly chosen; None without any."""
+    """The voltage of each channel before a few of these pulses, evenly chosen; None if there are none."""
     chosen = stimulus[np.linspace(0, len(stimulus) - 1, min(len(stimulus), REST_PULSES)).astype(int)]
     before = [traces.read_uv(at - rest, at - rest // 2) for at in chosen.tolist() if at >= rest]
     return np.array([np.median(voltage_uv, axis=0) for voltage_uv in before]) if before else None
@@ -147,7 +151,7 @@ def _rests_uv(
 def _finite(
     voltage_uv: Float32[np.ndarray, "samples channels"], is_lost: Bool[np.ndarray, "samples channels"]
 ) -> Float32[np.ndarray, "samples channels"]:
-    """The voltage with a straight line over what is not finite; 0 on a channel that never is."""
+    """The voltage with lost samples interpolated; 0 on a channel without finite samples."""
     voltage_uv = voltage_uv.copy(order="K")
     at = np.arange(len(voltage_uv))
     for column in np.flatnonzero(is_lost.any(axis=0)).tolist():
@@ -159,6 +163,6 @@ def _finite(
 def stimulus_samples(
     traces: RawTraces, stimulus_time_s: Float64[np.ndarray, " stimuli"]
 ) -> Int64[np.ndarray, " stimuli"]:
-    """The sample that each pulse starts at, rising; pulses at one time are one."""
+    """The sample at which each pulse starts, ascending; simultaneous pulses are one."""
     at = np.rint((np.asarray(stimulus_time_s, np.float64) - traces.start_s) * traces.sampling_rate_hz)
     return np.unique(at).astype(np.int64)

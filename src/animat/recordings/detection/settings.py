@@ -1,4 +1,4 @@
-"""How spikes are found in raw traces."""
+"""Settings of spike detection in raw traces."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ Milliseconds = Annotated[Number, Field(ge=0, le=1000)]
 
 @record
 class Detection:
-    """How spikes are found in raw traces.
+    """Settings of spike detection in raw traces.
 
     Attributes:
-        band_hz: pass band of the zero-phase filter; None where the traces are filtered already.
+        band_hz: pass band of the zero-phase filter; None if the traces are already filtered.
         threshold: depth of a negative peak that is a spike, in standard deviations of the channel's noise.
         dead_time_ms: of two negative peaks within it, the deeper one is the spike.
-        blank_ms: from before to after each stimulus in which nothing is looked for; 1.5 ms after by default, so that
-            the response window from 2 ms on stays whole.
-        saturation_uv: at which an amplifier saturates; None: where the trace is flat, far from where it was.
-        recovery_ms: how long after a stimulus its artefact is followed.
-        chunk_s: traces read at a time; with 1,024 channels at 20 kHz 0.5 s take some 200 MB a core.
+        blank_ms: time before and after each stimulus in which no spikes are looked for; 1.5 ms after by default, so
+            that the response window from 2 ms on stays intact.
+        saturation_uv: voltage at which an amplifier saturates; None: detected where the trace is flat and far from
+            where it was.
+        recovery_ms: how long an artefact is followed after its stimulus.
+        chunk_s: length of traces read at a time; with 1,024 channels at 20 kHz, 0.5 s takes some 200 MB per core.
 
     Raises:
         InvalidArgument: naming the setting, what was expected and what came.

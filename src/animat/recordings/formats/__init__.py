@@ -1,6 +1,5 @@
-"""File formats of recordings: one a file, each with `read_<format>` (and `write_<format>` for NWB, our own).
+"""File formats of recordings: one module per format, each with `read_<format>` (and `write_<format>` for our own, NWB).
 
-To add a format, write `read_<format>(path) -> Recording` in a file of its own, build the recording
-with `animat.recordings.columns` where the file brings plain arrays, and teach `animat.recordings.reading` to know it
-by its content.
+To add a format, write `read_<format>(path) -> Recording` in a new module, build the recording with
+`animat.recordings.columns` if the file has plain arrays, and make `animat.recordings.reading` detect it by its content.
 """

@@ -1,15 +1,15 @@
-"""Cortical Labs CL1 recordings (H5), read for spikes and stimuli. Raw traces: `traces`.
+"""Reads spikes and stimuli of Cortical Labs CL1 recordings (H5). Raw traces: `traces`.
 
     /spikes(timestamp, channel, samples), /stims(timestamp, channel)      frames from the start of the recording
     attributes of /: frames_per_second, channel_count, duration_frames, start_timestamp, created_utc
-    /samples (frames, channels), int16, where raw is kept
-    /data_stream/animat_stimuli/{index(timestamp, start_index, end_index), data}      what animat says of the stimuli
+    /samples (frames, channels), int16, if raw traces were kept
+    /data_stream/animat_stimuli/{index(timestamp, start_index, end_index), data}      stimulus parameters from animat
 
-The rig keeps no amplitude, frequency or pattern: animat's driver puts them into a data stream of its own, one text a
-request (`animat.recordings.formats.stimulus_text`), which holds for the pulses from its timestamp on until the next.
-Pulses of one timestamp on several channels are one stimulus. Attributes that are dictionaries are pickles: they are
-never opened. A channel is an electrode on this rig, so its number stands for both. Of its 64 channels ground and
-reference are no electrodes: they do not count, as in animat's own recordings, and spikes on them are left out.
+The rig stores no amplitude, frequency or pattern: animat's driver writes them to a separate data stream, one text per
+request (`animat.recordings.formats.stimulus_text`), which applies to the pulses from its timestamp on until the next.
+Pulses with the same timestamp on several channels are one stimulus. Attributes that are dictionaries are pickles: they
+are never opened. A channel is an electrode on this rig, so its number is used for both. Of its 64 channels, ground and
+reference are not electrodes: they do not count, as in animat's own recordings, and spikes on them are left out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from animat.recordings.formats.stimulus_text import LONGEST, stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import padded
 
-WHAT = "CL1 recording"
 USUAL_RATE_HZ = 25_000.0
 _TEXT_HEADERS = {0xD9: 2, 0xDA: 3, 0xDB: 5}
 _LARGEST_CHANNEL_COUNT = 4096
@@ -46,18 +45,18 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
     """Read spikes and stimuli of a CL1 recording.
 
     Args:
-        spikes: whether spikes must be there; without, stimuli are read, for raw traces beside them.
+        spikes: whether to read spikes, which must exist; otherwise only stimuli, for raw traces.
 
     Raises:
         InvalidFile: if the file is missing, damaged or lacks spikes.
-        UnusableData: if a column is not what it should be.
+        UnusableData: if a column is invalid.
     """
     path = Path(path)
     findings: list[Finding] = []
-    with hdf5_file(path, WHAT) as file:
+    with hdf5_file(path, "CL1 recording") as file:
         if spikes and not file.has("spikes"):
             raise InvalidFile(
-                f"{path}: expected spikes at /spikes, found none: it was recorded without (include_spikes=False); find "
+                f"{path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
                 "them in its raw traces with animat convert"
             )
         rate_hz = _rate_hz(file, findings)
@@ -66,7 +65,11 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         n_channels = file.attribute("/", "channel_count")
         if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
             findings.append(
-                Finding("channel-count-missing", "note", f"the number of channels is not in the file: {CHANNELS}")
+                Finding(
+                    "channel-count-missing",
+                    "note",
+                    f"the number of channels is not in the file: assumed to be {CHANNELS}",
+                )
             )
             n_channels = CHANNELS
         stimulus_frame, columns = _stimuli(file)
@@ -82,7 +85,9 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         names = ", ".join(
             f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in np.unique(channel[~on_electrode]).tolist()
         )
-        message = f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes; left out"
+        message = (
+            f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are not electrodes, and are left out"
+        )
         findings.append(Finding("spikes-not-on-electrodes", "note", message, float(stray)))
     frame, channel = frame[on_electrode], channel[on_electrode]
     spike_time_s, stimulus_time_s = (frame - start) / rate_hz, (stimulus_frame - start) / rate_hz
@@ -107,14 +112,16 @@ def _rate_hz(file: Hdf5File, findings: list[Finding]) -> float:
         rate = file.attribute("/", name)
         if isinstance(rate, int | float) and 0 < rate < 1e9:
             return float(rate)
-    findings.append(Finding("sampling-missing", "warning", "the sampling rate is not in the file: taken for 25 kHz"))
+    findings.append(
+        Finding("sampling-missing", "warning", "the sampling rate is not in the file: assumed to be 25 kHz")
+    )
     return USUAL_RATE_HZ
 
 
 def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:
-    """The frame that time 0 is: 0, or where the file counts from the start of the rig, its first frame.
+    """The frame of time 0: 0, or the recording's first frame if frames count from the start of the rig.
 
-    Whether it does is told by a pickle, which is not opened; so it is told by the numbers: none is before the start.
+    Which one is stated by a pickle, which is not opened; so it is inferred: no frame lies before the start.
     """
     start, frames = file.attribute("/", "start_timestamp"), file.attribute("/", "duration_frames")
     if not isinstance(start, int) or not isinstance(frames, int) or not 0 < frames < start:
@@ -138,7 +145,7 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
 
 
 def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:
-    """What animat's data stream says of the stimuli; electrodes are known from the stimuli themselves."""
+    """The stimulus parameters from animat's data stream; electrodes are known from the stimuli themselves."""
     at = f"data_stream/{STIMULUS_STREAM}"
     if not len(stimulus) or not file.has(f"{at}/index") or not file.has(f"{at}/data"):
         return {}
@@ -146,17 +153,17 @@ def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> di
     starts = file.read(f"{at}/index", "start_index").astype(np.int64)
     ends = file.read(f"{at}/index", "end_index").astype(np.int64)
     data = file.read(f"{at}/data").astype(np.uint8).tobytes()
-    # Some versions of the SDK write the first rows of the index over and over: from there on nothing is known.
+    # Some versions of the SDK write the first rows of the index again and again: nothing is known from there on.
     _, first = np.unique(np.stack([frame, starts, ends]), axis=1, return_index=True)
-    told = int(np.setdiff1d(np.arange(len(frame)), first).min(initial=len(frame)))
-    is_lost = stimulus > frame[:told].max(initial=-1) if told < len(frame) else np.zeros(len(stimulus), bool)
+    n_valid = int(np.setdiff1d(np.arange(len(frame)), first).min(initial=len(frame)))
+    is_lost = stimulus > frame[:n_valid].max(initial=-1) if n_valid < len(frame) else np.zeros(len(stimulus), bool)
     if lost := int(np.count_nonzero(is_lost)):
         message = (
-            f"the index of the data stream repeats itself after {told:,} of {len(frame):,} entries, as the SDK wrote "
-            f"it: frequency and pattern of the last {lost:,} stimuli are not known; what animat wrote itself has them"
+            f"the index of the data stream, written by the SDK, repeats itself after {n_valid:,} of {len(frame):,} "
+            f"entries: frequency and pattern of the last {lost:,} stimuli are not known; animat's own file has them"
         )
         findings.append(Finding("stimulus-words-lost", "warning", message, float(lost)))
-    order = np.argsort(frame[:told], kind="stable")
+    order = np.argsort(frame[:n_valid], kind="stable")
     texts = [_text(data, int(starts[i]), int(ends[i])) for i in order]
     entry = np.searchsorted(frame[order], stimulus, side="right") - 1
     columns = stimulus_columns(

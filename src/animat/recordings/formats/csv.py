@@ -1,7 +1,7 @@
-"""CSV: spikes in `NAME_spikes.csv[.gz]`, stimuli beside them in `NAME_stimuli.csv[.gz]`.
+"""CSV: spikes in `NAME_spikes.csv[.gz]`, and stimuli in `NAME_stimuli.csv[.gz]` in the same folder.
 
 Both have a header line and columns separated by commas, semicolons or tabs (`animat.recordings.formats.text_table`); a
-stimulus file may also be one bare column of times. Column names are those of
+stimulus file may also be a single column of times without a header. Column names are those of
 `animat.recordings.columns.PlainColumns`, or short ones:
 
     spikes     spike_time_s, time_s or time (seconds); spike_channel, channel or unit (a number or a name)
@@ -9,7 +9,7 @@ stimulus file may also be one bare column of times. Column names are those of
                stimulus_pattern or pattern, stimulus_presentation or presentation,
                stimulus_electrodes or electrodes (several separated by spaces)
 
-Other columns are left out, which is noted. There is no table of channels: those that fired are the channels.
+Other columns are left out, with a finding. There is no channel table: the channels are those that fired.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from animat.errors import InvalidFile, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding, left_out_of
+from animat.recordings.findings import Finding, left_out_finding
 from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
 from animat.tables import fits_padded, padded
@@ -46,20 +46,20 @@ SUFFIXES = (".csv", ".csv.gz")
 
 
 def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[str] | None = None) -> Recording:
-    """Read a recording from a file of spikes and the file of stimuli beside it.
+    """Read a recording from a file of spikes and one of stimuli.
 
     Args:
         path: the spikes.
-        stimuli_path: the stimuli; by default `NAME_stimuli.csv` or `NAME_stimuli.csv.gz` beside `NAME_spikes.csv`
-            (or beside `NAME.csv`). Where there is none, the recording has no stimuli, which is noted.
+        stimuli_path: the stimuli; by default `NAME_stimuli.csv` or `NAME_stimuli.csv.gz` next to `NAME_spikes.csv` (or
+            next to `NAME.csv`). If there is none, the recording has no stimuli, with a finding.
 
     Raises:
         InvalidFile: if a file is missing, damaged or lacks a required column, or the two seem to be swapped.
-        UnusableData: if a column is not what it should be.
+        UnusableData: if a column is invalid.
     """
     path = Path(path)
     if stimuli_path is None and _stem(path).endswith("_stimuli"):
-        raise InvalidFile(f"{path}: expected a file of spikes, got the stimuli beside it; name the file of spikes")
+        raise InvalidFile(f"{path}: expected a spike file, got the stimuli that belong to one; name the spike file")
     stimuli = stimuli_beside(path) if stimuli_path is None else Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
     columns, findings = _columns(read_text_table(path), SPIKE_COLUMNS)
@@ -69,8 +69,8 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
         message = (
-            f"{path.name} has {len(columns['spike_time_s']):,} spikes but no stimuli beside it, so there are no "
-            f"responses to learn from: {looked_for} was looked for; name the file of stimuli so"
+            f"{path.name} has {len(columns['spike_time_s']):,} spikes but no stimuli, so there are no responses to "
+            f"learn from: {looked_for} was looked for; rename the stimulus file accordingly"
         )
         findings.append(Finding("no-stimuli", "refuse", message))
     else:
@@ -82,7 +82,7 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
 
 
 def read_stimuli_csv(path: Path) -> dict[str, Any]:
-    """The stimulus columns of `PlainColumns` in a file of stimuli, whatever else is not known left out.
+    """The stimulus columns of `PlainColumns` in a stimulus file; unknown columns are left out.
 
     Raises:
         InvalidFile: if the file is missing, damaged or lacks the times.
@@ -91,7 +91,7 @@ def read_stimuli_csv(path: Path) -> dict[str, Any]:
 
 
 def stimuli_beside(path: Path) -> Path | None:
-    """The file of stimuli that belongs to a file of spikes, if there is one."""
+    """The stimulus file that belongs to a spike file, if there is one."""
     return next((file for file in _stimuli_beside(path) if file.exists()), None)
 
 
@@ -105,14 +105,14 @@ def _stem(path: Path) -> str:
 
 
 def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[dict[str, Any], list[Finding]]:
-    """The known columns of a file under our names, and what was noticed and left out."""
+    """The known columns of a file under our names, and the findings."""
     place = {}
     for name, names in known.items():
-        found = table.place(names)
-        if found is not None:
-            place[name] = found
+        column = table.place(names)
+        if column is not None:
+            place[name] = column
         elif name in REQUIRED:
-            # Of a table of responses by its other columns, one of these may be misspelt.
+            # It may be a response table in which one of these is misspelt.
             others = ("channel", "count", "rate_hz") if name == "spike_time_s" else ()
             found_names = ", ".join(repr(head)[1:-1][:40] for head in table.header[:12])
             found_names += ", ..." if len(table.header) > 12 else ""
@@ -124,43 +124,43 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
     if len(heads) > 1:
         raise InvalidFile(
             f"{table.path}, line 1: expected one column of {' or '.join(known['spike_channel'])}, got "
-            f"{' and '.join(heads)}: take one out (each unit is a channel)"
+            f"{' and '.join(heads)}: remove one (each unit is a channel)"
         )
     columns = {name: plain_column(table, i, name) for name, i in place.items()}
     left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
     if left_out:
-        missing = [each for name, names in known.items() if name not in place for each in names]
-        table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
+        missing = [alias for name, names in known.items() if name not in place for alias in names]
+        table.findings.append(left_out_finding("columns", left_out, table.path.name, missing))
     return columns, table.findings
 
 
 def _advice(table: TextTable, missing: str) -> str:
-    """What to do about a column that is missing, where the others tell."""
+    """What to do about a missing column, if the others show it."""
     heads = {folded(name) for name in table.header}
     if table.header[0].startswith("<"):
-        return ": it is a web page, perhaps the answer of a server in place of the file; get it again"
+        return ": it is a web page, perhaps a server's error page instead of the file; download it again"
     if len(heads) == 1 and len(table.header[0].split()) > 1:
         return ": separate the columns by commas, semicolons or tabs"
     if table.header[0].startswith("sep="):
-        return ": take this first line out"
+        return ": remove this first line"
     if any(is_number(name) for name in table.header):
-        return ": write the names of the columns into a line above"
+        return ": add a line with the column names above"
     if missing == "spike_channel" and any(heads & set(names) for names in list(STIMULUS_COLUMNS.values())[1:]):
-        return ": it looks like a file of stimuli; are spikes and stimuli swapped?"
+        return ": it looks like a stimulus file; are spikes and stimuli swapped?"
     other_unit = next((name for name in heads if name.endswith(("time_ms", "time_us", "sample", "frame"))), None)
     if missing != "spike_channel" and other_unit is not None:
-        return f": bring the times of {other_unit} in seconds, and call them time_s"
+        return f": convert the times in {other_unit} to seconds, and name them time_s"
     return ""
 
 
 def nearest(table: TextTable, missing: Sequence[str]) -> str:
-    """The end of a message on columns of which one is missing: the name that one of the table's others is near to."""
+    """The end of a message on missing columns: the missing name that one of the table's columns is similar to."""
     heads = [folded(name) for name in table.header]
     return next(filter(None, (did_you_mean(head, missing) for head in heads if head not in missing)), "")
 
 
 def plain_column(table: TextTable, place: int, name: str) -> Column:
-    """One column of spikes or stimuli under its name in `PlainColumns`: numbers, or text where it may be names.
+    """One column of spikes or stimuli by its name in `PlainColumns`: numbers, or text if it may hold names.
 
     Raises:
         InvalidFile: for a cell that is neither, with its line.
@@ -202,6 +202,6 @@ def _electrodes(table: TextTable, place: int) -> Column:
     if not fits_padded(lists):
         width = max(map(len, lists))
         raise InvalidFile(
-            f"{table.path}: stimulus_electrodes: expected a few electrodes a stimulus, got {width} in one line"
+            f"{table.path}: stimulus_electrodes: expected a few electrodes per stimulus, got {width} in one line"
         )
     return padded(lists)

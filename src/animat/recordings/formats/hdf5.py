@@ -1,9 +1,9 @@
-"""HDF5 files of strangers, read so that a damaged or hostile one costs an error and nothing else.
+"""Reads untrusted HDF5 files so that a damaged or hostile one causes an error and nothing else.
 
 A file is data, never instructions: links to other files are not followed (external links, external storage, virtual
-datasets), pickles are bytes that nobody opens, and what claims to be larger than the file can hold is refused before
-memory is asked for. Links inside a file are followed, as MaxWell's files need them. Where
-several things in a file could be meant, one is chosen by its name (`choose`).
+datasets), pickles are never opened, and data that claims to be larger than the file can hold is refused before memory
+is allocated. Links inside a file are followed, as MaxWell's files need them. If a file has several candidates, one is
+chosen by name (`choose`).
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from animat.errors import AnimatError, InvalidFile
 Column = np.ndarray[Any, Any]
 
 SOFT_LINKS = 16
-"""Followed in a row; more are a circle."""
+"""Most links followed in a row; more are circular."""
 SPARE_VALUES = 1_000_000
-"""Values that any file may hold, however small it is; beyond them each takes a byte of it, in any compression."""
+"""Values that any file may hold, however small it is; each one beyond them must take at least a byte."""
 LARGEST_VALUES = 200_000_000
 LARGEST_ITEM_BYTES = 2**16
 LARGEST_CHUNK_BYTES = 2**28
 DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError, AttributeError)
-"""What h5py and numpy raise on damaged files."""
+"""Errors that h5py and numpy raise on damaged files."""
 
 
 class Hdf5File:
-    """An open file whose every access is checked.
+    """An open file in which every access is checked.
 
     Attributes:
         path: of the file, for messages.
-        file: the open file; for what is checked elsewhere.
+        file: the open file, for accesses that are checked elsewhere.
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
@@ -47,10 +47,10 @@ class Hdf5File:
         self._bytes = path.stat().st_size
 
     def node(self, where: str) -> h5py.Group | h5py.Dataset | None:
-        """What stands at a place, None if nothing does; links inside the file are followed, others refused.
+        """The group or dataset at a path, None if there is none; links inside the file are followed, others refused.
 
         Raises:
-            InvalidFile: for a link to another file, or links in a circle.
+            InvalidFile: for a link to another file, or circular links.
         """
         parts = deque(part for part in where.split("/") if part)
         node: Any = self.file["/"]
@@ -65,45 +65,45 @@ class Hdf5File:
             if isinstance(link, h5py.ExternalLink):
                 raise InvalidFile(
                     f"{self.path}: expected data in the file itself, but {where} is a link to another file, which is "
-                    "never followed; copy the data into one file"
+                    "never followed; copy all data into one file"
                 )
             if isinstance(link, h5py.SoftLink):
                 hops += 1
                 if hops > SOFT_LINKS:
-                    raise InvalidFile(f"{self.path}: expected data at {where}, got links in a circle")
+                    raise InvalidFile(f"{self.path}: expected data at {where}, got circular links")
                 if link.path.startswith("/"):
                     node = self.file["/"]
                 parts.extendleft(reversed([part for part in link.path.split("/") if part]))
                 continue
-            # There is such a link: what it leads to is damaged if it cannot be opened, and not missing.
+            # The link exists: if its target cannot be opened, it is damaged, not missing.
             node = node[name]
         return node if isinstance(node, h5py.Group | h5py.Dataset) else None
 
     def names(self, where: str) -> list[str]:
-        """Names of what a group holds, in alphabetical order; none where there is no group."""
+        """Names of a group's members, in alphabetical order; empty if there is no group."""
         node = self.node(where)
         return sorted(node) if isinstance(node, h5py.Group) else []
 
     @property
-    def held(self) -> str:
-        """The first names at its root, in words."""
+    def root_names(self) -> str:
+        """The first names at the root, for messages."""
         names = self.names("/")
         return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
 
     def has(self, where: str) -> bool:
-        """Whether something stands at a place."""
+        """Whether there is a group or dataset at a path."""
         return self.node(where) is not None
 
     def fields(self, where: str) -> tuple[str, ...]:
-        """Names of a table's columns; none for other datasets, or where there is none."""
+        """Names of a table's columns; empty for other datasets, or if there is none."""
         node = self.node(where)
         return tuple(node.dtype.names or ()) if isinstance(node, h5py.Dataset) else ()
 
     def dataset(self, where: str) -> h5py.Dataset:
-        """A dataset whose values lie in the file itself.
+        """A dataset whose values are in the file itself.
 
         Raises:
-            InvalidFile: if there is none, or its values lie in other files.
+            InvalidFile: if there is none, or its values are in other files.
         """
         node = self.node(where)
         if not isinstance(node, h5py.Dataset):
@@ -111,21 +111,22 @@ class Hdf5File:
         created = node.id.get_create_plist()
         if created.get_external_count() > 0 or created.get_layout() == h5py.h5d.VIRTUAL:
             raise InvalidFile(
-                f"{self.path}: expected the values of {where} in the file itself, but they lie in other files, which "
-                "are never opened; copy the data into one file"
+                f"{self.path}: expected the values of {where} in the file itself, but they are in other files, which "
+                "are never opened; copy all data into one file"
             )
         chunk = node.chunks
         if node.dtype.itemsize > LARGEST_ITEM_BYTES or (
             chunk is not None and math.prod(chunk) * max(node.dtype.itemsize, 1) > LARGEST_CHUNK_BYTES
         ):
-            raise InvalidFile(f"{self.path}: {where} is stored in pieces of an absurd size: the file is damaged")
+            raise InvalidFile(f"{self.path}: {where} is stored in chunks of an absurd size: the file is damaged")
         return node
 
     def read(self, where: str, field: str | None = None) -> Column:
-        """All values of a dataset, or of one column of a table; text comes as `str`.
+        """All values of a dataset, or of one column of a table; text is returned as `str`.
 
         Raises:
-            InvalidFile: if there is none, it holds no numbers or text, or claims more values than the file can hold.
+            InvalidFile: if there is none, its type is not numbers or text, or it claims more values than the
+                file can hold.
         """
         dataset = self.dataset(where)
         dtype = dataset.dtype
@@ -145,14 +146,14 @@ class Hdf5File:
         return _as_text(values) if text else values
 
     def first(self, where: str) -> Any:
-        """The first value of a dataset, a number or text; None where there is no such dataset or it is empty."""
+        """The first value of a dataset, a number or text; None if there is no such dataset or it is empty."""
         if not isinstance(self.node(where), h5py.Dataset):
             return None
         values = self.read(where).reshape(-1)
         return values[0].item() if len(values) else None
 
     def ends(self, where: str) -> tuple[int, int, int] | None:
-        """First and last value of a dataset of whole numbers and how many there are; None where there are none."""
+        """First value, last value and length of a dataset of whole numbers; None if there is none."""
         node = self.node(where)
         if not isinstance(node, h5py.Dataset) or node.ndim != 1 or not node.shape[0] or node.dtype.kind not in "iu":
             return None
@@ -162,7 +163,7 @@ class Hdf5File:
         return int(dataset[0]), int(dataset[-1]), int(dataset.shape[0])
 
     def attribute(self, where: str, name: str) -> Any:
-        """An attribute that is one number or text; None where it is missing or anything else. Nothing is unpickled."""
+        """An attribute that is one number or text; None if it is missing or anything else. Nothing is unpickled."""
         node = self.node(where)
         if node is None or name not in node.attrs:
             return None
@@ -189,27 +190,27 @@ class Hdf5File:
             )
 
 
-PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) and name its folder in HDF5_PLUGIN_PATH"
+PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) and set HDF5_PLUGIN_PATH to its folder"
 
 
 def unavailable_filters(dataset: h5py.Dataset) -> str:
-    """The compression filters of a dataset that are not installed here, in words; empty where all are."""
+    """The compression filters of a dataset that are not installed, for messages; empty if all are installed."""
     created = dataset.id.get_create_plist()
     names = []
     for code, _, _, name in map(created.get_filter, range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(code):
-            words = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
-            words = words.partition("\0")[0].strip()
-            names.append(f"filter {code}" + (f" ({words})" if words.isprintable() and words else ""))
+            text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
+            text = text.partition("\0")[0].strip()
+            names.append(f"filter {code}" + (f" ({text})" if text.isprintable() and text else ""))
     return ", ".join(names)
 
 
 @contextmanager
 def hdf5_file(path: Path, what: str) -> Iterator[Hdf5File]:
-    """Open a file for checked reading; whatever goes wrong inside is one `InvalidFile` that names it.
+    """Open a file for checked reading; any error inside becomes an `InvalidFile` that names the file.
 
     Args:
-        what: the kind of file in words, such as "NWB recording".
+        what: the kind of file for messages, such as "NWB recording".
     """
     try:
         with h5py.File(path, "r") as file:
@@ -220,13 +221,13 @@ def hdf5_file(path: Path, what: str) -> Iterator[Hdf5File]:
         raise InvalidFile(f"{path}: no such file") from error
     except (*DAMAGE, AnimatError) as error:
         raise InvalidFile(
-            f"{path}: expected a whole {what}, but it is cut off or damaged ({first_line(error)}); "
+            f"{path}: expected a complete {what}, but it is cut off or damaged ({first_line(error)}); "
             "copy or record it again"
         ) from error
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says, or its kind where it says nothing."""
+    """The first line of an error's message, or its type if it has none."""
     line = str(error).strip().partition("\n")[0]
     return (line if line.isprintable() else "".join(c for c in line if c.isprintable()))[:200] or type(error).__name__
 
@@ -234,7 +235,7 @@ def first_line(error: BaseException) -> str:
 def _as_text(values: Column) -> Column:
     flat = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.reshape(-1).tolist()]
     if sum(map(len, flat)) > LARGEST_VALUES or max(map(len, flat), default=0) * len(flat) > LARGEST_VALUES:
-        # numpy gives every text the room of the longest.
+        # numpy reserves the length of the longest text for each.
         flat = [text[:256] for text in flat]
     return np.array(flat, dtype=np.str_).reshape(values.shape)
 
@@ -243,27 +244,28 @@ LISTED = 8
 
 
 def choose(
-    what: str, option: str, names: Iterable[str], asked: str | None, words: Callable[[str], str] = lambda name: name
+    what: str, option: str, names: Iterable[str], asked: str | None, describe: Callable[[str], str] = lambda name: name
 ) -> str:
-    """The name asked for, or the only one.
+    """The requested name, or the only one.
 
     Args:
         what: what is chosen and where, such as `rig.h5: part`.
-        option: how the user names it, such as `--part`.
-        names: what there is, at least one.
-        asked: the name asked for, if one was.
-        words: what to list of each name.
+        option: the option that chooses it, such as `--part`.
+        names: the candidates, at least one.
+        asked: the requested name, if any.
+        describe: how a name is listed in messages.
 
     Raises:
-        InvalidFile: naming what there is, if the name is not among them, or none is asked for and there are several.
+        InvalidFile: listing the candidates, if the name is not one of them, or none is requested and there are several.
     """
-    there = list(names)
-    listed = ", ".join(words(name)[:80] for name in there[:LISTED]) + (", ..." if len(there) > LISTED else "")
+    candidates = list(names)
+    listed = ", ".join(describe(name)[:80] for name in candidates[:LISTED])
+    listed += ", ..." if len(candidates) > LISTED else ""
     if asked is not None:
-        if asked in there:
+        if asked in candidates:
             return asked
         raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
-    if len(there) == 1:
-        return there[0]
-    raise InvalidFile(f"{what}: expected one, found {len(there)}: {listed}; choose with {option} NAME, which "
-                      "animat inspect and animat convert have: convert it for other commands")  # fmt: skip
+    if len(candidates) == 1:
+        return candidates[0]
+    raise InvalidFile(f"{what}: expected one, found {len(candidates)}: {listed}; choose with {option} NAME in "
+                      "animat inspect or animat convert; other commands need the file converted first")  # fmt: skip

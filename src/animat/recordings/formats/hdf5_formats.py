@@ -1,4 +1,4 @@
-"""Which of the formats in HDF5 a file is, told by its layout, and read."""
+"""Detects the format of an HDF5 file by its layout, and reads it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Format = Literal["NWB", "MaxWell", "CL1"]
 
 
 def format_of(file: Hdf5File) -> Format | None:
-    """The format of an open file, None for one that is not known."""
+    """The format of an open file, None if it is unknown."""
     if is_nwb(file):
         return "NWB"
     if is_maxwell(file):
@@ -28,24 +28,24 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
     """Read a recording in any of the formats.
 
     Args:
-        part: which recording of a MaxWell file that holds several.
-        stimuli: the name of the stimuli where several could be meant.
+        part: which recording of a MaxWell file with several.
+        stimuli: the name of the stimuli, if there are several candidates.
 
     Raises:
-        InvalidFile: if the file is damaged, of no known format, or holds no recording.
+        InvalidFile: if the file is damaged, of an unknown format, or holds no recording.
         InvalidArgument: for a choice that the file's format does not offer.
     """
     with hdf5_file(path, "HDF5 recording") as file:
-        found = format_of(file)
-        if found is None:
+        kind = format_of(file)
+        if kind is None:
             raise InvalidFile(
-                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.held}); bring its "
+                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.root_names}); save its "
                 "columns as NPZ or CSV"
             )
-    if part is not None and found != "MaxWell":
-        raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for one of {found}")
-    if stimuli is not None and found == "CL1":
-        raise InvalidArgument(f"stimuli: expected only for NWB and MaxWell files, got {stimuli!r} for one of {found}")
-    if found == "NWB":
+    if part is not None and kind != "MaxWell":
+        raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for a {kind} file")
+    if stimuli is not None and kind == "CL1":
+        raise InvalidArgument(f"stimuli: expected only for NWB and MaxWell files, got {stimuli!r} for a {kind} file")
+    if kind == "NWB":
         return read_nwb(path, stimuli=stimuli)
-    return read_maxwell(path, part=part, stimuli=stimuli) if found == "MaxWell" else read_cl1(path)
+    return read_maxwell(path, part=part, stimuli=stimuli) if kind == "MaxWell" else read_cl1(path)

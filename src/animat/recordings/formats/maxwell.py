@@ -1,6 +1,6 @@
-"""MaxWell MaxOne and MaxTwo files, new and old layout, read for spikes, stimuli and electrodes. Raw traces: `traces`.
+"""Reads spikes, stimuli and electrodes of MaxWell MaxOne and MaxTwo files, new and old layout. Raw traces: `traces`.
 
-    new    wells/wellNNN/recNNNN (also as recordings/recNNNN/wellNNN or data_store/dataNNNN), and there
+    new    wells/wellNNN/recNNNN (also as recordings/recNNNN/wellNNN or data_store/dataNNNN), with
              settings/mapping(channel, electrode, x, y), settings/sampling, settings/lsb
              spikes(frameno, channel, amplitude)
              events(frameno, eventtype, eventid, eventmessage)                        stimuli
@@ -8,8 +8,8 @@
     old    (version 20160704) mapping, settings/lsb, proc0/spikeTimes(frameno, channel, amplitude), sig,
              bits(frameno, bits)                                                      stimuli
 
-Frames are counted from when the system started: the first of `frame_nos` (old: the last two rows of `sig`) is time 0.
-A channel can be named twice in `mapping`; what was recorded is in `groups/NAME/channels`. `spikes` and `events` are
+Frames count from the start of the system: the first of `frame_nos` (old: from the last two rows of `sig`) is time 0. A
+channel can occur twice in `mapping`; the recorded channels are in `groups/NAME/channels`. `spikes` and `events` are
 plain tables: they are read without the vendor's compression filter, which the raw traces may need.
 """
 
@@ -31,16 +31,15 @@ from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
-WHAT = "MaxWell recording"
 OLD_VERSION = 20160704
 USUAL_RATE_HZ = 20_000.0
 ROOTS = ("wells", "recordings", "data_store")
 OLD_CHANNELS = 1024
-"""Rows of `sig` that are channels; the last two of its rows hold the frame number, low half first."""
+"""Rows of `sig` that are channels; its last two rows hold the frame number, low half first."""
 
 
 def is_maxwell(file: Hdf5File) -> bool:
-    """Whether a file is laid out as MaxWell's are."""
+    """Whether a file has MaxWell's layout."""
     return is_old(file) or any(file.names(root) for root in ROOTS)
 
 
@@ -55,36 +54,36 @@ def read_maxwell(
     """Read spikes, stimuli and electrodes of one recording of a MaxWell file.
 
     Args:
-        part: which recording, such as `well000/rec0000`, where the file holds several.
-        stimuli: the type of the events that are stimuli, as a number, where there are several types.
-        spikes: whether spikes must be there; without, channels and stimuli are read, for raw traces beside them.
+        part: which recording, such as `well000/rec0000`, if the file has several.
+        stimuli: the type of the events that are stimuli, as a number, if there are several types.
+        spikes: whether to read spikes, which must exist; otherwise only channels and stimuli, for raw traces.
 
     Raises:
         InvalidFile: if the file is missing, damaged, lacks spikes, or holds several recordings and none is chosen.
-        UnusableData: if a column is not what it should be.
+        UnusableData: if a column is invalid.
     """
     path = Path(path)
-    with hdf5_file(path, WHAT) as file:
-        found = _old(file) if is_old(file) else _new(file, part)
-        found.read(file, stimuli, spikes)
-    return found.recording(path)
+    with hdf5_file(path, "MaxWell recording") as file:
+        contents = _old(file) if is_old(file) else _new(file, part)
+        contents.read(file, stimuli, spikes)
+    return contents.recording(path)
 
 
 def parts(file: Hdf5File) -> dict[str, str]:
-    """Name of each recording in a file of the new layout, and where it is."""
+    """The path of each recording in a file of the new layout, by its name."""
     for root in ROOTS:
         outer = file.names(root)
         if root == "data_store" and outer:
             return {name: f"{root}/{name}" for name in outer}
-        found = {f"{a}/{b}": f"{root}/{a}/{b}" for a in outer for b in file.names(f"{root}/{a}")}
-        if found:
-            return found
+        recordings = {f"{a}/{b}": f"{root}/{a}/{b}" for a in outer for b in file.names(f"{root}/{a}")}
+        if recordings:
+            return recordings
     return {}
 
 
 @dataclass
-class _Found:
-    """Where things are in one layout, and what was read there."""
+class _Contents:
+    """The paths of data in one layout, and the data read from there."""
 
     spikes_at: str
     events_at: str
@@ -103,7 +102,7 @@ class _Found:
         if spikes and not file.has(self.spikes_at):
             raise InvalidFile(
                 f"{file.path}: expected spikes at /{self.spikes_at}, found none: the rig kept raw traces only, or "
-                "nothing; find spikes in them with animat convert"
+                "nothing; detect spikes in them with animat convert"
             )
         spike_frame = file.read(self.spikes_at, "frameno") if spikes else np.empty(0, np.int64)
         spike_channel = file.read(self.spikes_at, "channel") if spikes else np.empty(0, np.int64)
@@ -111,15 +110,15 @@ class _Found:
         if self.first_frame is None:
             frames = [int(np.min(f)) for f in (spike_frame, event_frame) if len(f)]
             self.first_frame = min(frames, default=0)
-            message = "the first frame's number is not in the file: the clock starts at the first spike or stimulus"
+            message = (
+                "the number of the first frame is not in the file: the clock starts at the first spike or stimulus"
+            )
             self._note("clock-from-first-event", message, "note")
         labels, electrode, xy_um = self._channels(file, spike_channel)
         routed = np.isin(spike_channel, labels)
         if not np.all(routed):
             lost = int(np.count_nonzero(~routed))
-            message = (
-                f"{lost:,} of {len(routed):,} spikes are on channels that no electrode is routed to, and are left out"
-            )
+            message = f"{lost:,} of {len(routed):,} spikes are on channels without a routed electrode and are left out"
             self._note("spikes-not-routed", message, "note" if lost < 0.01 * len(routed) else "warning", float(lost))
         self.columns |= {
             "spike_time_s": self._seconds(spike_frame[routed]),
@@ -136,7 +135,7 @@ class _Found:
             self.columns |= recorded_span(self.frames, self.rate_hz, *times_s)
 
     def recording(self, path: Path) -> Recording:
-        """What was read as a recording."""
+        """The recording made from the data."""
         provenance = {"source": path.name, "format": "MaxWell", **self.provenance}
         return PlainColumns(**self.columns).to_recording(provenance, tuple(self.findings))
 
@@ -149,7 +148,7 @@ class _Found:
             rises = (bits != 0) & (bits != np.concatenate([[0], bits[:-1]]))
             chosen = frame[rises]
             if n_falls := int(np.count_nonzero(~rises)):
-                message = f"{n_falls:,} of {len(bits):,} entries of /bits end a pulse and are no stimuli"
+                message = f"{n_falls:,} of {len(bits):,} entries of /bits end a pulse and are not stimuli"
                 self._note("bits-not-rising", message, "note", float(n_falls))
             columns = {"stimulus_pattern": bits[rises]} if len(np.unique(bits[rises])) > 1 else {}
             return chosen, columns
@@ -182,9 +181,8 @@ class _Found:
             labels = np.unique(spike_channel if self.recorded_channels is None else self.recorded_channels)
             severity = "warning" if self.recorded_channels is None else "note"
             message = (
-                f"the file has no /{self.mapping_at}: which electrode a channel reads is not "
-                f"known; {len(labels):,} channels are taken from "
-                + ("those that fired" if self.recorded_channels is None else "its groups")
+                f"the file has no /{self.mapping_at}: the electrodes of channels are not known; {len(labels):,} "
+                "channels are " + ("those that fired" if self.recorded_channels is None else "taken from its groups")
             )
             self._note("mapping-missing", message, severity)
             return labels, np.full(len(labels), UNKNOWN), np.full((len(labels), 2), np.nan)
@@ -198,8 +196,8 @@ class _Found:
         if repeated := int(np.count_nonzero(used)) - len(labels):
             rows = np.unique(np.column_stack([channel[used], electrode[used]]), axis=0)
             twice = len(rows) - len(labels)
-            message = f"the file's mapping names {repeated:,} channels again; each is one channel here" + (
-                f", and where it names another electrode ({twice:,} times) the first named is taken" if twice else ""
+            message = f"the file's mapping repeats {repeated:,} channels; each counts once" + (
+                f", and where it lists another electrode ({twice:,} times) the first one is used" if twice else ""
             )
             self._note("duplicate-channels", message, "note", float(repeated))
         if self.recorded_channels is not None:
@@ -216,23 +214,23 @@ class _Found:
         self.findings.append(Finding(name, severity, message, value))
 
 
-def _new(file: Hdf5File, part: str | None) -> _Found:
-    found_parts = parts(file)
-    if not found_parts:
+def _new(file: Hdf5File, part: str | None) -> _Contents:
+    recordings = parts(file)
+    if not recordings:
         raise InvalidFile(f"{file.path}: expected a MaxWell recording in one of {', '.join(ROOTS)}, found none")
-    name = choose(f"{file.path}: part", "--part", found_parts, part)
-    at = found_parts[name]
+    name = choose(f"{file.path}: part", "--part", recordings, part)
+    at = recordings[name]
     findings = []
     rate = file.first(f"{at}/settings/sampling")
     if not isinstance(rate, int | float) or not rate > 0:
         findings.append(
-            Finding("sampling-missing", "warning", "the sampling rate is not in the file: taken for 20 kHz")
+            Finding("sampling-missing", "warning", "the sampling rate is not in the file: assumed to be 20 kHz")
         )
         rate = USUAL_RATE_HZ
     groups = file.names(f"{at}/groups")
     recorded = [file.read(f"{at}/groups/{g}/channels") for g in groups if file.has(f"{at}/groups/{g}/channels")]
     ends = [e for g in groups if (e := file.ends(f"{at}/groups/{g}/frame_nos")) is not None]
-    found = _Found(
+    contents = _Contents(
         f"{at}/spikes",
         f"{at}/events",
         "events",
@@ -245,34 +243,33 @@ def _new(file: Hdf5File, part: str | None) -> _Found:
     )
     lost = max((e[1] - e[0] + 1 - e[2] for e in ends), default=0)
     if lost > 0:
-        found.findings.append(
+        contents.findings.append(
             Finding(
                 "frames-lost",
                 "warning" if lost > 0.001 * max(e[2] for e in ends) else "note",
-                f"{lost:,} frames ({lost / float(rate):.3g} s) are missing from the recording: what happened in them "
-                "is not known",
+                f"{lost:,} frames ({lost / float(rate):.3g} s) are missing from the recording",
                 float(lost),
             )
         )
-    if found.frames is not None and found.frames <= 0:
-        found.frames = None
-    if len(found_parts) > 1:
-        found.provenance["part"] = name
+    if contents.frames is not None and contents.frames <= 0:
+        contents.frames = None
+    if len(recordings) > 1:
+        contents.provenance["part"] = name
     started = file.first(f"{at}/start_time")
     if isinstance(started, int | float) and 0 < started < 4e12:
-        found.provenance["recorded_at"] = datetime.fromtimestamp(started / 1e3, UTC).isoformat(timespec="milliseconds")
-    return found
+        date = datetime.fromtimestamp(started / 1e3, UTC)
+        contents.provenance["recorded_at"] = date.isoformat(timespec="milliseconds")
+    return contents
 
 
-def _old(file: Hdf5File) -> _Found:
-    rate = USUAL_RATE_HZ
-    found = _Found("proc0/spikeTimes", "bits", "bits", "mapping", rate, first_frame=None)
+def _old(file: Hdf5File) -> _Contents:
+    contents = _Contents("proc0/spikeTimes", "bits", "bits", "mapping", USUAL_RATE_HZ, first_frame=None)
     sig = file.node("sig")
     if sig is not None and len(getattr(sig, "shape", ())) == 2 and sig.shape[0] > OLD_CHANNELS and sig.shape[1]:
         dataset = file.dataset("sig")
         if not unavailable_filters(dataset):
             low, high = (int(value) for value in dataset[-2:, 0])
-            found.first_frame = high << 16 | low
-        found.frames = int(dataset.shape[1])
-    found.provenance["layout"] = f"version {OLD_VERSION}"
-    return found
+            contents.first_frame = high << 16 | low
+        contents.frames = int(dataset.shape[1])
+    contents.provenance["layout"] = f"version {OLD_VERSION}"
+    return contents

@@ -1,10 +1,10 @@
-"""NPZ: one compressed numpy archive of plain columns, the simplest way to bring a recording.
+"""NPZ: one compressed numpy archive of plain columns, the simplest way to provide a recording.
 
 Keys are those of `animat.recordings.columns.PlainColumns`; `spike_time_s`, `spike_channel` and `stimulus_time_s` are
-required. Other names that are understood: `stim_...` for `stimulus_...`; for spike-sorted data `spike_unit` for
-`spike_channel` and `unit_...` for `channel_...` (each unit is then a channel); `stim_tag` for `stimulus_pattern`. Where
-units have positions but no electrodes, `mapping_electrode` and `mapping_xy_um` (the array's routing) name the electrode
-at each position, and `mapping_channel` is not needed. Any other key is left out, which is noted.
+required. Other accepted names are `stim_...` for `stimulus_...`; for spike-sorted data `spike_unit` for `spike_channel`
+and `unit_...` for `channel_...` (each unit is then a channel); `stim_tag` for `stimulus_pattern`. If units have
+positions but no electrodes, `mapping_electrode` and `mapping_xy_um` (the array's routing) give the electrode at each
+position, and `mapping_channel` is not needed. Any other key is left out, with a finding.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from animat.errors import InvalidFile, UnusableData, did_you_mean
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import left_out_of
+from animat.recordings.findings import left_out_finding
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -29,9 +29,9 @@ from animat.tables import UNKNOWN
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
 UNPACKED_BYTES, UNPACKED_RATIO = 2**26, 20
-WORDS = ("presentation_order",)
+TEXTS = ("presentation_order",)
 WHOLE = ("presentation_pulses",)
-SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *WORDS)
+SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *TEXTS)
 OTHER_NAMES = {
     "stim_tag": "stimulus_pattern",
     "spike_unit": "spike_channel",
@@ -39,7 +39,7 @@ OTHER_NAMES = {
     **{key.replace("channel_", "unit_"): key for key in KEYS if key.startswith("channel_")},
 }
 SPREADSHEET = "[Content_Types].xml"
-"""In the archives that spreadsheets are, too."""
+"""Present in the zip archives of spreadsheets."""
 ROUTING = ("mapping_electrode", "mapping_xy_um")
 
 
@@ -47,11 +47,11 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     """Read a recording from a numpy archive of plain columns; nothing in it is ever unpickled.
 
     Args:
-        path: the file, as `numpy.savez` or `numpy.savez_compressed` writes it.
+        path: the file, as written by `numpy.savez` or `numpy.savez_compressed`.
 
     Raises:
         InvalidFile: if the file is missing, damaged, holds pickled objects, or lacks a required key.
-        UnusableData: if a column is not what it should be.
+        UnusableData: if a column is invalid.
     """
     path = Path(path)
     columns, routing, left_out = load_columns(path)
@@ -59,17 +59,17 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     if missing:
         keys = [*columns, *routing, *left_out]
         if any(key.startswith("state_") for key in keys):
-            raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture beside its recordings")
+            raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture")
         counts = [key for key in keys if "spike" in key and key not in KEYS]
         if counts and "spike_time_s" in missing and "stimulus_time_s" in missing:
             raise InvalidFile(
                 f"{path}: expected times of spikes and of stimuli (spike_time_s, spike_channel, stimulus_time_s), "
-                f"found none: only counts ({', '.join(counts[:4])}); bring the times, or bring counts a stimulus and "
-                "channel as a table of responses (response_count)"
+                f"found only counts ({', '.join(counts[:4])}); provide the times, or counts per stimulus and channel "
+                "as a response table (response_count)"
             )
-        found = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
+        listed = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
         raise InvalidFile(
-            f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {found}"
+            f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {listed}"
             + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
         )
     provenance = {"source": path.name, "format": "NPZ"}
@@ -78,15 +78,17 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
         columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
-    findings = (left_out_of("keys", left_out, missing=[key for key in KEYS if key not in columns]),) if left_out else ()
+    findings = (
+        (left_out_finding("keys", left_out, missing=[key for key in KEYS if key not in columns]),) if left_out else ()
+    )
     return PlainColumns(**columns).to_recording(provenance, findings)
 
 
 def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
-    """What an archive holds: values by our names, the array's routing, and the names of what is left out.
+    """The contents of an archive: values under our names, the array's routing, and the keys that were left out.
 
     Args:
-        others: keys that are known besides those of a recording.
+        others: known keys in addition to those of a recording.
 
     Raises:
         InvalidFile: if the file is missing, damaged, or holds pickled objects.
@@ -116,26 +118,26 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
     except FileNotFoundError as error:
         raise InvalidFile(f"{path}: no such file") from error
     except ValueError as error:
-        # numpy's only other ValueErrors are about damaged headers; both mean that the file cannot be read as it is.
+        # Any other ValueError of numpy is about a damaged header.
         pickled = "Object arrays" in str(error)
         what = "pickled objects, which are never read" if pickled else f"a damaged array ({first_line(error)})"
-        raise InvalidFile(f"{path}: expected plain arrays of numbers or text, got {what}; save it anew") from error
+        raise InvalidFile(f"{path}: expected plain arrays of numbers or text, got {what}; save it again") from error
     except (OSError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise InvalidFile(
-            f"{path}: expected a whole NPZ archive, but it is cut off or damaged ({first_line(error)}); "
+            f"{path}: expected a complete NPZ archive, but it is cut off or damaged ({first_line(error)}); "
             "copy or save it again"
         ) from error
     return columns, {key: routing[key] for key in ROUTING if key in routing}, left_out
 
 
 def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
-    """Refuse what unpacks to far more than a recording of that size does."""
-    # Spikes compress to a fifth or so.
+    """Refuse a file that unpacks to far more than a recording of its size."""
+    # Spikes compress to about a fifth.
     limit = UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
     unpacked = sum(entry.file_size for entry in archive.infolist())
     if unpacked > limit:
         raise InvalidFile(
-            f"{path}: unpacks to {unpacked:,} bytes, more than a recording of its size does ({limit:,}): it is damaged"
+            f"{path}: unpacks to {unpacked:,} bytes, more than a recording of its size ({limit:,}): it is damaged"
         )
 
 
@@ -147,15 +149,15 @@ def _array(archive: Mapping[str, Column], key: str) -> Column:
 
 
 def _single(path: Path, key: str, array: Column) -> Any:
-    """The one value of an array, a number or a word."""
+    """The single value of an array, a number or text."""
     if array.size != 1:
         raise InvalidFile(f"{path}: {key}: expected one value, got shape {array.shape}")
     value = array.reshape(-1)[0].item()
     name = OTHER_NAMES.get(key, key)
-    if name in WORDS:
+    if name in TEXTS:
         if isinstance(value, str):
             return value
-        raise InvalidFile(f"{path}: {key}: expected a word, got {value!r}")
+        raise InvalidFile(f"{path}: {key}: expected text, got {value!r}")
     if not isinstance(value, int | float):
         raise InvalidFile(f"{path}: {key}: expected a number, got {value!r}")
     if name in WHOLE:
@@ -166,7 +168,7 @@ def _single(path: Path, key: str, array: Column) -> Any:
 
 
 def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) -> Column:
-    """The electrode routed at each position, unknown where there is none."""
+    """The electrode routed at each position, `UNKNOWN` if there is none."""
     n = len(electrode) if electrode.ndim == 1 else -1
     if electrode_xy_um.shape != (n, 2):
         raise UnusableData(

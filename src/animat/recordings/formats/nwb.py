@@ -1,10 +1,9 @@
-"""NWB, the recording's own format on disk: written with pynwb as whole columns, read with plain h5py.
+"""NWB, animat's own format on disk: written with pynwb as whole columns, read with plain h5py.
 
-NWB has fields of its own for who recorded what. They are filled from `Recording.provenance` where it has these
-keys, all optional: `recorded_at` (ISO 8601; UTC where it names no zone), `session_description`,
-`experiment_description`, `experimenter` (`Last, First`, several separated by semicolons), `lab`, `institution`,
-`keywords` (separated by commas), and for the subject `subject_id`, `species` (Latin), `sex`, `age` (ISO 8601 duration),
-`subject_description`. So they travel with the recording and need no second argument.
+NWB's fields for the origin of a recording are filled from these keys of `Recording.provenance`, all optional:
+`recorded_at` (ISO 8601; UTC unless it names a zone), `session_description`, `experiment_description`, `experimenter`
+(`Last, First`, several separated by semicolons), `lab`, `institution`, `keywords` (separated by commas), and for the
+subject `subject_id`, `species` (Latin), `sex`, `age` (ISO 8601 duration), `subject_description`.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from jaxtyping import Float64, Int64
 
 from animat.compilation import pynwb_importable
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.recordings.formats.foreign_nwb import ragged, read_foreign_nwb
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.nwb_layout import (
     ELECTRODES_TABLE,
@@ -31,18 +31,16 @@ from animat.recordings.formats.nwb_layout import (
     STIMULI_TABLE,
     UNITS_TABLE,
 )
-from animat.recordings.formats.nwb_of_others import ragged, read_other_nwb
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.recording import Channels, Recording
-from animat.recordings.told import from_words
+from animat.recordings.metadata import from_metadata
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 from animat.writing import atomic_write
 
-WHAT = "NWB recording"
 LARGEST_VALUES = 10_000_000
-"""Of the table of electrodes, rows times columns."""
+"""Rows times columns of the electrodes table."""
 
 T = TypeVar("T", int, float, str)
 
@@ -56,14 +54,14 @@ def write_nwb(
     """Write a recording as one NWB file, complete or absent.
 
     Args:
-        path: the file; parent folders are made, an old file is replaced only by a complete new one.
-        spikes: in place of the recording's own, which are none: more than memory holds, in any order.
+        path: the file; parent folders are created, and an old file is replaced only by a complete new one.
+        spikes: instead of the recording's own, which must be empty; may exceed memory, in any order.
         counts: of `spikes`.
 
     Raises:
         InvalidFile: if the file cannot be written (no permission, a full disk).
-        InvalidArgument: for text that HDF5 cannot hold, or a `recorded_at` that is no date.
-        UnusableData: for `spikes` that are not finite, of no channel, or outside of the recording.
+        InvalidArgument: for text that HDF5 cannot hold, or a `recorded_at` that is not a date.
+        UnusableData: for `spikes` that are not finite, not on a channel, or outside the recording.
     """
     with pynwb_importable():
         from hdmf.build import BuildManager
@@ -82,7 +80,7 @@ def write_nwb(
             f"got {first_s:g} to {last_s:g} s"
         )
     tree = nwb_file(recording, of_channels)
-    with atomic_write(path) as beside, beside.open("r+b", buffering=0) as raw:
+    with atomic_write(path) as temporary, temporary.open("r+b", buffering=0) as raw:
         disk = _Disk(raw)
         try:
             with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w", manager=BuildManager(_types())) as nwb_io:
@@ -90,7 +88,7 @@ def write_nwb(
                 if len(recording.channels):
                     write_spikes(file[f"{UNITS_TABLE}/spike_times"], spikes, of_channels)
         except Exception as error:
-            # What HDF5 made of what it could not read back.
+            # A full disk is the cause; HDF5's own error only follows from it.
             raise disk.error or error from None
         if disk.error is not None:
             raise disk.error
@@ -98,19 +96,19 @@ def write_nwb(
 
 @lru_cache(maxsize=1)
 def _types() -> Any:
-    """What pynwb knows of NWB's types, with what it finds out as it writes, which the next file need not."""
+    """pynwb's map of NWB types, kept because it caches what it looks up while writing."""
     import pynwb
 
     return pynwb.get_type_map()
 
 
 def recording_name(start_min: float) -> str:
-    """The file name of a recording that starts at a minute of the culture's clock."""
+    """The file name of a recording that starts at `start_min` on the culture's clock."""
     return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
 
 
 class _Disk(io.RawIOBase):
-    """A file that takes everything, and remembers what it could not write: HDF5 does not recover from a full disk."""
+    """A file that accepts every write and remembers the first error, as HDF5 does not recover from a full disk."""
 
     def __init__(self, file: io.FileIO) -> None:
         self.error: OSError | None = None
@@ -143,42 +141,42 @@ class _Disk(io.RawIOBase):
 
 
 def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Recording:
-    """Read a recording that `write_nwb` wrote, which equals the one that was written, or that another program wrote.
+    """Read a recording written by `write_nwb`, which equals the original, or by another program.
 
     Args:
-        stimuli: for another program's file, the name of the stimuli where several could be meant.
+        stimuli: for another program's file, the name of the stimuli if there are several candidates.
 
     Raises:
-        InvalidFile: if the file is missing, damaged, not NWB, or of another program and without spikes.
+        InvalidFile: if the file is missing, damaged, not NWB, or from another program and without spikes.
     """
-    with hdf5_file(Path(path), WHAT) as file:
+    with hdf5_file(Path(path), "NWB recording") as file:
         return _read(file, stimuli)
 
 
 def is_nwb(file: Hdf5File) -> bool:
-    """Whether a file says that it is NWB."""
+    """Whether a file declares itself as NWB."""
     return "nwb_version" in file.file.attrs
 
 
 def _read(file: Hdf5File, stimuli: str | None) -> Recording:
     path = file.path
     if not is_nwb(file):
-        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.held})")
+        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.root_names})")
     if not file.has(RECORDING_TABLE):
-        return read_other_nwb(file, stimuli)
+        return read_foreign_nwb(file, stimuli)
     if stimuli is not None:
-        raise InvalidFile(f"{path}: expected no choice of stimuli for a file of animat's own, got {stimuli!r}")
+        raise InvalidFile(f"{path}: expected no choice of stimuli for animat's own file, got {stimuli!r}")
     version = _cell(file, "format_version", int)
     if version > FORMAT_VERSION:
         raise InvalidFile(
             f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat to read it"
         )
-    words = dict[str, str]()
+    texts = dict[str, str]()
     if file.has(PROVENANCE_TABLE):
-        keys, told = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
-        words = dict(zip(keys, told, strict=True))
+        keys, values = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
+        texts = dict(zip(keys, values, strict=True))
     try:
-        told_fields = from_words(words)
+        text_fields = from_metadata(texts)
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
     order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
@@ -193,7 +191,7 @@ def _read(file: Hdf5File, stimuli: str | None) -> Recording:
         duration_s=_cell(file, "duration_s", float),
         start_min=_cell(file, "start_min", float),
         presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
-        **told_fields,
+        **text_fields,
     )
 
 
@@ -207,7 +205,7 @@ def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.nd
     times = file.read(f"{UNITS_TABLE}/spike_times")
     counts = ragged(file, f"{UNITS_TABLE}/spike_times", len(times))
     channels = np.repeat(np.arange(len(counts)), counts)
-    # Channel after channel: a stable sort leaves simultaneous spikes in the order of their channels, as Recording does.
+    # By channel: a stable sort leaves simultaneous spikes in the order of their channels, as Recording requires.
     order = np.argsort(times, kind="stable")
     return times[order], channels[order]
 

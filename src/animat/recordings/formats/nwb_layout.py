@@ -1,17 +1,17 @@
-"""Where a recording stands in animat's own NWB, for whoever writes it and whoever reads it.
+"""The layout of a recording in animat's own NWB, for writing and reading.
 
-/units                         one unit a channel, silent ones included: spike_times, obs_intervals, electrodes
-/general/extracellular_ephys   /electrodes: label, electrode_id, rel_x, rel_y (um); one row a channel
-                               (both are absent where a recording has no channel)
-/stimulus/presentation/stimuli TimeIntervals, one row a pulse: start_time, frequency_hz, pattern, presentation,
+/units                         one unit per channel, including silent ones: spike_times, obs_intervals, electrodes
+/general/extracellular_ephys   /electrodes: label, electrode_id, rel_x, rel_y (um); one row per channel
+                               (both are absent if a recording has no channels)
+/stimulus/presentation/stimuli TimeIntervals, one row per pulse: start_time, frequency_hz, pattern, presentation,
                                electrode_ids (ragged: ids on the array, which need not be recorded electrodes;
-                               absent where none is known)
+                               absent if none is known)
 /processing/ecephys            /animat_recording: one row, the scalars of `Recording` and its presentation;
-                               /animat_provenance: one row a key (absent where there is none)
+                               /animat_provenance: one row per key (absent if there is none)
 """
 
 FORMAT_VERSION = 1
-"""Of the tables above; written into every file, and a newer one is refused."""
+"""Version of the tables above, written to every file; newer versions are refused."""
 
 RECORDING_TABLE = "processing/ecephys/animat_recording"
 PROVENANCE_TABLE = "processing/ecephys/animat_provenance"
@@ -20,4 +20,4 @@ ELECTRODES_TABLE = "general/extracellular_ephys/electrodes"
 STIMULI_TABLE = "stimulus/presentation/stimuli"
 
 SUBJECT = {name: name for name in ("subject_id", "species", "sex", "age")} | {"description": "subject_description"}
-"""NWB's fields of a subject, and where a recording's provenance has them."""
+"""NWB's fields of a subject, and their keys in a recording's provenance."""

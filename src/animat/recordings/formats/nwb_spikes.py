@@ -1,4 +1,4 @@
-"""Spikes on their way into an NWB file, block by block: there may be more of them than memory holds."""
+"""Writes spikes into an NWB file block by block, as there may be more of them than memory holds."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from jaxtyping import Float64, Int, Int64
 from animat.errors import UnusableData
 
 SpikeBlock = tuple[Float64[np.ndarray, " spikes"], Int[np.ndarray, " spikes"]]
-"""Times in s and channels of some spikes."""
+"""Times in s and channels of a block of spikes."""
 
 _COUNTED_AT_ONCE = 2**14
 
 
 class SpikeCounts:
-    """Counts the spikes of each channel as they come, a few at a time.
+    """Counts the spikes of each channel incrementally.
 
     Args:
-        channels: how many there are.
+        channels: the number of channels.
     """
 
     def __init__(self, channels: int) -> None:
@@ -30,34 +30,34 @@ class SpikeCounts:
         self._n_waiting = 0
 
     def add(self, times_s: Float64[np.ndarray, " spikes"], channel: Int[np.ndarray, " spikes"]) -> None:
-        """Count some spikes in.
+        """Add spikes to the counts.
 
         Raises:
-            UnusableData: for a time that is not finite, or a channel that is none; it may be of an earlier call.
+            UnusableData: for a time that is not finite or an unknown channel, possibly from an earlier call.
         """
         if len(times_s):
             self._waiting.append((times_s, channel))
             self._n_waiting += len(times_s)
-            # Many are counted in the time of one.
+            # Counting many takes as long as counting one.
             if self._n_waiting > _COUNTED_AT_ONCE:
                 self._count()
 
     @property
     def of_channels(self) -> Int64[np.ndarray, " channels"]:
-        """How many there were up to now, shape (channels,)."""
+        """Spikes counted so far, shape (channels,)."""
         self._count()
         return self._counts
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The earliest and the latest time; 0 where there are none."""
+        """The earliest and the latest time; 0 if there are no spikes."""
         self._count()
         return self._span_s if np.isfinite(self._span_s[0]) else (0.0, 0.0)
 
     def _count(self) -> None:
         if not self._waiting:
             return
-        times_s, channel = (np.concatenate(each) for each in zip(*self._waiting, strict=True))
+        times_s, channel = (np.concatenate(arrays) for arrays in zip(*self._waiting, strict=True))
         self._waiting, self._n_waiting = [], 0
         channels = len(self._counts)
         if not np.all(np.isfinite(times_s)):
@@ -70,12 +70,12 @@ class SpikeCounts:
 
 
 def write_spikes(dataset: h5py.Dataset, blocks: Iterable[SpikeBlock], counts: Int64[np.ndarray, " channels"]) -> None:
-    """Write spike times channel after channel, those of a channel rising.
+    """Write spike times channel by channel, in ascending order within a channel.
 
     Args:
-        dataset: of floats, as many as there are spikes, one after the other in the file.
+        dataset: of floats, as many as there are spikes, contiguous in the file.
         blocks: all spikes, in any order.
-        counts: of each channel.
+        counts: spikes of each channel.
     """
     ends = np.cumsum(counts)
     place, newest_s = ends - counts, np.full(len(ends), -np.inf)
@@ -102,7 +102,7 @@ def write_spikes(dataset: h5py.Dataset, blocks: Iterable[SpikeBlock], counts: In
 
 
 def _write(dataset: h5py.Dataset, space: h5py.h5s.SpaceID, place: int, values: Float64[np.ndarray, " values"]) -> None:
-    # As `dataset[a:b] = values` does, in a twentieth of its time: there are tens of thousands of these. Space and type
-    # are given, as looking them up each time takes as long as writing.
+    # Like `dataset[a:b] = values`, in a twentieth of the time, as there are tens of thousands of these. Space and type
+    # are passed, as looking them up each time takes as long as writing.
     space.select_hyperslab((place,), (len(values),))
     dataset.id.write(h5py.h5s.create_simple((len(values),)), space, values, h5py.h5t.NATIVE_DOUBLE)

@@ -1,15 +1,15 @@
-"""Where an NWB file of another program keeps its stimuli: one place is taken, several are listed to choose from.
+"""Finds the stimuli in NWB files from other programs; if there are several candidates, lists them to choose from.
 
 What can be stimuli, and which rows or samples are pulses:
 
     TimeIntervals          every row, at start_time
     IntervalSeries         every positive entry, at its timestamp
-    other series           with timestamps: every entry that is not 0 (or all, if none is); text: every entry
-                           sampled at a rate: wherever it leaves 0 by more than half of its largest size, for the
+    other series           with timestamps: every entry that is not 0 (or all, if all are 0); text: every entry
+                           sampled at a rate: wherever it leaves 0 by more than half of its largest magnitude, for the
                            first time in 1 ms
 
-Looked for in /stimulus/presentation first; where that is empty, in /intervals, /acquisition and /processing, and there
-only under names that speak of stimuli, pulses or triggers. A name that the user gives is looked for in all of them.
+/stimulus/presentation is searched first; if that is empty, /intervals, /acquisition and /processing, and there only
+names that mention stimuli, pulses or triggers. A name given by the user is looked for in all of them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from animat.tables import fits_padded, padded
 
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")
-SPEAKS_OF_STIMULI = re.compile(r"stim|pulse|trigger|ttl", re.IGNORECASE)
+STIMULUS_NAME = re.compile(r"stim|pulse|trigger|ttl", re.IGNORECASE)
 COLUMNS = {
     "stimulus_frequency_hz": ("frequency_hz", "frequency", "stimulus_frequency", "stim_frequency"),
     "stimulus_pattern": ("pattern", "stimulus_pattern", "stimulus_type", "stimulus_name", "condition", "label"),
@@ -41,15 +41,15 @@ _BLOCK = 2**20
 
 
 def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> dict[str, Any]:
-    """The stimulus columns of `PlainColumns`; an empty column of times where the file keeps no stimuli.
+    """The stimulus columns of `PlainColumns`; an empty column of times if the file has no stimuli.
 
     Args:
         file: open.
-        asked: the name of the stimuli, where the user gave one: a place, or its last part.
-        findings: what is noticed is added.
+        asked: the name of the stimuli if the user gave one: a path, or its last part.
+        findings: new findings are added to it.
 
     Raises:
-        InvalidFile: if several places could be meant and none is named, or the named one is not there.
+        InvalidFile: if there are several candidates and none is named, or the named one does not exist.
     """
     at = _place(file, asked, findings)
     if at is None:
@@ -71,12 +71,12 @@ def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | 
         if not named:
             choose(f"{file.path}: stimuli", "--stimuli", every or ["none (nothing in the file can be stimuli)"], asked)
         return choose(f"{file.path}: stimuli named {asked}", "--stimuli", named, None)
-    candidates = first or [at for at in elsewhere if SPEAKS_OF_STIMULI.search(at.rpartition("/")[2])]
-    # Regular samples, and epochs, are hardly ever stimuli.
+    candidates = first or [at for at in elsewhere if STIMULUS_NAME.search(at.rpartition("/")[2])]
+    # Regular samples and epochs are hardly ever stimuli.
     perhaps = [at for at in elsewhere if not (file.has(f"{at}/starting_time") or at.endswith("/epochs"))]
     if not candidates and perhaps:
         message = (
-            f"nothing in the file speaks of stimuli; if one of {some_of(perhaps)} holds them, choose it with "
+            f"nothing in the file is named like stimuli; if one of {some_of(perhaps)} holds them, choose it with "
             "--stimuli NAME (animat inspect, animat convert)"
         )
         findings.append(Finding("stimuli-elsewhere", "note", message))
@@ -112,10 +112,10 @@ def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
 
 
 def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
-    """The electrodes of each of n rows, as whole numbers or in words ("7 9"); None where they are none of these."""
+    """The electrodes of each of n rows, from whole numbers or text ("7 9"); None if they are neither."""
     dataset = file.dataset(at)
     if dataset.dtype.kind in "SO" and dataset.shape == (n,):
-        return _in_words([str(words) for words in file.read(at).tolist()])
+        return _parse_electrodes([str(text) for text in file.read(at).tolist()])
     if dataset.dtype.kind not in "iu":
         return None
     values = file.read(at).astype(np.int64)
@@ -128,8 +128,8 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
 
 
-def _in_words(cells: Sequence[str]) -> Column | None:
-    """Numbers of electrodes separated by blanks or commas, padded; None where a cell holds anything else."""
+def _parse_electrodes(cells: Sequence[str]) -> Column | None:
+    """Electrode numbers separated by spaces or commas, padded; None if a cell holds anything else."""
     try:
         lists = [[int(word) for word in cell.replace(",", " ").split()] for cell in cells]
     except (ValueError, OverflowError):
@@ -138,7 +138,7 @@ def _in_words(cells: Sequence[str]) -> Column | None:
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:
-    """Start of every pulse of a series."""
+    """Start times of all pulses of a series."""
     if file.has(f"{at}/timestamps"):
         time_s = file.read(f"{at}/timestamps").reshape(-1)
         node = file.node(f"{at}/data")
@@ -156,7 +156,7 @@ def _of_series(file: Hdf5File, at: str) -> Column:
 
 
 def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
-    """Samples at which a sampled stimulus leaves 0; read in blocks, as it may be as long as the recording."""
+    """The samples at which a sampled stimulus leaves 0, read in blocks, as it may be as long as the recording."""
     dataset = file.dataset(at)
     if dataset.ndim != 1 or dataset.dtype.kind not in "iuf" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
         raise InvalidFile(f"{file.path}: expected one column of numbers at /{at}, got {dataset.dtype} {dataset.shape}")

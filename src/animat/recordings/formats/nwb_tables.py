@@ -1,4 +1,4 @@
-"""The NWB tables of a recording as pynwb objects, each made as whole columns. Imports pynwb (1-2 s): import it late."""
+"""Makes the NWB tables of a recording as pynwb objects, as whole columns. Imports pynwb (1-2 s): import it late."""
 
 from __future__ import annotations
 
@@ -18,61 +18,61 @@ from pynwb.misc import Units
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
 from animat.recordings.recording import Channels, Recording
-from animat.recordings.told import in_words
+from animat.recordings.metadata import to_metadata
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
 UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
-"""NWB demands a date; a recording without `recorded_at` gets this one, which every reader sees to be none."""
+"""NWB requires a date; a recording without `recorded_at` gets this one, which readers recognise as unknown."""
 
 UNKNOWN_SUBJECT = {
     "subject_id": "unknown",
     "sex": "U",
     "age": "P0D/",
-    "description": "neuronal culture; nothing more was said of it",
+    "description": "neuronal culture; nothing else is known",
 }
-"""Sex U is unknown, and an age from 0 days on, without an upper end, is any."""
+"""Sex U is unknown, and an age from 0 days on without an upper limit is any age."""
 _FILE_KEYS = ("experiment_description", "lab", "institution")
 
 
 def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> NWBFile:
-    """A recording as pynwb's object tree, with room for spikes; see `animat.recordings.formats.nwb_layout`.
+    """A recording as a pynwb object tree, with room for spikes; see `animat.recordings.formats.nwb_layout`.
 
     Args:
-        recording: all but its spikes are taken.
-        spike_counts: of each channel: their times are for the caller to write.
+        recording: everything but its spikes is used.
+        spike_counts: of each channel; the caller writes the times.
     """
-    words = {_text("provenance", k): _text("provenance", v) for k, v in in_words(recording).items()}
+    texts = {_text("provenance", k): _text("provenance", v) for k, v in to_metadata(recording).items()}
     nwb = NWBFile(
-        session_description=words.get(
+        session_description=texts.get(
             "session_description", "Spikes of a neuronal culture on a multi-electrode array, under stimulation."
         ),
         identifier=str(uuid.uuid4()),
-        session_start_time=_date(words.get("recorded_at", UNKNOWN_DATE)),
-        experimenter=_split(words["experimenter"], ";") if "experimenter" in words else None,
-        keywords=_split(words.get("keywords", "multi-electrode array, neuronal culture, electrical stimulation"), ","),
+        session_start_time=_date(texts.get("recorded_at", UNKNOWN_DATE)),
+        experimenter=_split(texts["experimenter"], ";") if "experimenter" in texts else None,
+        keywords=_split(texts.get("keywords", "multi-electrode array, neuronal culture, electrical stimulation"), ","),
         source_script="animat.recordings.formats.nwb.write_nwb",
         source_script_file_name="nwb.py",
-        **{key: words[key] for key in _FILE_KEYS if key in words},
+        **{key: texts[key] for key in _FILE_KEYS if key in texts},
     )
-    # NWB's checkers demand a subject; of one that nothing is said of, that is what is written.
-    known = {field: words[key] for field, key in SUBJECT.items() if key in words}
+    # NWB's checkers require a subject; an unknown one is written as unknown.
+    known = {field: texts[key] for field, key in SUBJECT.items() if key in texts}
     nwb.subject = Subject(**(UNKNOWN_SUBJECT | known))
     if len(recording.channels):
         _add_electrodes(nwb, recording.channels)
         _add_units(nwb, recording, spike_counts)
     nwb.add_stimulus(_stimulus_table(recording.stimuli))
-    module = nwb.create_processing_module(name="ecephys", description="What the recording is, for the package animat.")
+    module = nwb.create_processing_module(name="ecephys", description="Data of the recording for the package animat.")
     module.add(_recording_table(recording))
-    if words:
+    if texts:
         module.add(
             DynamicTable(
                 name="animat_provenance",
-                description="Where the recording came from, and what was noticed when it was read.",
-                id=np.arange(len(words)),
+                description="Where the recording came from, and findings made when it was read.",
+                id=np.arange(len(texts)),
                 columns=[
-                    VectorData(name="key", description="what the words are about", data=list(words)),
-                    VectorData(name="words", description="the words", data=list(words.values())),
+                    VectorData(name="key", description="keyword", data=list(texts)),
+                    VectorData(name="words", description="text", data=list(texts.values())),
                 ],
             )
         )
@@ -80,7 +80,7 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
 
 
 def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
-    """The electrodes table, one row a channel."""
+    """The electrodes table, one row per channel."""
     device = nwb.create_device(name="array", description="multi-electrode array")
     group = nwb.create_electrode_group(
         name="array", description="the recording electrodes", location="in vitro", device=device
@@ -102,7 +102,7 @@ def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
 
 
 def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> None:
-    """The units table, one row a channel, so that a silent channel stays a channel."""
+    """The units table, one row per channel, so that silent channels are kept."""
     rows = len(recording.channels)
     ends = np.cumsum(spike_counts).astype(np.int64)
     room = H5DataIO(shape=(int(spike_counts.sum()),), dtype=np.dtype(np.float64))
@@ -135,7 +135,7 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
 
 
 def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
-    # A row keeps its electrodes up to the last known one, so that padding between known ones survives too.
+    # A row keeps its electrodes up to the last known one, so that padding between known ones is kept too.
     known, columns = stimuli.electrodes != UNKNOWN, stimuli.electrodes.shape[1]
     lengths = np.zeros(len(stimuli), np.int64)
     for column in range(columns):
@@ -147,21 +147,19 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
     )
     table = [
         VectorData(name="start_time", description="start of the pulse, s", data=stimuli.time_s),
-        # NWB demands an end; the pulse's length is not kept, and readers take an empty interval for a mistake.
+        # NWB requires an end; the pulse's length is not stored, and readers treat an empty interval as a mistake.
         VectorData(name="stop_time", description="nominal: 1 us after start_time", data=stimuli.time_s + 1e-6),
         VectorData(name="frequency_hz", description="stimulus frequency; NaN: unknown", data=stimuli.frequency_hz),
         VectorData(name="pattern", description=f"stimulation pattern; -1: unknown{rests}", data=stimuli.pattern),
-        VectorData(
-            name="presentation", description="presentation that the pulse belongs to", data=stimuli.presentation
-        ),
+        VectorData(name="presentation", description="trial that the pulse belongs to", data=stimuli.presentation),
     ]
     if len(electrodes.data):
-        # A column without any value is valid, but other programs stumble over it.
+        # A column without values is valid, but other programs fail on it.
         index = VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths).astype(np.int64), target=electrodes)
         table += [electrodes, index]
     return TimeIntervals(
         name="stimuli",
-        description="Stimulation pulses, one row a pulse.",
+        description="Stimulation pulses, one row per pulse.",
         id=np.arange(len(stimuli)),
         columns=table,
     )
@@ -170,20 +168,20 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
 def _recording_table(recording: Recording) -> DynamicTable:
     presentation = recording.presentation
     cells: dict[str, tuple[object, str]] = {
-        "format_version": (FORMAT_VERSION, "of the tables that animat writes"),
+        "format_version": (FORMAT_VERSION, "version of the tables written by animat"),
         "start_s": (float(recording.start_s), "start of the recording on its own clock, s"),
         "duration_s": (float(recording.duration_s), "from start_s, s"),
         "start_min": (float(recording.start_min), "start of the recording on the culture's clock, min"),
         "sampling_rate_hz": (float(recording.sampling_rate_hz), "of the raw signal, Hz; NaN: unknown"),
         "presentation_order": (presentation.order if presentation else "", "blocked or mixed; empty: unknown"),
-        "presentation_pulses": (presentation.pulses if presentation else 0, "pulses a presentation; 0: unknown"),
+        "presentation_pulses": (presentation.pulses if presentation else 0, "pulses per trial; 0: unknown"),
         "stimulus_electrode_columns": (recording.stimuli.electrodes.shape[1], "width of the padded electrode table"),
     }
     return DynamicTable(
         name="animat_recording",
         description="The scalars of the recording, one row.",
         id=np.arange(1),
-        columns=[VectorData(name=n, description=words, data=[value]) for n, (value, words) in cells.items()],
+        columns=[VectorData(name=n, description=text, data=[value]) for n, (value, text) in cells.items()],
     )
 
 

@@ -1,12 +1,12 @@
-"""What a line of text beside a stimulus says about it: how animat's drivers keep its parameters in a rig's file.
+"""Parses the text that accompanies a stimulus in a rig's file, in which animat's drivers store its parameters.
 
-A rig's own file knows when a pulse was and perhaps where, not at which frequency it was presented or which presentation
-it ends. animat writes one JSON object a pulse (MaxWell: the event's message; CL1: an entry of the data stream
-`animat_stimuli`), of which every key is optional:
+A rig's own file holds when a pulse was and perhaps where, but not its frequency or trial. animat writes one JSON object
+per pulse (MaxWell: the event's message; CL1: an entry of the data stream `animat_stimuli`), of which every key is
+optional:
 
     {"frequency_hz": 20, "pattern": 3, "presentation": 17, "electrodes": [909, 23923], "order": "mixed", "pulses": 5}
 
-Text by others in the manner of `frequency 20 electrode 909` or `frequency_hz=20` is understood for the same names.
+Text such as `frequency 20 electrode 909` or `frequency_hz=20` from other programs is parsed for the same names.
 """
 
 from __future__ import annotations
@@ -22,62 +22,62 @@ import numpy as np
 from animat.tables import UNKNOWN, padded
 
 LONGEST = 4096
-"""Characters of a line; what is longer says nothing that is understood here."""
+"""Most characters of a line; longer lines are ignored."""
 NAMES = {name: name for name in ("frequency_hz", "pattern", "presentation", "electrodes", "order", "pulses")}
 NAMES |= {"frequency": "frequency_hz", "freq": "frequency_hz", "electrode": "electrodes"}
 _MOST_ELECTRODES = 1024
 _PAIR = re.compile(r"([A-Za-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:[,+]\d+)*)")
 
 
-def said(text: str) -> dict[str, Any]:
-    """What one line says, by our names; nothing where it says nothing that is understood."""
+def parse_line(text: str) -> dict[str, Any]:
+    """The parameters in one line, under our names; empty if there are none."""
     text = text.strip()
     if not text or len(text) > LONGEST:
         return {}
-    words: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
     if text.startswith("{"):
         try:
             read = json.loads(text)
         except (ValueError, RecursionError):
             return {}
-        words = {NAMES[key]: value for key, value in read.items() if key in NAMES}
+        parameters = {NAMES[key]: value for key, value in read.items() if key in NAMES}
     else:
         for key, value in _PAIR.findall(text):
             name = NAMES.get(key.lower())
             if name == "electrodes":
-                words[name] = [int(number) for number in re.findall(r"\d{1,9}", value)]
+                parameters[name] = [int(number) for number in re.findall(r"\d{1,9}", value)]
             elif name:
-                words[name] = value
-    return words
+                parameters[name] = value
+    return parameters
 
 
 def stimulus_columns(lines: Sequence[str]) -> dict[str, Any]:
-    """The columns of `PlainColumns` that the lines of all pulses give together, one line a pulse.
+    """The columns of `PlainColumns` from the lines of all pulses, one line per pulse.
 
-    A column that no line speaks of is left out; so is a presentation that only some name: it would be guessed.
+    A column that is in no line is left out; so are presentations that are not in all, as the others would be guesses.
     """
-    read = [said(line) for line in lines]
+    pulses = [parse_line(line) for line in lines]
     columns: dict[str, Any] = {}
-    frequency = np.array([_number(words.get("frequency_hz")) for words in read], dtype=np.float64)
+    frequency = np.array([_number(pulse.get("frequency_hz")) for pulse in pulses], dtype=np.float64)
     frequency[~(frequency > 0)] = np.nan
     if np.any(~np.isnan(frequency)):
         columns["stimulus_frequency_hz"] = frequency
-    pattern = np.array([_whole(words.get("pattern")) for words in read], dtype=np.int64)
+    pattern = np.array([_whole(pulse.get("pattern")) for pulse in pulses], dtype=np.int64)
     if np.any(pattern != UNKNOWN):
         columns["stimulus_pattern"] = pattern
-    presentation = np.array([_whole(words.get("presentation")) for words in read], dtype=np.int64)
-    # One number for all is what a pulse has that belongs to no presentation in particular.
+    presentation = np.array([_whole(pulse.get("presentation")) for pulse in pulses], dtype=np.int64)
+    # Pulses that belong to no particular trial all have the same number.
     has_presentation = bool(np.all(presentation != UNKNOWN)) and len(np.unique(presentation)) > 1
     if has_presentation:
-        # Numbers can begin anew in the middle of a file: what counts is where they change.
+        # Numbers may restart in the middle of a file: what counts is where they change.
         columns["stimulus_presentation"] = np.cumsum(np.diff(presentation, prepend=presentation[0]) != 0)
-    electrodes = [_electrodes(words.get("electrodes")) for words in read]
+    electrodes = [_electrodes(pulse.get("electrodes")) for pulse in pulses]
     if any(electrodes):
         columns["stimulus_electrodes"] = padded(electrodes)
-    orders = {order if isinstance(order := words.get("order"), str) else None for words in read}
-    pulses = {_whole(words.get("pulses")) for words in read}
+    orders = {order if isinstance(order := pulse.get("order"), str) else None for pulse in pulses}
+    counts = {_whole(pulse.get("pulses")) for pulse in pulses}
     if len(orders) == 1 and orders <= {"blocked", "mixed"}:
-        n_pulses = next(iter(pulses)) if len(pulses) == 1 else UNKNOWN
+        n_pulses = next(iter(counts)) if len(counts) == 1 else UNKNOWN
         if n_pulses == 1 or (n_pulses > 1 and has_presentation):
             columns |= {"presentation_order": next(iter(orders)), "presentation_pulses": n_pulses}
     return columns

@@ -1,7 +1,7 @@
-"""Tables as text: a header line, and a line a row; separated by commas, semicolons or tabs, gzipped or not.
+"""Reads text tables: a header line and one line per row, separated by commas, semicolons or tabs, gzipped or not.
 
-Headers are read whatever their capitals, blanks and brackets (`Time (s)` is `time_s`), and numbers with decimal commas
-where nothing else can be meant; both are said. What cannot be read is named with its line in the file.
+Headers may have capitals, spaces and brackets (`Time (s)` is `time_s`), and numbers may have decimal commas where they
+are unambiguous; both are reported. Errors name the file and the line.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
 
 @dataclass(frozen=True, eq=False)
 class TextTable:
-    """A table of text, its cells still as they stand in the file.
+    """A table with its cells as text, unchanged from the file.
 
     Attributes:
-        header: the names of its columns, as they stand there.
-        rows: the cells, as many in each row as the header has names.
-        lines: the line of the file that each row ends on, the first line being 1.
-        findings: what was noticed; methods add to it.
+        header: the column names, unchanged from the file.
+        rows: the cells, as many in each row as in the header.
+        lines: the line of the file on which each row ends, counted from 1.
+        findings: methods add to them.
     """
 
     path: Path
@@ -46,39 +46,37 @@ class TextTable:
     findings: list[Finding] = field(default_factory=list)
 
     def place(self, names: Sequence[str]) -> int | None:
-        """The column of the first of several names that the header has, whatever its capitals; None without any.
+        """The column of the first of several names in the header, ignoring case; None if there is none.
 
         Raises:
-            InvalidFile: if two columns go by that name.
+            InvalidFile: if two columns have that name.
         """
         for name in names:
-            found = [i for i, head in enumerate(self.header) if head == name] or [
+            columns = [i for i, head in enumerate(self.header) if head == name] or [
                 i for i, head in enumerate(self.header) if folded(head) == name
             ]
-            if len(found) > 1:
-                twice = " and ".join(repr(self.header[i]) for i in found[:2])
+            if len(columns) > 1:
+                twice = " and ".join(repr(self.header[i]) for i in columns[:2])
                 raise InvalidFile(f"{self.path}, line 1: expected one column {name}, got {twice}; rename one")
-            if found:
-                if self.header[found[0]] != name:
-                    self._note_once(
-                        "headers-read-as", f"{self.header[found[0]]!r} of {self.path.name} is read as {name}"
-                    )
-                return found[0]
+            if columns:
+                if (head := self.header[columns[0]]) != name:
+                    self._note_once("headers-read-as", f"{head!r} of {self.path.name} is read as {name}")
+                return columns[0]
         return None
 
     def text(self, column: int) -> list[str]:
-        """The cells of a column, without blanks around them."""
+        """The cells of a column, without surrounding spaces."""
         return [row[column].strip() for row in self.rows]
 
     def numbers(self, column: int, name: str, *, required: bool = False) -> Float64[np.ndarray, " rows"]:
         """The numbers of a column, NaN for an empty cell.
 
         Args:
-            name: what it is called in errors.
-            required: whether each must be there and finite.
+            name: its name in errors.
+            required: whether each must be present and finite.
 
         Raises:
-            InvalidFile: for a cell that is no number, with its line.
+            InvalidFile: for a cell that is not a number, with its line.
         """
         cells = self.text(column)
         try:
@@ -92,7 +90,7 @@ class TextTable:
         return values
 
     def wrong(self, row: int, what: str) -> InvalidFile:
-        """The error of a row, with its line."""
+        """An error about a row, with its line."""
         return InvalidFile(f"{self.path}, line {self.lines[row]}: {what}")
 
     def _with_decimal_commas(self, cells: list[str], name: str) -> Float64[np.ndarray, " rows"]:
@@ -100,8 +98,8 @@ class TextTable:
         for row, cell in enumerate(cells):
             if cell and not is_number(cell) and not _DECIMAL_COMMA.fullmatch(cell):
                 raise self.wrong(row, f"{name}: expected a number, got {cell!r}")
-        # 1,234 may be a thousand and more; 0,123 and 12,5 are not, and one such tells of all. A dot elsewhere says that
-        # commas are no points.
+        # 1,234 may have a thousands separator; 0,123 and 12,5 cannot, and one of these settles it for all. A dot in any
+        # cell means that commas are not decimal points.
         if any("." in cell for cell in cells) or all(_THOUSANDS.fullmatch(cells[row]) for row in commas):
             row = commas[0] if commas else 0
             raise self.wrong(row, f"{name}: expected a number with a decimal point, got {cells[row]!r}")
@@ -114,14 +112,15 @@ class TextTable:
 
 
 def read_text_table(path: Path, bare: str | None = None) -> TextTable:
-    """Read a file of text in columns.
+    """Read a text table.
 
     Args:
         path: the file, in UTF-8, gzipped or not.
-        bare: the name of the one column of a file without a header; None: there must be one.
+        bare: name of the only column of a file without a header; None: a header is required.
 
     Raises:
-        InvalidFile: if the file is missing, damaged or no such text, or a row has not as many fields as the header.
+        InvalidFile: if the file is missing, damaged or not such text, or a row has more or fewer fields than the
+            header.
     """
     text = _text(path)
     first_line = text.lstrip("\r\n").partition("\n")[0]
@@ -137,14 +136,14 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
     except csv.Error as error:
         raise InvalidFile(f"{path}: expected CSV (text in columns), got something else ({error})") from error
     if after - first > 1:
-        # A last row of several lines: a reader that is strict tells a quote that is not closed from one that is.
+        # The last row spans several lines: only a strict reader notices an unclosed quote.
         try:
             list(csv.reader([*io.StringIO(text)][first - 1 :], delimiter=separator, strict=True))
         except csv.Error as error:
             if "end of data" in str(error):
                 raise InvalidFile(f"{path}, line {first}: expected a quote to be closed, got none") from error
     if not rows:
-        raise InvalidFile(f"{path}: expected a header line and a line an event, got an empty file")
+        raise InvalidFile(f"{path}: expected a header line and one line per event, got an empty file")
     header = [name.strip() for name in rows[0]]
     if bare is not None and len(header) == 1 and is_number(header[0]):
         header = [bare]
@@ -164,10 +163,10 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
 
 
 def read_header(path: Path) -> list[str]:
-    """The names of a file's columns, as they stand there.
+    """The column names of a file, unchanged.
 
     Raises:
-        InvalidFile: if the file is missing, damaged or no text.
+        InvalidFile: if the file is missing, damaged or not text.
     """
     try:
         with path.open("rb") as file:
@@ -185,12 +184,12 @@ def _separator(line: str) -> str:
 
 
 def folded(name: str) -> str:
-    """A header in small letters, with underscores for blanks and without brackets: `Time (s)` is `time_s`."""
+    """A header in lower case, with underscores for spaces and without brackets: `Time (s)` is `time_s`."""
     return re.sub(r"[\s_\-]+", "_", re.sub(r"[()\[\]{}\"']", "", name).strip().casefold())
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a number, NaN and infinity among them."""
+    """Whether a cell is a number, including NaN and infinity."""
     try:
         float(cell)
     except ValueError:
@@ -200,8 +199,8 @@ def is_number(cell: str) -> bool:
 
 def _advice(row: list[str], separator: str) -> str:
     if separator == "," and all(is_number(cell) for cell in row if cell.strip()):
-        return "write numbers with decimal points, or separate the columns by semicolons where they have decimal commas"
-    return "quote the text that holds the separator, or take the field out"
+        return "write numbers with decimal points, or separate the columns by semicolons if they have decimal commas"
+    return "quote text that contains the separator, or remove the extra field"
 
 
 def _text(path: Path) -> str:
@@ -216,12 +215,12 @@ def _text(path: Path) -> str:
         ) from error
     except (OSError, EOFError, zlib.error) as error:
         raise InvalidFile(
-            f"{path}: expected a whole file, but it cannot be read or is cut off ({error}); copy it again"
+            f"{path}: expected a complete file, but it cannot be read or is cut off ({error}); copy it again"
         ) from error
 
 
 def _unpacked(path: Path, content: bytes) -> bytes:
-    """What is in a gzipped file, unless it is far more than text of that size packs."""
+    """The contents of a gzipped file, unless they are far more than text of its size can hold."""
     limit = UNPACKED_BYTES + UNPACKED_RATIO * len(content)
     with gzip.open(io.BytesIO(content)) as packed:
         unpacked = packed.read(limit + 1)

@@ -1,4 +1,4 @@
-"""Raw traces in MaxWell, CL1 and NWB files, and the recording without spikes that they belong to."""
+"""Opens raw traces in MaxWell, CL1 and NWB files, with their recording without spikes."""
 
 from __future__ import annotations
 
@@ -15,57 +15,57 @@ from jaxtyping import Float32, Int64
 
 from animat.errors import InvalidFile
 from animat.recordings.formats.cl1 import read_cl1
+from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, unavailable_filters
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
-from animat.recordings.formats.nwb_of_others import read_other_nwb
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 from animat.tables import UNKNOWN
 
 OLD_LSB_V = 6.294e-6
-"""Of the old layout, where the file does not say."""
+"""Volts per step in the old layout, if the file does not state it."""
 
 
 def open_traces(
     path: str | os.PathLike[str], *, part: str | None = None, stimuli: str | None = None
 ) -> tuple[RawTraces, Recording]:
-    """Raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
+    """The raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
     Args:
-        part: of a MaxWell file that holds several recordings, which; of an NWB file with several series, which.
-        stimuli: which of several things are the stimuli, as in `read_recording`.
+        part: which recording of a MaxWell file, or which series of an NWB file, if there are several.
+        stimuli: which of several candidates are the stimuli, as in `read_recording`.
 
     Raises:
         InvalidFile: if the file holds no raw traces, or they are compressed by a filter that is not installed.
     """
     path = Path(path)
     with hdf5_file(path, "file of raw traces") as file:
-        found = format_of(file)
-        if found is None:
+        kind = format_of(file)
+        if kind is None:
             raise InvalidFile(f"{path}: expected raw traces in MaxWell, CL1 or NWB, got another HDF5 file")
-    if found == "MaxWell":
+    if kind == "MaxWell":
         base = read_maxwell(path, part=part, stimuli=stimuli, spikes=False)
         if len(base.stimuli) and any(finding.name == "clock-from-first-event" for finding in base.findings):
             raise InvalidFile(
-                f"{path}: expected the first frame of the traces (frame_nos), by which they are aligned with stimuli, "
+                f"{path}: expected the first frame of the traces (frame_nos), which aligns them with stimuli, "
                 "found none"
             )
-    elif found == "CL1":
+    elif kind == "CL1":
         base = read_cl1(path, spikes=False)
     else:
         with hdf5_file(path, "NWB recording") as file:
-            base = read_other_nwb(file, stimuli, spikes=False)
+            base = read_foreign_nwb(file, stimuli, spikes=False)
     with hdf5_file(path, "file of raw traces") as file:
-        if found == "MaxWell":
+        if kind == "MaxWell":
             traces = _maxwell(file, part, base)
-        elif found == "CL1":
+        elif kind == "CL1":
             traces = _traces(file, "samples", base, _number(file.attribute("/", "uV_per_sample_unit"), 0.195))
         else:
             traces = _nwb(file, part, base)
     stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
     start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
-    # At once: stimuli lie within both together, and perhaps not within the new start and the old length.
+    # Replaced together: stimuli lie within the new span, but perhaps not within the new start and the old duration.
     base = replace(
         base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s, duration_s=stop_s - start_s
     )
@@ -76,12 +76,12 @@ def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     if is_old(file):
         lsb = _number(file.first("settings/lsb"), OLD_LSB_V)
         return _traces(file, "sig", base, 1e6 * lsb, channels_first=True, labels=np.arange(OLD_CHANNELS))
-    there = parts(file)
-    at = there[choose(f"{file.path}: part", "--part", there, part)]
+    recordings = parts(file)
+    at = recordings[choose(f"{file.path}: part", "--part", recordings, part)]
     groups = [g for g in file.names(f"{at}/groups") if file.has(f"{at}/groups/{g}/raw")]
     if not groups:
         raise InvalidFile(f"{file.path}: expected raw traces at /{at}/groups, found none: the rig kept spikes only")
-    # Most groups are parts of one; the one with the most channels has them all.
+    # Most groups are parts of another one; the one with the most channels has them all.
     group = max(groups, key=lambda g: file.dataset(f"{at}/groups/{g}/raw").shape[0])
     labels = file.read(f"{at}/groups/{group}/channels") if file.has(f"{at}/groups/{group}/channels") else None
     ends = [e for g in groups if (e := file.ends(f"{at}/groups/{g}/frame_nos")) is not None]
@@ -122,7 +122,7 @@ def _traces(
     start_s: float = 0.0,
     labels: Any = None,
 ) -> RawTraces:
-    """Traces in a dataset, with the channels of the recording that it holds; one row or column a label."""
+    """Traces in a dataset, with those of the recording's channels that it holds; one label per row or column."""
     path, rate_hz = file.path, base.sampling_rate_hz if rate_hz is None else rate_hz
     if not isinstance(file.node(where), h5py.Dataset):
         raise InvalidFile(f"{path}: expected raw traces at /{where}, found none")
@@ -135,7 +135,7 @@ def _traces(
     if missing:
         raise InvalidFile(
             f"{path}: the raw traces at /{where} are compressed by {missing}, which is not installed: {PLUGIN_ADVICE}; "
-            "spikes that the rig found itself can be read without it"
+            "spikes detected by the rig can be read without it"
         )
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise InvalidFile(f"{path}: expected a sampling rate of the traces at /{where}, got {rate_hz:g}")
@@ -151,7 +151,7 @@ def _traces(
         used, nowhere = np.arange(columns), np.full(columns, np.nan)
         channels = Channels(used.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
     else:
-        # A channel twice in the traces is one channel: its first column.
+        # If a channel occurs twice in the traces, its first column is used.
         _, first = np.unique(np.array(rows)[used], return_index=True)
         used = used[np.sort(first)]
         kept = np.array(rows)[used]
@@ -170,12 +170,12 @@ def read_dataset_uv(
     start: int,
     stop: int,
 ) -> Float32[np.ndarray, "samples channels"]:
-    """The voltage of samples `start` to `stop` in an HDF5 dataset of numbers, read as they are asked for.
+    """The voltage of samples `start` to `stop` in an HDF5 dataset of numbers.
 
     Args:
-        path, where: of the dataset; its values are checked to lie in the file itself.
+        path, where: of the dataset, whose values must be in the file itself.
         columns: of the dataset, in the order of the channels.
-        channels_first: whether the dataset is (channels, samples) and not (samples, channels).
+        channels_first: whether the dataset is (channels, samples) instead of (samples, channels).
 
     Raises:
         InvalidFile: if the samples cannot be read.

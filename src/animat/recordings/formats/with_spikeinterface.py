@@ -1,8 +1,8 @@
-"""Raw traces of any format that SpikeInterface reads, through the extra `animat[raw]`; imported when asked for.
+"""Opens raw traces in any format that SpikeInterface reads, with the extra `animat[raw]`, which is imported on demand.
 
 The format is named by the user (`intan`, `openephys`, `mcsraw`, ...: SpikeInterface's `read_...` functions), never
-guessed: guessing would try readers on a stranger's file. SpikeInterface's own saved objects are not read, as they name
-Python classes to be loaded.
+guessed: guessing would try many readers on an untrusted file. SpikeInterface's own saved objects are not read, as they
+name Python classes to load.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MISSING = (
     "expected the package SpikeInterface, which is not installed: .venv/bin/pip install -c constraints.txt '.[raw]'"
 )
 REFUSED = ("binary",)
-"""A reader of traces that wants to be told more than their file."""
+"""Trace readers that need more than a file."""
 
 
 def open_with_spikeinterface(
@@ -36,13 +36,13 @@ def open_with_spikeinterface(
     """Raw traces read by SpikeInterface, and their recording without spikes.
 
     Args:
-        path: file or folder, as the reader wants it.
+        path: a file or folder, as the reader requires.
         reader: the format, such as `intan`.
-        stimuli_path: CSV with the stimuli's times from the start of the traces, as beside CSV spikes; by default
-            `NAME_stimuli.csv` beside the file.
+        stimuli_path: CSV with stimulus times from the start of the traces, as for CSV spikes; by default
+            `NAME_stimuli.csv` next to the file.
 
     Raises:
-        InvalidArgument: for a reader that there is not, or without SpikeInterface.
+        InvalidArgument: for an unknown reader, or if SpikeInterface is not installed.
         InvalidFile: if the file cannot be read.
     """
     path = Path(path)
@@ -62,7 +62,7 @@ def open_with_spikeinterface(
         duration_s = samples / rate_hz
         segments = int(recording.get_num_segments())
     except Exception as error:
-        # The readers of 40 formats fail in as many ways.
+        # The readers of some 40 formats raise all kinds of errors.
         raise InvalidFile(
             f"{path}: expected {reader} data that SpikeInterface reads, got {first_line(error)}"
         ) from error
@@ -86,7 +86,7 @@ def open_with_spikeinterface(
             recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale), 1.0
         )
 
-    # From 0 s on, as stimuli beside such files are counted from their start.
+    # Starts at 0 s, as the times of stimuli count from the start of the traces.
     return RawTraces(read_uv, channels, samples, rate_hz), base
 
 
@@ -95,7 +95,7 @@ def _reader(name: str) -> Callable[..., Any]:
         extractors = importlib.import_module("spikeinterface.extractors")
     except ImportError as error:
         raise InvalidArgument(f"reader: {MISSING}") from error
-    # Not those of sortings and events, nor of SpikeInterface's own saved objects.
+    # Excludes readers of sortings and events, and of SpikeInterface's own saved objects.
     of_traces = list(extractors.recording_extractor_full_dict.values())
     readers = {n[5:]: getattr(extractors, n) for n in dir(extractors) if n.startswith("read_")}
     readers = {n: read for n, read in readers.items() if read in of_traces and n not in REFUSED}

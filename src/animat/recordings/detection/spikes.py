@@ -1,4 +1,4 @@
-"""Find the spikes in raw traces: noise first, then piece after piece on all cores, in bounded memory."""
+"""Detects spikes in raw traces: first the noise, then piece by piece on all cores, in bounded memory."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
 
 BLOCK = 64
-"""Channels that are filtered at a time: few enough to stay near the processor."""
+"""Channels filtered at a time: few enough to fit into the processor's cache."""
 NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
 DEAD, NOISY = 0.1, 5.0
-"""Of the median channel's noise: a channel below is dead, one above is noisy."""
+"""Shares of the median channel's noise: a channel below is dead, one above is noisy."""
 
 MUCH_LOST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class FoundSpikes:
-    """Spikes that were found, in the order of time.
+class DetectedSpikes:
+    """Detected spikes, in order of time.
 
     Attributes:
-        time_s: at their negative peaks, on the recording's clock, shape (spikes,).
+        time_s: of their negative peaks, on the recording's clock, shape (spikes,).
         channel: row of the channel table, shape (spikes,).
         noise_uv: standard deviation of each channel's noise, shape (channels,).
     """
@@ -44,28 +44,28 @@ class FoundSpikes:
     findings: tuple[Finding, ...]
 
 
-def find_spikes(
+def detect_spikes(
     traces: RawTraces,
     stimulus_time_s: Float64[np.ndarray, " stimuli"] | None = None,
     settings: Detection | None = None,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> FoundSpikes:
-    """Find spikes in raw traces.
+) -> DetectedSpikes:
+    """Detect spikes in raw traces.
 
     A spike is a negative peak of the band-passed trace deeper than `threshold` standard deviations of its channel's
-    noise, the deepest within the dead time on both sides (`find_negative_peaks`), outside what is blanked around
-    stimuli (`artefacts`).
+    noise, the deepest within the dead time on both sides (`find_negative_peaks`), outside the blanks around stimuli
+    (`artefacts`).
 
     Args:
         stimulus_time_s: starts of the pulses on the recording's clock.
-        settings: how; by default as in `Detection`.
-        workers: threads; by default one a core. Memory grows with them, by some 200 MB each for 1,024 channels.
-        progress: told after each piece.
+        settings: by default those of `Detection`.
+        workers: threads; by default one per core. Each takes some 200 MB of memory for 1,024 channels.
+        progress: updated after each piece.
 
     Raises:
-        InvalidArgument: for a band that the sampling rate does not hold.
+        InvalidArgument: for a band that does not lie below half the sampling rate.
         InvalidFile: if samples cannot be read.
     """
     settings, progress = settings or Detection(), progress or Silent()
@@ -76,7 +76,7 @@ def find_spikes(
     noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
     sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, level_uv, settings, workers, progress)
     order = np.lexsort((channel, sample))
-    return FoundSpikes(
+    return DetectedSpikes(
         time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
@@ -84,15 +84,8 @@ def find_spikes(
     )
 
 
-def depths_uv(noise_uv: Float32[np.ndarray, " channels"], threshold: float) -> Float32[np.ndarray, " channels"]:
-    """The depth that a negative peak must have on each channel; infinite on dead ones."""
-    depth_uv = np.asarray(threshold * noise_uv, dtype=np.float32)
-    depth_uv[is_dead(noise_uv)] = np.inf
-    return depth_uv
-
-
 def is_dead(noise_uv: Float32[np.ndarray, " channels"]) -> np.ndarray:
-    """Whether a channel has no noise to speak of, so that nothing reaches it; shape (channels,)."""
+    """Whether a channel has hardly any noise, so that no signal reaches it; shape (channels,)."""
     return np.asarray(noise_uv <= DEAD * np.median(noise_uv)) if len(noise_uv) else np.zeros(0, dtype=bool)
 
 
@@ -105,14 +98,14 @@ def blocks(channels: int) -> Iterator[slice]:
 def _noise_and_level_uv(
     traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], settings: Detection, workers: int
 ) -> Float32[np.ndarray, "2 channels"]:
-    """The noise of each channel and its usual voltage: medians over pieces from all over the recording."""
+    """The noise of each channel and its usual voltage: medians over pieces spread over the recording."""
     rate_hz, channels = traces.sampling_rate_hz, len(traces.channels)
     length, margin = round(NOISE_PIECE_S * rate_hz), round(MARGIN_S * rate_hz)
     n = max(1, min(NOISE_PIECES, traces.samples // max(length, 1)))
     starts = np.linspace(0, max(traces.samples - length, 0), n).astype(np.int64)
 
     def of_piece(start: int) -> np.ndarray:
-        found = np.zeros((2, channels), np.float32)
+        medians_uv = np.zeros((2, channels), np.float32)
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
             rows = piece.rows(columns)
@@ -121,12 +114,12 @@ def _noise_and_level_uv(
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
                 first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
-            found[:, columns] = first, level_uv
-        return found
+            medians_uv[:, columns] = first, level_uv
+        return medians_uv
 
     with ThreadPoolExecutor(workers) as pool:
-        found = list(pool.map(of_piece, starts.tolist()))
-    return np.asarray(np.median(found, axis=0), dtype=np.float32)
+        pieces = list(pool.map(of_piece, starts.tolist()))
+    return np.asarray(np.median(pieces, axis=0), dtype=np.float32)
 
 
 def _filtered(
@@ -146,14 +139,12 @@ def _detect(
     workers: int,
     progress: Progress,
 ) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray, Int64[np.ndarray, " channels"]]:
-    """Samples and channels of the spikes; of each stimulus how many channels saturate, and how long in ms.
-
-    And the samples of each channel that are lost, as they are no finite numbers.
-    """
+    """Samples and channels of the spikes; for each stimulus, how many channels saturate and how long in ms; and the
+    number of lost (non-finite) samples of each channel."""
     rate_hz = traces.sampling_rate_hz
     margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
-    depth_uv = depths_uv(noise_uv, settings.threshold)
+    depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
 
     def of_block(piece: Piece, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
@@ -162,7 +153,7 @@ def _detect(
             filtered[cleaned.is_blank] = 0.0
         end = margin + piece.stop - piece.start
         row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
-        # Of a pulse before the piece, or near its end, another one counts the channels; how long is seen in either.
+        # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
         saturation = np.column_stack([cleaned.saturated * piece.owned, cleaned.longest_ms])
         return sample - margin + piece.start, row + columns.start, saturation
 
@@ -181,7 +172,7 @@ def _detect(
     starts = deque(range(0, traces.samples, length))
     n, done = len(starts), 0
     with ThreadPoolExecutor(workers) as pool:
-        # No more pieces are under way than there are threads: what waits takes memory.
+        # No more pieces than threads at a time, as waiting pieces take memory.
         running: deque[Future[tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]]] = deque()
         while starts or running:
             while starts and len(running) < workers:
@@ -203,8 +194,8 @@ def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Findin
         n_channels = np.count_nonzero(lost)
         share = n / (samples * n_channels)
         message = (
-            f"{n:,} samples on {n_channels:,} of {len(lost):,} channels ({100 * share:.2g} % of theirs) are no finite "
-            "numbers: nothing is looked for there"
+            f"{n:,} samples on {n_channels:,} of {len(lost):,} channels ({100 * share:.2g} % of theirs) are not "
+            "finite: no spikes are looked for there"
         )
         yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
@@ -214,12 +205,12 @@ def _findings(
 ) -> Iterator[Finding]:
     n, middle = len(noise_uv), float(np.median(noise_uv)) if len(noise_uv) else 0.0
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
-                  f"peaks of {settings.threshold:g} times it and more", middle)  # fmt: skip
+                  f"peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
     if dead := int(np.count_nonzero(is_dead(noise_uv))):
         are, them, count = ("is", "it", "it counts") if dead == 1 else ("are", "them", "they count")
         message = (
-            f"{dead:,} of {n:,} channels {are} dead (less than {DEAD:g} of the median noise): no spike can be found on "
-            f"{them}, and {count} in rates per channel; leave {them} out of the routing next time"
+            f"{dead:,} of {n:,} channels {are} dead (less than {DEAD:g} of the median noise): no spike can be detected "
+            f"on {them}, and {count} in rates per channel; leave {them} out of the routing next time"
         )
         yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
     noisy = int(np.count_nonzero(noise_uv > NOISY * middle)) if middle > 0 else 0
@@ -227,13 +218,13 @@ def _findings(
         have = "has" if noisy == 1 else "have"
         message = (
             f"{noisy:,} of {n:,} channels {have} more than {NOISY:g} times the median noise: "
-            "only large spikes are found there; look for loose contacts or air bubbles"
+            "only large spikes are detected there; look for loose contacts or air bubbles"
         )
         yield Finding("noisy-channels", "note" if noisy < 0.1 * n else "warning", message, float(noisy))
     if n_stimuli:
         before, after = settings.blank_ms
         message = (
-            f"from {before:g} ms before to {after:g} ms after each of {n_stimuli:,} stimuli nothing is looked for"
+            f"no spikes are looked for from {before:g} ms before to {after:g} ms after each of {n_stimuli:,} stimuli"
             + ("" if after <= 2.0 else "; the response window usually begins at 2 ms, so part of it is lost")
         )
         yield Finding("blanked", "note" if after <= 2.0 else "warning", message, after)
@@ -246,5 +237,5 @@ def _findings(
             f"{saturation[:, 1].max():.1f} ms); they are blanked until then"
         )
         is_much = share >= 0.05 and longest > 2
-        message += ": rates in an earlier window are too low, use one that begins later" if is_much else ""
+        message += ": rates in an earlier window are too low; use a window that begins later" if is_much else ""
         yield Finding("saturated-channels", "warning" if is_much else "note", message, share)

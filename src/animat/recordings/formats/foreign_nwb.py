@@ -1,10 +1,10 @@
-"""NWB as other programs write it, read with plain h5py: units as channels, and stimuli wherever they were put.
+"""NWB from other programs, read with plain h5py: units as channels, and stimuli wherever they are.
 
-    /units                  spike_times and its index; electrodes (rows of the electrodes table), where there are any
+    /units                  spike_times and its index; electrodes (rows of the electrodes table), if there are any
     /general/extracellular_ephys/electrodes      rel_x, rel_y or x, y; label, channel_name or electrode_name
     stimuli                 see `animat.recordings.formats.nwb_stimuli`
 
-Every unit becomes a channel, silent ones too; a unit on several electrodes takes the position of its first.
+Every unit becomes a channel, including silent ones; a unit on several electrodes takes the position of its first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from animat.errors import InvalidFile, UnusableData
-from animat.recordings.columns import Column, PlainColumns, out_of_order, unsorted
+from animat.recordings.columns import Column, PlainColumns, count_out_of_order, unsorted_finding
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import SUBJECT
@@ -31,17 +31,17 @@ ELECTRODE_LABELS = ("label", "channel_name", "electrode_name")
 TEXTS = ("experiment_description", "session_description", "institution", "lab")
 
 
-def read_other_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
-    """Read a recording that another program wrote.
+def read_foreign_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
+    """Read a recording written by another program.
 
     Args:
         file: open.
-        stimuli: the name of the stimuli, where the file holds several that could be meant.
-        spikes: whether units must be there; without, channels and stimuli are read, for raw traces beside them.
+        stimuli: the name of the stimuli, if the file has several candidates.
+        spikes: whether to read units, which must exist; otherwise only channels and stimuli, for raw traces.
 
     Raises:
-        InvalidFile: if the file holds no units, or several stimuli and none is chosen.
-        UnusableData: if a column is not what it should be.
+        InvalidFile: if the file holds no units, or several candidates for stimuli and none is chosen.
+        UnusableData: if a column is invalid.
     """
     path, findings = file.path, list[Finding]()
     columns: dict[str, Any]
@@ -60,7 +60,7 @@ def read_other_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> 
     else:
         columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **_electrodes(file)}
     columns |= read_stimuli(file, stimuli, findings)
-    provenance = {"source": path.name, "format": "NWB of another program", **_who(file)}
+    provenance = {"source": path.name, "format": "NWB of another program", **_origin(file)}
     if spikes:
         provenance["channels"] = "units"
     resolution = file.attribute(f"{UNITS}/spike_times", "resolution")
@@ -69,7 +69,7 @@ def read_other_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> 
     try:
         return PlainColumns(**columns).to_recording(provenance, tuple(findings))
     except UnusableData as error:
-        # Said as it is: the file is whole, its contents are not what they should be.
+        # The file is not damaged; its contents are invalid.
         raise InvalidFile(f"{path}: {error}") from error
 
 
@@ -97,9 +97,9 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
     labels = np.arange(n).astype(np.str_) if names is None else file.read(names).reshape(-1).astype(np.str_)
     if len(labels) != n or len(np.unique(labels)) != n:
         labels = np.arange(n).astype(np.str_)
-    # Units stand one after another; only what is out of order within one is.
-    if early := sum(map(out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
-        findings.append(unsorted("spikes", early, len(time_s)))
+    # Units follow each other; spikes count as out of order only within a unit.
+    if early := sum(map(count_out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
+        findings.append(unsorted_finding("spikes", early, len(time_s)))
     order = np.argsort(time_s, kind="stable")
     columns: dict[str, Any] = {
         "spike_time_s": time_s[order],
@@ -122,7 +122,7 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
 
 
 def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
-    """The first row of the electrodes table that each unit names, -1 for none; None where the table has no column."""
+    """The first row of the electrodes table that each unit refers to, -1 for none; None without such a column."""
     if not file.has(f"{UNITS}/electrodes"):
         return None
     rows = file.read(f"{UNITS}/electrodes").astype(np.int64).reshape(-1)
@@ -138,7 +138,7 @@ def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
 
 
 def _electrodes(file: Hdf5File) -> dict[str, Any]:
-    """The electrodes table as channel columns; empty where there is none."""
+    """The electrodes table as channel columns; empty if there is none."""
     if not file.has(f"{ELECTRODES}/id"):
         return {}
     number = file.read(f"{ELECTRODES}/id").astype(np.int64).reshape(-1)
@@ -146,9 +146,9 @@ def _electrodes(file: Hdf5File) -> dict[str, Any]:
     labels = number.astype(np.str_)
     for name in ELECTRODE_LABELS:
         if file.has(f"{ELECTRODES}/{name}"):
-            words = file.read(f"{ELECTRODES}/{name}").reshape(-1).astype(np.str_)
-            if len(words) == n == len(np.unique(words)):
-                labels = words
+            names = file.read(f"{ELECTRODES}/{name}").reshape(-1).astype(np.str_)
+            if len(names) == n == len(np.unique(names)):
+                labels = names
                 break
     xy_um = np.full((n, 2), np.nan)
     for pair in POSITIONS:
@@ -160,18 +160,18 @@ def _electrodes(file: Hdf5File) -> dict[str, Any]:
     return {"channel_label": labels, "channel_electrode": np.maximum(number, UNKNOWN), "channel_xy_um": xy_um}
 
 
-def _who(file: Hdf5File) -> dict[str, str]:
-    """Who recorded what, where the file says so."""
-    found: dict[str, Any] = {"recorded_at": _words(file, "session_start_time")}
-    found |= {name: _words(file, f"general/{name}") for name in TEXTS}
-    found["session_description"] = _words(file, "session_description") or found["session_description"]
-    found |= {key: _words(file, f"general/subject/{name}") for name, key in SUBJECT.items()}
+def _origin(file: Hdf5File) -> dict[str, str]:
+    """Who recorded what, as far as the file states it."""
+    texts: dict[str, Any] = {"recorded_at": _text(file, "session_start_time")}
+    texts |= {name: _text(file, f"general/{name}") for name in TEXTS}
+    texts["session_description"] = _text(file, "session_description") or texts["session_description"]
+    texts |= {key: _text(file, f"general/subject/{name}") for name, key in SUBJECT.items()}
     if isinstance(node := file.node("general/experimenter"), h5py.Dataset) and node.size and node.size < 100:
-        found["experimenter"] = "; ".join(str(name) for name in file.read("general/experimenter").reshape(-1).tolist())
-    return {key: words for key, words in found.items() if isinstance(words, str) and words and "\0" not in words}
+        texts["experimenter"] = "; ".join(str(name) for name in file.read("general/experimenter").reshape(-1).tolist())
+    return {key: text for key, text in texts.items() if isinstance(text, str) and text and "\0" not in text}
 
 
-def _words(file: Hdf5File, at: str) -> str | None:
+def _text(file: Hdf5File, at: str) -> str | None:
     node = file.node(at)
     if not isinstance(node, h5py.Dataset) or node.size != 1:
         return None

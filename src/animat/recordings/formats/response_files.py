@@ -1,13 +1,14 @@
-"""Tables of responses as CSV and NPZ: a count or a rate a stimulus and channel, without times of spikes.
+"""Response tables in CSV and NPZ: a count or a rate per stimulus and channel, without spike times.
 
-    NAME_responses.csv[.gz]   wide: a line a stimulus; a column count_CHANNEL or rate_hz_CHANNEL for each channel
-                              long: a line a stimulus and channel; trial (or stimulus_time_s), channel, count or rate_hz
-                              both: stimulus columns as in a file of stimuli, condition for pattern; window_start_ms,
+    NAME_responses.csv[.gz]   wide: one line per stimulus; a column count_CHANNEL or rate_hz_CHANNEL for each channel
+                              long: one line per stimulus and channel; trial (or stimulus_time_s), channel, count or
+                              rate_hz
+                              both: stimulus columns as in a stimulus file, condition for pattern; window_start_ms,
                               window_end_ms and start_min, the same in all lines
     NAME.npz                  response_count or response_rate_hz (stimuli, channels); response_window_ms (2,);
                               stimulus_... and channel_... as in an NPZ of spikes, all optional
 
-Lines are in the order of presentation, or have times. Of a long table a stimulus and channel without a line are 0.
+Lines are in order of presentation, or have times. In a long table, a stimulus and channel without a line count as 0.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding, left_out_of
+from animat.recordings.findings import Finding, left_out_finding
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import load_columns
 from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
@@ -45,71 +46,71 @@ TRIAL = "trial"
 
 
 def is_response_csv(path: Path) -> bool:
-    """Whether a text file holds a table of responses, by its header.
+    """Whether a text file is a response table, by its header.
 
     Raises:
-        InvalidFile: if it holds no text.
+        InvalidFile: if it is not text.
     """
     names = {folded(name) for name in read_header(path)}
-    # Spikes may have columns of counts and rates of their own.
+    # Spike files may have columns of counts and rates too.
     if names & SPIKE_COLUMNS.keys() or path.name.lower().endswith(("_spikes.csv", "_spikes.csv.gz")):
         return False
     long = "channel" in names and bool(names & set(KINDS))
     if path.name.lower().endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
-        # Whatever it lacks, it is meant for one.
+        # It is meant to be one, whatever it lacks.
         return True
     return long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
 
 
 def is_response_npz(path: Path) -> bool:
-    """Whether an archive holds a table of responses."""
+    """Whether an archive holds a response table."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (OSError, zipfile.BadZipFile, NotImplementedError):
         return False
-    # Where there are spikes too, they say more.
+    # If there are spikes too, they are more informative.
     return any(f"{key}.npy" in names for key in NPZ_KEYS) and "spike_time_s.npy" not in names
 
 
 def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
-    """Read a table of responses from a numpy archive; nothing in it is ever unpickled.
+    """Read a response table from a numpy archive; nothing in it is ever unpickled.
 
     Raises:
-        InvalidFile: if the file is damaged, or holds counts and rates.
-        UnusableData: if an array is not what it should be.
+        InvalidFile: if the file is damaged, or holds both counts and rates.
+        UnusableData: if an array is invalid.
     """
     path = Path(path)
     arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms"))
-    given = [key for key in NPZ_KEYS if key in arrays]
-    if len(given) != 1:
-        raise InvalidFile(f"{path}: expected {' or '.join(NPZ_KEYS)}, one of them, got {' and '.join(given) or 'none'}")
-    values = np.asarray(arrays.pop(given[0]))
+    keys = [key for key in NPZ_KEYS if key in arrays]
+    if len(keys) != 1:
+        raise InvalidFile(f"{path}: expected one of {' or '.join(NPZ_KEYS)}, got {' and '.join(keys) or 'neither'}")
+    values = np.asarray(arrays.pop(keys[0]))
     if values.ndim != 2 or values.dtype.kind not in "iufb":
         raise UnusableData(
-            f"{given[0]}: expected numbers of shape (stimuli, channels), got {values.dtype} {values.shape}"
+            f"{keys[0]}: expected numbers of shape (stimuli, channels), got {values.dtype} {values.shape}"
         )
     per_stimulus = {len(a) for key, a in arrays.items() if key.startswith("stimulus_") and np.ndim(a)}
     if per_stimulus == {values.shape[1]} and values.shape[0] != values.shape[1]:
         raise UnusableData(
-            f"{given[0]}: expected a row for each of {values.shape[1]} stimuli, got {values.shape}: transpose it"
+            f"{keys[0]}: expected a row for each of {values.shape[1]} stimuli, got {values.shape}: transpose it"
         )
     window = arrays.pop("response_window_ms", None)
     if window is not None and np.shape(window) != (2,):
         raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
-    findings = [left_out_of("keys", left_out)] if left_out else []
+    findings = [left_out_finding("keys", left_out)] if left_out else []
     labels = arrays.pop("channel_label", np.arange(values.shape[1]))
     window_ms = None if window is None else (float(window[0]), float(window[1]))
     provenance = {"source": path.name, "format": "NPZ of responses"}
-    return _table(values, NPZ_KEYS[given[0]], labels, arrays, window_ms, provenance, findings)
+    return _table(values, NPZ_KEYS[keys[0]], labels, arrays, window_ms, provenance, findings)
 
 
 def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
-    """Read a table of responses from text, wide or long.
+    """Read a response table from text, wide or long.
 
     Raises:
-        InvalidFile: for what cannot be read, with its line.
-        UnusableData: if a column is not what it should be.
+        InvalidFile: for text that cannot be read, with its line.
+        UnusableData: if a column is invalid.
     """
     table = read_text_table(Path(path))
     is_long = table.place(("channel",)) is not None
@@ -128,15 +129,15 @@ def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
         columns["start_min"] = single["start_min"]
     left_out = [name for i, name in enumerate(table.header) if i not in used]
     if left_out:
-        missing = [each for name, names in TABLE_COLUMNS.items() if name not in columns for each in names]
-        table.findings.append(left_out_of("columns", left_out, table.path.name, missing))
+        missing = [alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names]
+        table.findings.append(left_out_finding("columns", left_out, table.path.name, missing))
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
     return _table(values, kind, labels, columns, window_ms, provenance, table.findings)
 
 
 def _wide(table: TextTable) -> _Read:
-    """Of a line a stimulus."""
+    """Read a table with one line per stimulus."""
     places = {kind: [i for i, h in enumerate(table.header) if folded(h).startswith(f"{kind}_")] for kind in KINDS}
     kinds = [kind for kind in KINDS if places[kind]]
     if len(kinds) != 1:
@@ -154,21 +155,21 @@ def _wide(table: TextTable) -> _Read:
 
 
 def _label(head: str, kind: Kind) -> str:
-    """What a header says after the kind, as it stands there: 12 of `Rate (Hz) 12`."""
+    """The part of a header after the kind, such as 12 in `Rate (Hz) 12`."""
     return next(head[i:].strip() for i in range(len(head) + 1) if folded(f"{head[:i]}x") == f"{kind}_x")
 
 
 def _long(table: TextTable) -> _Read:
-    """Of a line a stimulus and channel."""
-    there = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
+    """Read a table with one line per stimulus and channel."""
+    places = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
     trial = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"]))
-    if len(there) != 1 or trial is None:
+    if len(places) != 1 or trial is None:
         raise InvalidFile(
             f"{table.path}, line 1: expected trial (or stimulus_time_s), channel, and count or rate_hz, found "
             + ", ".join(table.header[:12])
             + nearest(table, (TRIAL, *TABLE_COLUMNS["stimulus_time_s"], "channel", *KINDS))
         )
-    (kind, place), channel = next(iter(there.items())), table.place(("channel",))
+    (kind, place), channel = next(iter(places.items())), table.place(("channel",))
     assert channel is not None
     numbers = table.numbers(place, kind, required=True)
     trials, first, row_of = np.unique(table.text(trial), return_index=True, return_inverse=True)
@@ -181,18 +182,18 @@ def _long(table: TextTable) -> _Read:
     distinct, counts = np.unique(cells, return_counts=True)
     if np.any(counts > 1):
         again = int(np.flatnonzero(cells == distinct[counts > 1][0])[1])
-        raise table.wrong(again, "expected one line a stimulus and channel, got this one again")
+        raise table.wrong(again, "expected one line per stimulus and channel, got this one again")
     values = np.zeros(len(trials) * len(labels))
     values[cells] = numbers
     if missing := len(values) - len(distinct):
-        message = f"{missing:,} of {len(values):,} pairs of a stimulus and a channel have no line: taken for 0"
+        message = f"{missing:,} of {len(values):,} pairs of a stimulus and a channel have no line and count as 0"
         table.findings.append(Finding("pairs-missing", "note", message, float(missing)))
     used = {place, channel, trial}
     return values.reshape(len(trials), len(labels)), kind, labels, first[order], stimulus_of, used
 
 
 def _per_stimulus(table: TextTable, place: int, name: str, first: Int64[np.ndarray, " lines"]) -> Column:
-    """A column of the stimuli, the same in each line of one; first: the first line of each line's stimulus."""
+    """A column that must be the same in all lines of a stimulus; `first` is the first line of each line's stimulus."""
     column = plain_column(table, place, name)
     same = column == column[first]
     if column.dtype.kind == "f":
@@ -200,13 +201,13 @@ def _per_stimulus(table: TextTable, place: int, name: str, first: Int64[np.ndarr
     if not np.all(same):
         row = int(np.argwhere(~same)[0, 0])
         cells, line = table.text(place), table.lines[first[row]]
-        expected = f"expected {cells[first[row]]!r} as in line {line}, which is of the same stimulus"
+        expected = f"expected {cells[first[row]]!r} as in line {line}, of the same stimulus"
         raise table.wrong(row, f"{name}: {expected}, got {cells[row]!r}")
     return column
 
 
 def _constant(table: TextTable, name: str, used: set[int]) -> float | None:
-    """The one number of a column, None where there is no such column."""
+    """The single number of a column, None if there is no such column."""
     place = table.place((name,))
     if place is None:
         return None
@@ -231,14 +232,14 @@ def _table(
     provenance: dict[str, str],
     findings: list[Finding],
 ) -> ResponseTable:
-    """The table, its stimuli and channels checked as those of plain columns are."""
+    """The table, with stimuli and channels checked like plain columns."""
     has_times = "stimulus_time_s" in columns
     times = np.asarray(columns.pop("stimulus_time_s", np.arange(len(values), dtype=np.float64)))
     plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, channel_label=labels, **columns)
     if len(values) != len(times):
         raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
     if not has_times:
-        order = "the table has no times of stimuli: its rows are taken for the order of presentation"
+        order = "the table has no stimulus times: its rows are assumed to be in order of presentation"
         findings = [Finding("stimulus-times-unknown", "note", order), *findings]
     recording = plain.to_recording({}, tuple(findings))
     return ResponseTable(

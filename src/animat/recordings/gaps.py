@@ -1,4 +1,4 @@
-"""Stretches without any event that are too long for chance: before the first one, and between spikes."""
+"""Gaps without any event that are too long to be chance: before the first event, and between spikes."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 
 TIMES = 10.0
-"""An empty stretch is this many times as long as the next shorter one. Of n like stretches the first is so by chance
-once in n^10 / 10! cases."""
+"""A gap must be this many times as long as the next shorter one. Of n similar gaps, the first is so by chance once in
+n^10 / 10! cases."""
 LATE_SHARE, LATE_SPIKES = 0.1, 20
-"""Of the recording, and the spikes that it must have: less changes no rate by much, and fewer tell nothing."""
+"""Smallest share of the recording, as less hardly changes rates; and fewest spikes, as fewer are not conclusive."""
 SILENT_SHARES, SILENT_S, SILENT_SPIKES = (0.01, 0.5), 1.0, 1000
-"""Likewise for silences, from the first spike on; a culture that is silent for most of the time fires in bursts."""
+"""Likewise for silences, from the first spike on; a culture that is silent most of the time fires in bursts."""
 SILENCES = 5
-"""So many at most stand out together."""
+"""Most silences that are reported together."""
 
 
 def late_start(
     spike_time_s: Float64[np.ndarray, " spikes"], stimulus_time_s: Float64[np.ndarray, " stimuli"]
 ) -> Iterator[Finding]:
-    """A finding where a recording that is taken to start at 0, as nobody said when, has its first event much later.
+    """A finding if a recording with an unknown start, assumed to be 0, has its first event much later.
 
     Args:
-        spike_time_s, stimulus_time_s: rising.
+        spike_time_s, stimulus_time_s: in ascending order.
     """
     event_s = np.sort(np.concatenate([spike_time_s, stimulus_time_s]))
     if len(spike_time_s) < LATE_SPIKES:
@@ -35,20 +35,16 @@ def late_start(
     first_s, last_s, longest_s = float(event_s[0]), float(event_s[-1]), float(np.diff(event_s).max())
     if first_s > max(TIMES * longest_s, LATE_SHARE * last_s):
         message = (
-            f"the recording does not say when it starts and is taken to start at 0 s, but the first event is at "
-            f"{first_s:.12g} s, and no later two are more than {longest_s:.3g} s apart: if it starts near the first, "
-            "rates are too low and bursts are found where there are none; say when it starts "
+            f"the recording does not state its start, which is assumed to be 0 s, but the first event is at "
+            f"{first_s:.12g} s and later events are at most {longest_s:.3g} s apart: if it starts near the first, "
+            "rates are too low and bursts are found where there are none; state the start "
             "(animat convert --start-s, start_s in NPZ)"
         )
         yield Finding("start-unknown", "warning", message, first_s)
 
 
 def silences(recording: Recording) -> Iterator[Finding]:
-    """A finding where no channel has a spike for far longer than it is else silent on all of them.
-
-    Args:
-        recording: with any spikes.
-    """
+    """A finding if all channels are silent for far longer than at any other time."""
     if len(recording.spike_times_s) < SILENT_SPIKES:
         return
     times_s = np.append(recording.spike_times_s, recording.stop_s)
@@ -63,7 +59,7 @@ def silences(recording: Recording) -> Iterator[Finding]:
         return
     where = ", ".join(f"from {times_s[i]:.12g} to {times_s[i + 1]:.12g} s" for i in sorted(longest[:n].tolist()))
     message = (
-        f"no spike on any channel {where} ({total_s:.3g} s), where no other silence is longer than "
-        f"{of_longest_s[n]:.2g} s: was nothing recorded there? It counts in rates; if so, cut the recording there"
+        f"no spike on any channel {where} ({total_s:.3g} s), while no other silence is longer than "
+        f"{of_longest_s[n]:.2g} s: was recording interrupted? If so, cut the recording there, as it counts in rates"
     )
     yield Finding("silence", "warning", message, total_s)

@@ -1,4 +1,4 @@
-"""Stretches without events. Oracles: independent spikes, which have none by chance, cut, shifted and doubled."""
+"""Gaps without events. Oracles: independent spikes, which have none by chance, cut, shifted and doubled."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from animat.cli import main
 from animat.errors import AnimatError
 from animat.recordings.columns import PlainColumns
-from animat.recordings.noticed import noticed
+from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.responses.inspection import inspect_recording
@@ -29,22 +29,22 @@ def spikes_csv(folder: Path, from_s: float, n: int = 20_000, length_s: float = 6
 
 
 def said(source: Recording) -> dict[str, str]:
-    return {finding.name: finding.message for finding in noticed(source)}
+    return {finding.name: finding.message for finding in recording_findings(source)}
 
 
 @pytest.mark.parametrize("from_s", [3600.0, 1.7e9])
-def test_a_clock_that_does_not_begin_at_0_is_warned_of_and_its_start_can_be_given(
+def test_a_clock_that_does_not_start_at_0_causes_a_warning_and_its_start_can_be_given(
     from_s: float, tmp_path: Path
 ) -> None:
     path = spikes_csv(tmp_path, from_s)
     source = read_recording(path)
-    finding = next(f for f in noticed(source) if f.name == "start-unknown")
+    finding = next(f for f in recording_findings(source) if f.name == "start-unknown")
     assert finding.severity == "warning" and "animat convert --start-s" in finding.message
     assert f"the first event is at {source.spike_times_s[0]:.12g} s" in finding.message
     told = read_recording(path, start_s=from_s)
     assert not {"start-unknown", "silence", "times-not-in-seconds"} & set(said(told))
     assert (told.start_s, told.stop_s) == (from_s, source.stop_s)
-    assert said(told)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, in place of 0 s"
+    assert said(told)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, instead of 0 s"
     assert "start-given" not in said(read_recording(path, start_s=0.0))
     inspection = inspect_recording(told)
     # 20,000 spikes on 30 channels in 600 s, independent of each other.
@@ -76,7 +76,7 @@ def test_independent_events_and_bursts_have_no_late_start_by_chance(seed: int, n
     assert "start-unknown" not in said(columns.to_recording({}))
 
 
-def test_a_late_first_event_is_not_asked_about_where_the_start_is_stated() -> None:
+def test_a_late_first_event_causes_no_warning_if_the_start_is_stated() -> None:
     times_s = 3600 + np.arange(100.0)
     for start_s, asked in [(None, True), (0.0, False), (3000.0, False)]:
         columns = PlainColumns(times_s, np.zeros(100, int), np.empty(0), start_s=start_s)
@@ -84,7 +84,7 @@ def test_a_late_first_event_is_not_asked_about_where_the_start_is_stated() -> No
 
 
 def poisson(silent_s: list[tuple[float, float]], duration_s: float = 1000.0) -> Recording:
-    """300 spikes a second on 20 channels, but none in these stretches."""
+    """300 spikes per second on 20 channels, but none in these gaps."""
     rng = np.random.default_rng(1)
     times = rng.uniform(0, duration_s, int(300 * duration_s))
     for start, stop in silent_s:
@@ -92,25 +92,25 @@ def poisson(silent_s: list[tuple[float, float]], duration_s: float = 1000.0) -> 
     return of_spikes(np.column_stack([times, rng.integers(20, size=len(times))]), [], 20, duration_s)
 
 
-def test_silences_are_told_where_they_are() -> None:
+def test_silences_are_reported_with_their_times() -> None:
     assert "silence" not in said(poisson([]))
-    finding = next(f for f in noticed(poisson([(400, 600)])) if f.name == "silence")
+    finding = next(f for f in recording_findings(poisson([(400, 600)])) if f.name == "silence")
     assert finding.severity == "warning" and finding.value == pytest.approx(200, abs=0.1)
     assert finding.message.startswith("no spike on any channel from 399.9") and "to 600.0" in finding.message
-    two = next(f for f in noticed(poisson([(100, 130), (900, 1000)])) if f.name == "silence")
+    two = next(f for f in recording_findings(poisson([(100, 130), (900, 1000)])) if f.name == "silence")
     assert two.value == pytest.approx(130, abs=0.1) and ", from 899.9" in two.message
     # Less than a hundredth of the recording changes no rate by much.
     assert "silence" not in said(poisson([(400, 405)]))
 
 
 @pytest.mark.parametrize("n_bursts", [1, 2, 3, 5, 20])
-def test_a_culture_that_fires_in_bursts_alone_is_not_silent(n_bursts: int) -> None:
+def test_a_culture_that_fires_only_in_bursts_is_not_silent(n_bursts: int) -> None:
     rng = np.random.default_rng(n_bursts)
     times = [t for at in rng.uniform(0, 600, n_bursts) for t in at + rng.uniform(0, 0.3, 2000)]
     assert "silence" not in said(of_spikes([(t, 0) for t in times], [], 4, 601.0))
 
 
-def test_spikes_that_are_there_twice_are_warned_of() -> None:
+def test_duplicate_spikes_cause_a_warning() -> None:
     rng = np.random.default_rng(0)
     spikes = np.column_stack([rng.uniform(0, 10, 1000), rng.integers(4, size=1000)])
     assert "duplicate-spikes" not in said(of_spikes(spikes, [], 4))
@@ -121,20 +121,20 @@ def test_spikes_that_are_there_twice_are_warned_of() -> None:
     assert "duplicate-spikes" not in said(of_spikes(both, [], 4))
 
 
-def test_trials_that_nobody_numbered_are_trials_each_and_several_frequencies_are_warned_of() -> None:
+def test_unnumbered_pulses_are_trials_and_several_frequencies_in_one_cause_a_warning() -> None:
     def trials(**columns: object) -> Recording:
         times_s = np.arange(1.0, 51.0)
         return PlainColumns(np.array([1.005]), np.zeros(1, int), times_s, **columns).to_recording({})  # type: ignore[arg-type]
 
     unknown = trials(stimulus_presentation=np.full(50, -1))
     assert np.count_nonzero(unknown.stimuli.is_last_of_presentation) == 50
-    assert said(unknown)["trials-unknown"].startswith("50 of 50 stimuli name no trial (-1)")
+    assert said(unknown)["trials-unknown"].startswith("50 of 50 stimuli have no trial number (-1)")
     some = trials(stimulus_presentation=np.r_[np.full(20, -1), np.repeat(np.arange(15), 2)])
     assert np.count_nonzero(some.stimuli.is_last_of_presentation) == 35
-    with pytest.raises(AnimatError, match="expected numbers that do not fall"):
+    with pytest.raises(AnimatError, match="expected numbers that never fall over time"):
         trials(stimulus_presentation=np.r_[np.full(20, -1), np.arange(30)[::-1]])
     frequency_hz = np.tile([5.0, 10.0], 25)
     mixed = trials(stimulus_presentation=np.repeat([0, 1], 25), stimulus_frequency_hz=frequency_hz)
-    assert said(mixed)["trials-of-several-frequencies"].startswith("2 of 2 trials hold pulses of several frequencies")
+    assert said(mixed)["trials-of-several-frequencies"].startswith("2 of 2 trials have pulses of several frequencies")
     alike = trials(stimulus_presentation=np.repeat([0, 1], 25), stimulus_frequency_hz=np.repeat([5.0, 10.0], 25))
     assert "trials-of-several-frequencies" not in said(alike)

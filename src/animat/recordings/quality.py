@@ -1,4 +1,4 @@
-"""What was noticed about a recording: when its file was read, and in the recording itself."""
+"""Findings about a recording: those from reading its file, and those seen in its data."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from animat.recordings.empty_stretches import silences
 from animat.recordings.findings import Finding
+from animat.recordings.gaps import silences
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import frequency_findings, time_findings
 from animat.tables import UNKNOWN
 
 MANY_STIMULI = 100
-STIMULI_A_SPIKE = 10.0
-"""From here on, spikes and stimuli must be swapped: a culture that answers so seldom teaches nothing."""
+STIMULI_PER_SPIKE = 10.0
+"""From this ratio on spikes and stimuli must be swapped: nothing can be learned from a culture that responds so
+rarely."""
 
 
-def noticed(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
-    """All findings about a recording: those noted when its file was read, then those seen in its data.
+def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
+    """All findings about a recording: those from reading its file, then those seen in its data.
 
-    Of a table of responses, which has no spikes to look at, the former and its frequencies (`other-frequencies`).
+    For a response table, which has no spikes, only the former and those on its frequencies (`other-frequencies`).
 
     Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
     (`channel_findings`), times that cannot be in seconds (`animat.recordings.time_quality`), silences of all channels
-    (`silence`), spikes that are there twice (`duplicate-spikes`), more stimuli than spikes
-    (`more-stimuli-than-spikes`), stimuli of one time (`simultaneous-stimuli`), trials of several frequencies
-    (`trials-of-several-frequencies`), stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown
-    presentation (`presentation-unknown`).
+    (`silence`), duplicate spikes (`duplicate-spikes`), more stimuli than spikes (`more-stimuli-than-spikes`), stimuli
+    with the same time (`simultaneous-stimuli`), trials of several frequencies (`trials-of-several-frequencies`),
+    stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
     """
     if isinstance(recording, ResponseTable):
         return (*recording.findings, *frequency_findings(recording.stimuli, has_times=recording.has_times))
@@ -40,8 +40,8 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
     channels, stimuli = recording.channels, recording.stimuli
     if not len(stimuli):
         message = (
-            f"{len(recording.spike_times_s):,} spikes but no stimulus: there are no responses to learn from; "
-            "bring the stimulus times too"
+            f"{len(recording.spike_times_s):,} spikes but no stimuli: there are no responses to learn from; "
+            "provide the stimulus times too"
         )
         yield Finding("no-stimuli", "refuse", message)
     if not len(recording.spike_times_s):
@@ -57,58 +57,58 @@ def _in_data(recording: Recording) -> Iterable[Finding]:
         yield Finding("stimulus-electrodes-unknown", "note", message, float(unknown))
     if len(stimuli) and recording.presentation is None:
         message = (
-            "how the stimuli were presented (blocked or mixed, pulses per trial) is not known; a closed loop "
+            "how the stimuli were presented (blocked or mixed, pulses per trial) is not known, so a closed loop "
             "cannot check that it presents them in the same way"
         )
         yield Finding("presentation-unknown", "note", message)
 
 
 def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
-    """Rows of the stimulus table that are no single stimuli."""
+    """Findings on rows of the stimulus table that are not single stimuli."""
     n_spikes, times_s = len(recording.spike_times_s), recording.stimuli.time_s
     if len(times_s) >= MANY_STIMULI and 0 < n_spikes < len(times_s):
         ratio = len(times_s) / n_spikes
         message = f"{len(times_s):,} stimuli for {n_spikes:,} spikes: are spikes and stimuli swapped?"
-        yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_A_SPIKE else "note", message, ratio)
+        yield Finding("more-stimuli-than-spikes", "refuse" if ratio >= STIMULI_PER_SPIKE else "note", message, ratio)
     last = recording.stimuli.is_last_of_presentation
     if same := int(np.count_nonzero((np.diff(times_s) == 0) & last[:-1])):
         message = (
-            f"{same:,} of {len(times_s):,} stimuli come at the very time of the one before, and the response is "
-            "counted for each: where they are the electrodes of one stimulus, put these into one row"
+            f"{same:,} of {len(times_s):,} stimuli come at exactly the same time as the previous one, and the response "
+            "is counted for each: if they are electrodes of one stimulus, put them into one row"
         )
         yield Finding("simultaneous-stimuli", "refuse", message, float(same))
 
     frequency_hz, trial = recording.stimuli.frequency_hz, recording.stimuli.presentation
-    # Unknown ones differ from each other too, and are none.
+    # Unknown frequencies (NaN) differ from each other too, and do not count.
     differs = (np.diff(frequency_hz) != 0) & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
     if several := len(np.unique(trial[1:][differs & (np.diff(trial) == 0)])):
         message = (
-            f"{several:,} of {np.count_nonzero(last):,} trials hold pulses of several frequencies, and the response "
-            "counts for that of the last: correct the frequencies or stimulus_presentation"
+            f"{several:,} of {np.count_nonzero(last):,} trials have pulses of several frequencies, and the response "
+            "counts for that of the last pulse: correct the frequencies or stimulus_presentation"
         )
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 
-TWICE = 0.03, 20
-"""Share of the spikes, and how many, from which on they are told."""
+DUPLICATES = 0.03, 20
+"""Share of the spikes above which duplicates are reported, and fewest."""
 
 
 def _duplicates(recording: Recording) -> Iterable[Finding]:
-    """Spikes of one channel at one time, which no channel can have."""
+    """A finding on spikes with the same channel and time, which is impossible."""
     same = (np.diff(recording.spike_times_s) == 0) & (np.diff(recording.spike_channels) == 0)
     n, share = int(np.count_nonzero(same)), float(np.mean(same)) if len(same) else 0.0
-    if share > TWICE[0] and n >= TWICE[1]:
+    if share > DUPLICATES[0] and n >= DUPLICATES[1]:
         message = (
-            f"{n:,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at the "
-            "very time of another on their channel: are they in the file twice, or times coarse? Each is counted; "
-            "bring them once"
+            f"{n:,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at exactly the same time as "
+            "another on their channel: are they in the file twice, or are times coarse? Each is counted; provide them "
+            "once"
         )
         yield Finding("duplicate-spikes", "warning", message, share)
 
 
 MOSTLY_SILENT = 0.5
 FAST_HZ = 100.0
-"""On average over a recording: no few neurons near one electrode fire so fast for minutes."""
+"""On average over a recording: the few neurons near one electrode cannot fire so fast for minutes."""
 HOLDS_MOST = 1 / 3
 SEVERAL = 8
 NAMED = 6
@@ -117,8 +117,8 @@ NAMED = 6
 def channel_findings(recording: Recording) -> Iterator[Finding]:
     """Findings on silent channels (`silent-channels`) and noisy ones (`noisy-channels`).
 
-    A channel is silent without a spike. It is noisy if it fires at more than 100 Hz on average, or holds more than a
-    third of all spikes of eight or more channels.
+    A channel without a spike is silent. A channel is noisy if it fires at more than 100 Hz on average, or has more than
+    a third of all spikes of eight or more channels.
 
     Args:
         recording: with at least one spike.
@@ -140,11 +140,11 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     if len(noisy):
         share = float(count[noisy].sum() / n_spikes)
         names = ", ".join(channels.label[noisy[:NAMED]]) + (", ..." if len(noisy) > NAMED else "")
-        one = ("fires", "holds", "it carries", "its threshold", "it")
-        several = ("fire", "hold", "they carry", "their threshold", "them")
-        fire, hold, carry, threshold, them = one if len(noisy) == 1 else several
+        one = ("fires", "has", "it carries", "its threshold", "it")
+        several = ("fire", "have", "they carry", "their threshold", "them")
+        fire, have, carry, threshold, them = one if len(noisy) == 1 else several
         message = (
-            f"{len(noisy):,} of {n:,} channels ({names}) {fire} as no neurons do and {hold} {100 * share:.0f} % of all "
-            f"spikes: {carry} noise; raise {threshold} or leave {them} out of the routing"
+            f"{len(noisy):,} of {n:,} channels ({names}) {fire} as no neuron does and {have} {100 * share:.0f} % of "
+            f"all spikes: {carry} noise; raise {threshold} or leave {them} out of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

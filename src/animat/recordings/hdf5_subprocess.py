@@ -1,9 +1,9 @@
-"""HDF5 files are read in a process of their own, so that a damaged one cannot take the program with it.
+"""Reads HDF5 files in a separate process, so that a damaged file cannot crash the program.
 
-The HDF5 library itself can crash, or turn in circles for ever, on a few bytes in the wrong place (seen: three of 2,000
-damaged files). So another Python reads them, under limits on processor time and memory that the operating system keeps;
-if it dies, the file was damaged, and the next file gets a new one. It is started with the first file and stays for the
-next ones, which takes a few tenths of a second once.
+The HDF5 library itself can crash, or loop for ever, on a few misplaced bytes (seen in three of 2,000 damaged files). So
+another Python process reads them, under limits on processor time and memory that the operating system enforces; if it
+dies, the file was damaged, and the next file gets a new process. It is started for the first file, in a few tenths of a
+second, and kept for later ones.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 
 PROCESSOR_S, PROCESSOR_S_PER_MB = 2.0, 0.2
-"""Processor time that a file may take: for any, and more by its size."""
+"""Processor time that a file may take, and how much more per megabyte."""
 WAIT_S, WAIT_S_PER_MB = 8.0, 2.0
-"""By the clock, for a machine that is busy with other things, or files that cannot be got at."""
+"""Wall-clock time, for busy machines and inaccessible files."""
 START_S = 60.0
-"""For the process to start."""
+"""Time for the process to start."""
 MEMORY_BYTES, MEMORY_PER_BYTE = 800 * 2**20, 12
 
 _lock = threading.Lock()
 _reader: Process | None = None
 
 
-def read_hdf5_apart(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
-    """Read a recording as `animat.recordings.formats.hdf5_formats.read_hdf5` does, in the process kept for it.
+def read_hdf5_in_subprocess(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
+    """Read a recording as `animat.recordings.formats.hdf5_formats.read_hdf5` does, in the separate process.
 
     Raises:
-        InvalidFile: as there; also if the HDF5 library crashes on the file, or needs more time or memory than it may.
+        InvalidFile: as there; also if the HDF5 library crashes on the file, or exceeds its limits on time or memory.
         InvalidArgument: as there.
     """
-    # Messages name the path as it was given, so it goes with the folder that it is counted from.
+    # Messages name the path as it was given, so the folder that it is relative to is passed too.
     call = pickle.dumps((_read, (Path.cwd(), path, part, stimuli), {}))
     wait_s = WAIT_S + WAIT_S_PER_MB * path.stat().st_size / 1e6
     with _lock:
@@ -51,8 +51,8 @@ def read_hdf5_apart(path: Path, *, part: str | None = None, stimuli: str | None 
             raise
         except (BrokenExecutor, TimeoutError) as error:
             raise InvalidFile(
-                f"{path}: expected a whole HDF5 recording, but it is damaged: the HDF5 library crashed on it, or took "
-                "more time or memory than its size allows; copy or record it again"
+                f"{path}: expected a complete HDF5 recording, but it is damaged: the HDF5 library crashed on it, or "
+                "took more time or memory than its size allows; copy or record it again"
             ) from error
         except Exception as error:
             raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
@@ -67,20 +67,20 @@ def _start() -> Process:
         _reader.answer(pickle.dumps((_get_ready, (), {})), START_S)
     except Exception as error:
         is_late = isinstance(error, TimeoutError)
-        why = f"not ready after {START_S:g} s, is the machine busy?" if is_late else "is animat installed whole?"
+        why = f"not ready after {START_S:g} s, is the machine busy?" if is_late else "is animat fully installed?"
         raise InvalidFile(f"the process that reads HDF5 files could not be started: {why}") from error
     return _reader
 
 
 @atexit.register
 def end_reader() -> None:
-    """End the process, if there is one; the next file gets a new one."""
+    """End the process if there is one; the next file gets a new one."""
     if _reader is not None:
         _reader.end()
 
 
 def _get_ready() -> None:
-    """Import what reads, before the time of a file begins."""
+    """Import the readers before the time limit of a file starts."""
     from animat.recordings.formats import hdf5_formats  # noqa: F401
 
 
@@ -93,7 +93,7 @@ def _read(folder: Path, path: Path, part: str | None, stimuli: str | None) -> Re
 
 
 def _limit(path: Path) -> None:
-    """Let the operating system end this process if a file takes too much of it."""
+    """Make the operating system end this process if a file takes too much time or memory."""
     import resource
 
     size = path.stat().st_size

@@ -1,0 +1,74 @@
+"""What a file keeps about a recording beside its arrays: text by key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, get_args
+
+from animat.errors import InvalidArgument
+from animat.recordings.findings import Finding, Severity
+from animat.recordings.recording import RecordedCulture, Recording
+from animat.stimulation.protocol import Protocol
+
+
+def to_metadata(recording: Recording) -> dict[str, str]:
+    """The provenance, and the fields that `from_metadata` restores.
+
+    Raises:
+        InvalidArgument: for a provenance that would be read back as something else.
+    """
+    metadata = dict(recording.provenance)
+    if reserved := [key for key in metadata if key == "protocol" or _is_finding(key)]:
+        raise InvalidArgument(
+            f"provenance: expected other keys than those of protocol and findings in a file, got {reserved[0]!r}"
+        )
+    if (culture := _culture_of(metadata)) != recording.culture:
+        raise InvalidArgument(
+            f"culture: expected that of the provenance's source and seed, {culture!r}, got {recording.culture!r}"
+        )
+    if recording.protocol is not None:
+        metadata["protocol"] = recording.protocol.to_json()
+    return metadata | {f"{finding.severity}: {finding.name}": finding.message for finding in recording.findings}
+
+
+def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """A recording's `provenance`, `protocol`, `culture` and `findings`.
+
+    Raises:
+        InvalidArgument: for a protocol that is not one.
+    """
+    provenance, findings, protocol = dict[str, str](), list[Finding](), None
+    for key, text in metadata.items():
+        if key == "protocol":
+            protocol = Protocol.from_json(text)
+        elif _is_finding(key):
+            severity, _, name = key.partition(": ")
+            findings.append(Finding(name, severity, text))  # type: ignore[arg-type]
+        else:
+            provenance[key] = text
+    culture = _culture_of(metadata)
+    return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}
+
+
+def _is_finding(key: str) -> bool:
+    severity, colon, _ = key.partition(": ")
+    return bool(colon) and severity in get_args(Severity)
+
+
+_KINDS = {
+    "virtual culture": ("virtual", "seed"),
+    "CL1": ("cl1", "pattern_seed"),
+    "MaxOne by animat": ("maxone", ""),
+    "replay of recordings": ("replay", ""),
+}
+"""How the source in a file begins, and the kind of culture and the key of its seed that this means."""
+
+
+def _culture_of(metadata: Mapping[str, str]) -> RecordedCulture | None:
+    source = metadata.get("source", "")
+    for beginning, (kind, key) in _KINDS.items():
+        if source.startswith(beginning):
+            seed = metadata.get(key, "")
+            known = int(seed) if seed.isdecimal() and len(seed) <= 20 else None
+            return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source)
+    return None
