@@ -374,9 +374,9 @@ def test_an_amplifier_that_is_mostly_saturated_is_blanked_wherever_pieces_begin(
     for start_s in pulses[2:30:5]:
         is_railed[round(start_s * RATE_HZ) : round((start_s + 0.65) * RATE_HZ)] = True
     voltage[is_railed, 1] = 32_000
-    source = RawTraces.of_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
+    source = RawTraces.from_array(voltage, channels(4), RATE_HZ, uv_per_step=0.1)
     for chunk_s in (0.2, 0.5, 20.0):
-        found = find_spikes(source, pulses, Detection(chunk_s=chunk_s))
+        found = detect_spikes(source, pulses, Detection(chunk_s=chunk_s))
         on_it = np.rint(found.time_s[found.channel == 1] * RATE_HZ).astype(np.int64)
         assert not np.any(is_railed[on_it])
         assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1

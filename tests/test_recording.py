@@ -10,9 +10,9 @@ import pytest
 
 from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding, merged
+from animat.recordings.metadata import from_metadata, to_metadata
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Channels, RecordedCulture, Recording
-from animat.recordings.metadata import from_metadata, to_metadata
 from animat.stimulation.protocol import PAPER, Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN

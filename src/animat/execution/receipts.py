@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from animat.errors import AnimatError, InvalidFile
-from animat.recordings.recording import Recording
 from animat.recordings.metadata import to_metadata
+from animat.recordings.recording import Recording
 from animat.writing import write_whole
 
 

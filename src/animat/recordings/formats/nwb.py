@@ -32,8 +32,8 @@ from animat.recordings.formats.nwb_layout import (
     UNITS_TABLE,
 )
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
-from animat.recordings.recording import Channels, Recording
 from animat.recordings.metadata import from_metadata
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN

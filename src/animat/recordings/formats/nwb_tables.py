@@ -17,8 +17,8 @@ from pynwb.misc import Units
 
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
-from animat.recordings.recording import Channels, Recording
 from animat.recordings.metadata import to_metadata
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
