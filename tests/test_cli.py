@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from animat.cli import COMMANDS, main
-from animat.cli.responses import say_findings
+from animat.cli.responses import print_warnings
 from animat.cli.train import Train
 from animat.coding.mapping import Thresholds
 from animat.cultures.series import Series
@@ -225,7 +225,7 @@ def test_recordings_that_were_there_already_are_said_to_be(
         return Series([*folder.iterdir()], [])
 
     monkeypatch.setattr("animat.cultures.series.record_series", recorded)
-    for were_there in ("", "; all were there already"):
+    for were_there in ("", "; all existed already"):
         assert main(["record", "--out", str(tmp_path / "out")]) == 0
         assert capsys.readouterr().out == f"1 recording in {tmp_path / 'out'}{were_there}\n"
 
@@ -452,7 +452,7 @@ BAD = {
     "no recordings to run by": (
         nothing,
         ["run", "{policies}", "--out", "{folder}/session"],
-        ["animat: --recordings: expected those that the policies were trained on, got none: record first with"],
+        ["animat: --recordings: expected those that the policies were trained on, got none: make some with"],
     ),
     "another training's folder": (
         other_robot,
@@ -541,7 +541,7 @@ BAD = {
     "a folder of others' recordings": (
         lambda folder, *_: (folder / "mine.nwb").write_text("x"),
         ["record", "--out", "{folder}"],
-        ["expected no recordings but those of this series, got mine.nwb; choose another --out"],
+        ["expected only recordings of this series, got mine.nwb; choose another --out"],
     ),
     "a file for a folder": (
         lambda folder, *_: (folder / "taken").write_text("x"),
@@ -726,7 +726,7 @@ def test_an_error_of_an_argument_begins_with_its_option(
         (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
         (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),
         (["train", "cartpole", "pole"], 2, ["animat: unexpected argument 'pole'; see animat train --help"]),
-        (["train", "--robot", "pole"], 2, ["animat: robot: expected its value alone, got --robot before it; see"]),
+        (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
         (["train", "--window-ms", "2"], 2, ["animat: --window-ms: expected two numbers, got '2'; see animat train"]),
         (["trian"], 2, ["train, evaluate", "got 'trian'; did you mean train?"]),
@@ -816,7 +816,7 @@ def test_what_went_wrong_besides_is_told_too(
 
 def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
     found = [Finding("binning", "warning", f"at {m} min: lost", m / 100) for m in (0, 20, 10)]
-    say_findings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
+    print_warnings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
     assert capsys.readouterr().err.splitlines() == [
         "warning: at 20 min: lost (and 2 more like it)",
         "warning: 12 only",
@@ -830,7 +830,7 @@ def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture
 def test_the_worst_of_several_warnings_is_told(
     name: str, values: tuple[float, ...], worst: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    say_findings([Finding(name, "warning", f"it is {value}", value) for value in values])
+    print_warnings([Finding(name, "warning", f"it is {value}", value) for value in values])
     assert capsys.readouterr().err.startswith(f"warning: it is {worst} (and ")
 
 

@@ -718,7 +718,7 @@ def test_killed_during_a_long_presentation_the_log_has_what_was_asked(
     assert told["unanswered_pulses"] == 4
     assert len(session.outline.unanswered[0]["stimuli"][0][3]) == 2
     assert main(["recover", str(tmp_path)]) == 0
-    assert "4 pulses were asked for and never answered" in capsys.readouterr().out
+    assert "4 pulses were requested and never answered" in capsys.readouterr().out
     assert_read_alike(tmp_path, loop_of(pulses=4))
 
 

@@ -108,7 +108,7 @@ def test_an_import_that_does_not_end_is(tmp_path: Path, monkeypatch) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
     ("module", "kept"),
-    [("tyro", ""), ("jax._src.interpreters.mlir", "; what was finished is kept; start again to go on")],
+    [("tyro", ""), ("jax._src.interpreters.mlir", "; finished work is kept; run it again to resume")],
 )
 def test_a_command_that_still_imports_ends_in_a_line(
     module: str, kept: str, number: signal.Signals, tmp_path: Path
@@ -161,7 +161,7 @@ def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, cap
     monkeypatch.setattr("animat.cultures.series.record_series", killed)
     before = signal.getsignal(signal.SIGTERM)
     assert animat(["record", "--out", str(tmp_path / "recordings")]) == 130
-    assert capsys.readouterr().err.endswith("animat: interrupted; what was finished is kept; start again to go on\n")
+    assert capsys.readouterr().err.endswith("animat: interrupted; finished work is kept; run it again to resume\n")
     assert signal.getsignal(signal.SIGTERM) is before
 
 
@@ -172,7 +172,7 @@ def test_an_interrupted_session_is_told_to_be_no_start_for_another(tmp_path, mon
     monkeypatch.setattr("animat.cli.run.Run.run", interrupted)
     command = ["run", "policies", "--out", str(tmp_path)]
     assert animat(command) == 130
-    assert capsys.readouterr().err == "animat: interrupted; what was finished is kept\n"
+    assert capsys.readouterr().err == "animat: interrupted; finished work is kept\n"
     (tmp_path / "session.log").touch()
     assert animat(command) == 130
     told = capsys.readouterr().err

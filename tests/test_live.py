@@ -573,7 +573,7 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     told = json.loads(printed[-1])
     assert printed[0].startswith("2 recordings in 10 min of the culture's clock (")
     assert printed[0].endswith("1 swaps of simulators:")
-    assert f"{told['iterations']:,} iterations of each policy, never stopped" in printed[0]
+    assert f"{told['iterations']:,} iterations of each policy without a pause" in printed[0]
     assert "policies p0 to p1 after" in printed[1]
     assert "the recording at 5.2 min" in printed[1]
     assert any(line.split()[:1] == ["random"] for line in printed)
@@ -585,5 +585,5 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     # Everything is told of one that fails in the loop too, and then it is an error.
     assert main([*given, "--out", str(tmp_path / "failed")]) == 1
     printed_too = capsys.readouterr()
-    assert "the session ended before its plan was done: the culture raised DeviceFailed: gone" in printed_too.err
+    assert "the session ended before its plan was completed: the culture raised DeviceFailed: gone" in printed_too.err
     assert printed_too.out.startswith("2 recordings in 10 min")

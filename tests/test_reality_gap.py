@@ -747,7 +747,7 @@ class TestCommand:
         printed = capsys.readouterr()
         assert "session.nwb: cannot be written" in printed.err
         assert "animat recover" in printed.err
-        assert "is its recording" not in printed.out
+        assert f"recording: {folder}" not in printed.out
 
     def test_a_polite_kill_closes_the_culture(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def kill(culture: FakeCulture, observed: Observed) -> Observed:
@@ -779,7 +779,7 @@ class TestCommand:
             "animat: fake: expected it to close, got ConnectionResetError: the device is gone"
         )
         assert "random" in printed.out
-        assert "is its recording" in printed.out
+        assert f"recording: {folder}" in printed.out
 
     @pytest.mark.oracle
     def test_other_electrodes_than_in_the_recordings_are_told(

@@ -135,7 +135,7 @@ def recorded_by(series: Path, folder: Path, *pulses: Pulse | None) -> Path:
     return folder
 
 
-OTHERS, WEAK = " as the others had", Pulse((Phase(200, amplitude_mv=-100), Phase(200, amplitude_mv=100)))
+OTHERS, WEAK = " as in the other recordings", Pulse((Phase(200, amplitude_mv=-100), Phase(200, amplitude_mv=100)))
 USUAL = " the usual one on a virtual"
 
 

@@ -101,7 +101,7 @@ def test_a_damaged_log_is_not_written_over_what_holds_more(tmp_path: Path, capsy
     for file in files:
         file.unlink()
     assert main(["recover", str(tmp_path / "session")]) == 0
-    assert "from where it is torn or damaged on, are lost" in capsys.readouterr().out
+    assert "from where it is torn or damaged, are lost" in capsys.readouterr().out
     assert len(session.ticks_file.read_bytes()) < len(before[0])
     # What was recovered is no less than what the log has: it is recovered again.
     assert main(["recover", str(tmp_path / "session")]) == 0

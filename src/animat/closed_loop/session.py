@@ -237,16 +237,16 @@ def _expect_no_less(session: Session) -> None:
         )
 
 
-def told_lost(lost_bytes: int) -> str:
-    """What a log that is torn or damaged lacks, in a sentence."""
-    return f"{lost_bytes} bytes of the log, from where it is torn or damaged on, are lost"
+def lost_message(lost_bytes: int) -> str:
+    """A sentence about what is missing from a torn or damaged log."""
+    return f"{lost_bytes} bytes of the log, from where it is torn or damaged, are lost"
 
 
-def told_unanswered(session: Session) -> str:
-    """What is to be known of pulses that were never answered, in a sentence."""
+def unanswered_message(session: Session) -> str:
+    """A sentence about pulses that were never answered."""
     n = session.outline.unanswered_pulses
-    pulses, them = ("1 pulse was", "it") if n == 1 else (f"{n} pulses were", "them")
+    pulses, they = ("1 pulse was", "it was") if n == 1 else (f"{n} pulses were", "they were")
     return (
-        f"{pulses} asked for and never answered: whether the culture got {them} is not known; {LOG_FILE} has times and "
-        "electrodes"
+        f"{pulses} requested and never answered: whether {they} delivered is not known; times and electrodes are in "
+        f"{LOG_FILE}"
     )
