@@ -725,7 +725,7 @@ class TestCommand:
         assert self.command(folder, "--controls", "random") == 0
         before = (folder / "session" / "session.log").read_bytes()
         assert self.command(folder) == 1
-        assert "a session is there already; choose another folder" in capsys.readouterr().err
+        assert "expected no session, got one; choose another folder" in capsys.readouterr().err
         assert (folder / "session" / "session.log").read_bytes() == before
 
     def test_of_a_session_that_was_killed_it_says_how_to_recover_it_and_touches_nothing(

@@ -94,7 +94,7 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     of_each = loop.decoder.percentiles_shape[:-1]
     nothing, commands = np.full(of_each, np.nan).tolist(), []
     read_hz: list[Sequence[float]] = []
-    for words in session.log.records.words():
+    for words in session.log.records.fields():
         tick = words.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
