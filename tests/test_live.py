@@ -448,8 +448,8 @@ def test_a_folder_with_an_earlier_live_run_is_refused_in_a_line(left: str, tmp_p
     with pytest.raises(Mismatch) as refused:
         check_plan(ONE, PROTOCOL, tmp_path, QUICK, 1, {})
     assert str(refused.value) == (
-        f"{tmp_path}: expected an empty folder for a live run, got one with files; choose another, or see what is "
-        f"there: animat watch {tmp_path}"
+        f"{tmp_path}: expected an empty folder for a live run, got one with files; choose another, or see what it "
+        f"holds: animat watch {tmp_path}"
     )
 
 

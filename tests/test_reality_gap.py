@@ -735,7 +735,7 @@ class TestCommand:
         session.mkdir()
         (session / "session.log").write_bytes(b"what a killed program left")
         assert self.command(folder) == 1
-        assert f"`animat recover {session}` does it; choose another folder" in capsys.readouterr().err
+        assert f"use `animat recover {session}`; choose another folder" in capsys.readouterr().err
         assert [file.name for file in session.iterdir()] == ["session.log"]
 
     def test_a_recording_that_could_not_be_written_is_an_error(

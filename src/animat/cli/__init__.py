@@ -222,8 +222,8 @@ def _parse(arguments: list[str]) -> Command:
     except SystemExit as stop:
         if not stop.code:
             raise
-        before = itertools.takewhile(lambda argument: argument != "--", arguments)
-        _expect_known([word for word in before if word[:2] == "--" and _plain(word) not in options], options, see)
+        leading = itertools.takewhile(lambda argument: argument != "--", arguments)
+        _expect_known([word for word in leading if word[:2] == "--" and _plain(word) not in options], options, see)
         for option, value in itertools.pairwise([*arguments, "--"]):
             if value.startswith("--") and not isinstance(options.get(option.replace("_", "-"), False), bool):
                 raise InvalidArgument(f"{option}: expected a value after it, got none{see}") from None

@@ -88,12 +88,12 @@ class Live(StimulationOptions):
             raise InvalidArgument(f"--speed: expected 1, as a living culture runs in real time, got {self.speed:g}")
         if (self.culture == "replay") != bool(self.recordings):
             raise InvalidArgument(
-                f"--recordings: expected some for --culture replay and none for others, got {len(self.recordings)} for "
+                f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
                 f"{self.culture}: a live run records the culture itself"
             )
         self._expect_culture_seed()
-        default_speed = 30.0 if simulated else 1.0
-        timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
+        speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
+        timetable = Timetable(self.interval_min, self.duration_min, speed)
         robot = robot_named(self.robot)
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         training = Training(

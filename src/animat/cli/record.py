@@ -62,25 +62,20 @@ class Record:
         """Record."""
         from animat.progress import Bar
 
-        if (self.culture == "replay") != bool(self.recordings):
-            raise InvalidArgument(
-                "--recordings: expected some for --culture replay, got none"
-                if self.culture == "replay"
-                else f"--recordings: expected none for --culture {self.culture}, got {len(self.recordings)}"
-            )
-        if (self.culture == "maxone") != (self.selection is not None):
-            raise InvalidArgument(
-                "--selection: expected a file of electrodes for --culture maxone, got none"
-                if self.culture == "maxone"
-                else f"--selection: expected none for --culture {self.culture}, got {self.selection}"
-            )
         # Before any device is powered.
+        for option, some, kind, value in (
+            ("--recordings", "some", "replay", len(self.recordings) or None),
+            ("--selection", "a file of electrodes", "maxone", self.selection),
+        ):
+            if (self.culture == kind) != (value is not None):
+                expected, got = (some, "none") if value is None else ("none", value)
+                raise InvalidArgument(f"{option}: expected {expected} for --culture {self.culture}, got {got}")
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        asked = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
-        asked += ["--paper"] if self.paper else []
-        if asked and self.protocol is not None:
-            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them in the file")
+        options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
+        options += ["--paper"] if self.paper else []
+        if options and self.protocol is not None:
+            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(options)} too; put them in the file")
         protocol = self._protocol()
         if self.protocol is not None:
             _warn_too_fast(protocol)
@@ -113,7 +108,7 @@ class Record:
             # A virtual culture has the usual number of patterns.
             self._protocol() if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
             self.out,
-            sessions=self._sessions,
+            sessions=(15 if self.paper else 2) if self.sessions is None else self.sessions,
             interval_min=self.interval_min,
             seed=self.seed,
             progress=progress,
@@ -121,12 +116,6 @@ class Record:
         for minute in series.missed_min:
             print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
         return series.files
-
-    @property
-    def _sessions(self) -> int:
-        if self.sessions is not None:
-            return self.sessions
-        return 15 if self.paper else 2
 
     def _protocol(self, patterns: int = 100) -> Protocol:
         """The protocol of the options, with the usual values for the culture's kind and number of patterns."""
@@ -138,9 +127,9 @@ class Record:
         usual = replace(PAPER if self.paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
-        asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
-        asked["places"] = None if self.places is None else read_places(self.places)
-        protocol = replace(usual, **{name: value for name, value in asked.items() if value is not None})
+        options = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
+        options["places"] = None if self.places is None else read_places(self.places)
+        protocol = replace(usual, **{name: value for name, value in options.items() if value is not None})
         if self.trials is not None or self.paper:
             return protocol
         # Fewer with several pulses or more conditions: the recording takes as long, and ends before the next is due.

@@ -276,6 +276,6 @@ def _conditions(recordings: Sequence[Recording], first: Policy) -> Conditions | 
     if not first.conditions or any(condition.unit != "Hz" for condition in first.conditions):
         return None
     picked = ByFrequency(tuple(condition.value for condition in first.conditions))
-    every = range(len(picked.values_hz))
+    every = set(range(len(picked.values_hz)))
     # If one is missing, an error about the recordings' own conditions is clearer.
-    return picked if all(set(every) <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None
+    return picked if all(every <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None
