@@ -302,7 +302,7 @@ def test_the_warm_up_and_the_settling_count(recorded: Responses, adjusted: Adjus
 
 
 def test_what_thresholds_cannot_start_from_is_refused(recorded: Responses, adjusted: AdjustedRanks) -> None:
-    for wrong, changed, told in (
+    for wrong, changed, message in (
         (adjusted, {"conditions": CONDITIONS[:4]}, "expected responses to each of 4 conditions, .* got \\[40, 37"),
         (
             replace(adjusted, ranks=(*adjusted.ranks[:4], adjusted.ranks[4][:0])),
@@ -312,7 +312,7 @@ def test_what_thresholds_cannot_start_from_is_refused(recorded: Responses, adjus
         (replace(adjusted, slopes=np.zeros((2, 2))), {}, r"the loop's number of readouts \(1\), got .* in 2"),
         (adjusted.responses_hz, {}, "adaptive_from: expected calibration.adjusted, got tuple"),
     ):
-        with pytest.raises(InvalidArgument, match=told):
+        with pytest.raises(InvalidArgument, match=message):
             loop_of(adaptive_from=wrong, **changed)
     other = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY)).remembering
     with pytest.raises(InvalidArgument, match=r"remembering: expected adaptive_from\.remembering"):

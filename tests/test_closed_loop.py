@@ -200,7 +200,7 @@ def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Ro
             agents,
             tmp_path,
             episodes=3,
-            progress=SimpleNamespace(update=lambda *told: said.append(told)),
+            progress=SimpleNamespace(update=lambda *shown: said.append(shown)),
         )
     last = [tick for tick in session.ticks if tick.episode == 5 and tick.reward is not None]
     returns = [[sum(t.reward or 0.0 for t in session.ticks if t.episode == i)] for i in range(6)]
@@ -429,7 +429,7 @@ def test_a_culture_settles_before_the_first_episode(tmp_path: Path) -> None:
     )
 
 
-def test_what_is_told_of_a_session_before_its_first_move() -> None:
+def test_the_note_of_a_session_before_its_first_move() -> None:
     standing = Standing(6)
     assert standing.note() == "warm-up"
     standing.begin("p0")
@@ -626,7 +626,7 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
     assert lasted[1] > lasted[-1] + 10
 
 
-def test_what_the_device_left_out_is_told(tmp_path: Path) -> None:
+def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
     class Losing(FakeCulture):
         @property
         def left_out(self) -> dict[str, int]:
@@ -647,7 +647,7 @@ def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
         episodes = [episode.number for episode in session.episodes if episode.agent == name]
         chosen = [{tick.chosen for tick in session.ticks if tick.episode == number} for number in episodes]
         assert chosen == [{0}, {1}, {2}, {0}, {1}]
-    assert [told.get("in_turn") for told in session.log.header["agents"]] == [None, *[["p0", "p1", "p2"]] * 2]
+    assert [agent.get("in_turn") for agent in session.log.header["agents"]] == [None, *[["p0", "p1", "p2"]] * 2]
 
 
 def test_a_budget_is_kept_to_the_pulse() -> None:

@@ -153,7 +153,7 @@ def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str
 
 
 class Gone(FakeCulture):
-    """Its clock answers so many times, then does what it is told."""
+    """Its clock answers so many times, then fails as requested."""
 
     def __init__(self, then: Callable[[], Any], left: int = 60) -> None:
         super().__init__()
@@ -274,7 +274,7 @@ def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace:
 
 
 @pytest.mark.parametrize("how", ["raises", "hangs"])
-def test_a_culture_that_cannot_be_stopped_is_told(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_culture_that_cannot_stop_is_reported(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
     monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
 
@@ -337,7 +337,7 @@ def test_a_backend_that_hangs(tmp_path: Path, little_grace: None) -> None:
 
 
 class FakeClock:
-    """A clock that moves when it is waited for, or told."""
+    """A clock that moves when a sleeper waits for it, or when it is moved."""
 
     def __init__(self) -> None:
         self.time_s = 100.0
@@ -665,17 +665,17 @@ def test_killed_outright_it_loses_at_most_a_second(tmp_path: Path) -> None:
         [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
     )
     assert process.stdout is not None
-    told = []
-    while len(told) < 2 or told[-1][1] - told[0][1] < 2.0:
+    written = []
+    while len(written) < 2 or written[-1][1] - written[0][1] < 2.0:
         number, at_s = process.stdout.readline().split()
-        told.append((int(number), float(at_s)))
+        written.append((int(number), float(at_s)))
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
     session = read_session(tmp_path)
     assert session.ending.by == "crash"
     # What was done a second before the last sign of life is there, whatever came after it.
-    done = max(number for number, at_s in told if at_s < told[-1][1] - 1.0)
+    done = max(number for number, at_s in written if at_s < written[-1][1] - 1.0)
     assert session.outline.ticks >= done - 1 > 20
     with pytest.raises(InvalidFile):
         read_recording(tmp_path / "session.nwb")
@@ -713,9 +713,9 @@ def test_killed_during_a_long_presentation_the_log_has_what_was_asked(
     process.wait()
     process.stdout.close()
     session = recover_session(tmp_path)
-    told = session.to_dict()
-    assert told["pulses"] + told["unanswered_pulses"] == pulses == 8 * 4
-    assert told["unanswered_pulses"] == 4
+    summary = session.to_dict()
+    assert summary["pulses"] + summary["unanswered_pulses"] == pulses == 8 * 4
+    assert summary["unanswered_pulses"] == 4
     assert len(session.outline.unanswered[0]["stimuli"][0][3]) == 2
     assert main(["recover", str(tmp_path)]) == 0
     assert "4 pulses were requested and never answered" in capsys.readouterr().out

@@ -96,7 +96,9 @@ class Driver:
     @property
     def unfinished(self) -> Record | None:
         """The record of a response that has not moved the robot yet: to be logged if it never does."""
-        return None if self._unfinished is None else stretch_record(*self._unfinished)
+        # Read once, as the loop's thread may clear it meanwhile.
+        unfinished = self._unfinished
+        return None if unfinished is None else stretch_record(*unfinished)
 
     def stopped_by_file(self) -> Ending | None:
         """The ending if a person created the stop file."""
@@ -294,7 +296,7 @@ class Driver:
         except Exception as error:
             raise Stop(Ending("robot", f"the robot raised {in_words(error)}")) from error
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
-            raise Stop(Ending("robot", f"the robot came to {moved.observation.tolist()} with reward {moved.reward:g}"))
+            raise Stop(Ending("robot", f"the robot returned {moved.observation.tolist()} with reward {moved.reward:g}"))
         return {
             "handled": handled,
             "command": self._last_command,
