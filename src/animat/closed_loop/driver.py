@@ -97,8 +97,7 @@ class Driver:
     def unfinished(self) -> Record | None:
         """The record of a response that has not moved the robot yet: to be logged if it never does."""
         # Read once, as the loop's thread may clear it meanwhile.
-        unfinished = self._unfinished
-        return None if unfinished is None else stretch_record(*unfinished)
+        return None if (unfinished := self._unfinished) is None else stretch_record(*unfinished)
 
     def stopped_by_file(self) -> Ending | None:
         """The ending if a person created the stop file."""
@@ -224,8 +223,7 @@ class Driver:
         late_s = float(np.max(pulse_time_s - due_at_s))
         late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
         drawn_from = None if is_warm_up else agent.drawn_from
-        response = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
-        is_burst = response.is_burst
+        x_hz, fields, is_burst = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {
@@ -247,7 +245,7 @@ class Driver:
             "truncated": False,
             "late_s": late_s,
             "decided_s": decided_s,
-            **response.fields,
+            **fields,
         }
         self._n_presented += 1
         came = self._remembered
@@ -264,17 +262,15 @@ class Driver:
             if late_s and loop.on_late == "stop":
                 raise Stop(Ending("lateness", f"a pulse came {1000 * late_s:.3g} ms late, and on_late is stop"))
             if not (again or is_warm_up):
-                tick |= self._move(agent, response.x_hz, is_burst, iteration)
+                tick |= self._move(agent, x_hz, is_burst, iteration)
             if self._adaptive is not None and stimuli and (agent.calibrates or is_warm_up) and not is_burst:
-                self._adaptive.add(delivered, came, np.asarray(response.x_hz))
+                self._adaptive.add(delivered, came, np.asarray(x_hz))
                 self._percentiles = self._adaptive.percentiles()
                 adapted["percentiles_hz"] = self._percentiles.tolist()
         finally:
             # Whatever happens to the robot, the culture's response is logged.
             finished = Tick(**tick)
-            record = stretch_record(stretch, stimuli, vars(finished))
-            record.fields.update(adapted)
-            self.records.append(record)
+            self.records.append(stretch_record(stretch, stimuli, vars(finished), **adapted))
             self._unfinished = None
         return finished, again
 

@@ -65,10 +65,10 @@ def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
 
 
-def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
+def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None, **more: Any) -> Record:
     """The log record of a stretch of time."""
     span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
+    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick, **more}
     return Record(fields, stretch.spike_times_s, stretch.spike_channels)
 
 
