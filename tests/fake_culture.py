@@ -1,4 +1,4 @@
-"""A small culture on the contract that answers as it is told, and fails as it is told: for tests of the closed loop."""
+"""A small culture on the contract that answers and fails on request, for tests of the closed loop."""
 
 from __future__ import annotations
 

@@ -230,21 +230,21 @@ def adapted(session: Session, recorded: Responses, adjusted: AdjustedRanks, coun
     percentiles = percentiles_of(adjusted).astype(np.float32)
     answered, trace, load, before_s = list[Answered](), 0.0, 0.0, -np.inf
     for record in session.log.records:
-        tick = session_tick(record.words)
+        tick = session_tick(record.fields)
         if tick is None:
             continue
         if tick.command is not None:
             assert tick.command == float(Thresholds(9).command(np.float32(tick.rate_hz), percentiles))
-        assert ("percentiles_hz" in record.words) == (counts(tick) and not tick.is_burst)
+        assert ("percentiles_hz" in record.fields) == (counts(tick) and not tick.is_burst)
         if not tick.patterns:
             continue
         first_s, last_s = tick.pulse_time_s[0], tick.read_after_s
         trace = 0.0 if first_s - before_s > 1.0 else trace
         load = load * np.exp((before_s - last_s) / m.load_s) if m.load_s else 0.0
-        if "percentiles_hz" in record.words:
+        if "percentiles_hz" in record.fields:
             explained = float(np.array([trace, load]) @ adjusted.slopes[:, 0])
             answered.append((tick.delivered, tick.rate_hz, explained))
-            percentiles = np.float32(record.words["percentiles_hz"])
+            percentiles = np.float32(record.fields["percentiles_hz"])
             again = thresholds_after(recorded_hz, answered, recorded_ranks=list(adjusted.ranks))
             np.testing.assert_allclose(percentiles, again, rtol=1e-5)
         rank = percentileofscore(adjusted.sorted_hz, tick.rate_hz, kind="mean") / 100
@@ -302,17 +302,17 @@ def test_the_warm_up_and_the_settling_count(recorded: Responses, adjusted: Adjus
 
 
 def test_what_thresholds_cannot_start_from_is_refused(recorded: Responses, adjusted: AdjustedRanks) -> None:
-    for wrong, changed, told in (
+    for wrong, changed, message in (
         (adjusted, {"conditions": CONDITIONS[:4]}, "expected responses to each of 4 conditions, .* got \\[40, 37"),
         (
             replace(adjusted, ranks=(*adjusted.ranks[:4], adjusted.ranks[4][:0])),
             {},
             "each of 5 conditions, .* 0\\] in 1",
         ),
-        (replace(adjusted, slopes=np.zeros((2, 2))), {}, r"as the loop has \(1\), got .* in 2"),
+        (replace(adjusted, slopes=np.zeros((2, 2))), {}, r"the loop's number of readouts \(1\), got .* in 2"),
         (adjusted.responses_hz, {}, "adaptive_from: expected calibration.adjusted, got tuple"),
     ):
-        with pytest.raises(InvalidArgument, match=told):
+        with pytest.raises(InvalidArgument, match=message):
             loop_of(adaptive_from=wrong, **changed)
     other = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY)).remembering
     with pytest.raises(InvalidArgument, match=r"remembering: expected adaptive_from\.remembering"):

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from animat.cli import COMMANDS, main
-from animat.cli.responses import say_findings
+from animat.cli.responses import print_warnings
 from animat.cli.train import Train
 from animat.coding.mapping import Thresholds
 from animat.cultures.series import Series
@@ -100,14 +100,14 @@ def test_the_live_page_has_what_returns_are_compared_with(
     evaluated = last_json(capsys.readouterr().out)
     assert json.loads(out.read_text()) == evaluated
     returns = {row["name"]: row["mean_return"] for row in evaluated["rows"]}  # type: ignore[attr-defined]
-    # The random actions of 100 episodes on the first simulator are those that training told.
+    # The random actions of 100 episodes on the first simulator are those that training reported.
     assert returns["random"] == manifest["random_return"]
     assert levels_in(folder) == [
         ("random actions", returns["random"]),
         ("best coupling", returns["coupling"]),
         ("optimal return", evaluated["optimum"]["value"]),  # type: ignore[index]
     ]
-    # A training that goes on tells it as before.
+    # A resumed training reports it as before.
     assert main(["train", "cartpole", "--recordings", str(recordings), *QUICK, "--out", str(folder)]) == 0
     assert json.loads((folder / "training.json").read_text()) == manifest
     capsys.readouterr()
@@ -162,13 +162,13 @@ def levels_in(folder: Path) -> list[tuple[str, float]]:
 def test_settings_of_the_algorithm_are_those_that_policies_are_trained_with(recordings: Path, tmp_path: Path) -> None:
     few = ["--policies", "1", "--iterations", "640", "--sac", "discount=0.9", "hidden=8", "environments=16"]
     assert main(["train", "cartpole", "--recordings", str(recordings), *few, "--out", str(tmp_path)]) == 0
-    told = json.loads((tmp_path / "training.json").read_text())["training"]["algorithm"]
-    assert told == asdict(SAC(discount=0.9, hidden=8, environments=16))
+    settings = json.loads((tmp_path / "training.json").read_text())["training"]["algorithm"]
+    assert settings == asdict(SAC(discount=0.9, hidden=8, environments=16))
     assert [w.shape for w in Policy.load(tmp_path / "p0.safetensors").weights] == [(4, 8), (8, 8), (8, 5)]
 
 
 @pytest.mark.oracle
-def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_finished_one_is_told(
+def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_finished_one_is_reported(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     again = ["train", "cartpole", "--recordings", str(recordings), *QUICK, "--out", str(policies)]
@@ -201,9 +201,9 @@ def test_the_whole_way(recordings: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert len(last_json(printed)["recordings"]) == 2 and "there already" not in printed  # type: ignore[arg-type]
 
     assert main(["inspect", str(series), "--out", str(figures), "--json"]) == 0
-    told = last_json(capsys.readouterr().out)["recordings"]
-    assert [r["stimuli"] for r in told] == [500, 500]  # type: ignore[attr-defined, index]
-    assert all(Path(figure).is_file() for r in told for figure in r["figures"])  # type: ignore[attr-defined, index]
+    results = last_json(capsys.readouterr().out)["recordings"]
+    assert [r["stimuli"] for r in results] == [500, 500]  # type: ignore[attr-defined, index]
+    assert all(Path(figure).is_file() for r in results for figure in r["figures"])  # type: ignore[attr-defined, index]
 
     train = ["train", "cartpole", "--recordings", str(series), *QUICK, "--out", str(trained)]
     assert main([*train, "--json"]) == 0
@@ -211,9 +211,9 @@ def test_the_whole_way(recordings: Path, tmp_path: Path, capsys: pytest.CaptureF
 
     evaluate = ["evaluate", str(trained), "--recordings", str(series), "--at-min", "0"]
     assert main([*evaluate, "--json"]) == 0
-    told = last_json(capsys.readouterr().out)
-    assert told["recorded_at_min"] == 0.0
-    assert set(told["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
+    results = last_json(capsys.readouterr().out)
+    assert results["recorded_at_min"] == 0.0
+    assert set(results["policies"]) == {"p0", "p1"}  # type: ignore[call-overload]
 
 
 def test_recordings_that_were_there_already_are_said_to_be(
@@ -225,7 +225,7 @@ def test_recordings_that_were_there_already_are_said_to_be(
         return Series([*folder.iterdir()], [])
 
     monkeypatch.setattr("animat.cultures.series.record_series", recorded)
-    for were_there in ("", "; all were there already"):
+    for were_there in ("", "; all existed already"):
         assert main(["record", "--out", str(tmp_path / "out")]) == 0
         assert capsys.readouterr().out == f"1 recording in {tmp_path / 'out'}{were_there}\n"
 
@@ -257,12 +257,12 @@ def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "3"]
     assert main([*command, "--interventions", "--json"]) == 0
     said = capsys.readouterr().out
-    told: dict[str, Any] = last_json(said)["whose_work"]  # type: ignore[assignment]
-    names = [row["name"] for row in told["rows"]]
+    results: dict[str, Any] = last_json(said)["whose_work"]  # type: ignore[assignment]
+    names = [row["name"] for row in results["rows"]]
     changed = ["ideal actuator", "random spikes", "silent", "shuffled", "yoked", "turned round"]
     assert names == ["as they are", *changed]
     of_each = last_json(said)["policies"].values()  # type: ignore[attr-defined]
-    assert told["rows"][0]["mean_return"] == pytest.approx(np.mean(list(of_each)))
+    assert results["rows"][0]["mean_return"] == pytest.approx(np.mean(list(of_each)))
     assert "whose work is it: the same policies" in said and "the robot has only one goal" in said
     assert main([*command[:2], "--episodes", "2", "--interventions"]) == 1
 
@@ -275,17 +275,17 @@ def test_evaluate_tells_the_optimum_of_the_recording_it_evaluates_on(
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0"]
     assert main([*command, "--optimum", "--json"]) == 0
     said = capsys.readouterr().out
-    told: dict[str, Any] = last_json(said)
+    results: dict[str, Any] = last_json(said)
     assert asked == [1.0]
     simulator = fit_timeline(extract_series(read_recordings([recordings]))).at(0.0)
     direct = best_return(Animat(Cartpole(), Thresholds(9), 5), simulator, resolution=0.25, episodes=0)
-    interval = told["optimum"].pop("interval")
+    interval = results["optimum"].pop("interval")
     assert interval["low"] <= interval["value"] == direct.value <= interval["high"]
-    assert told["optimum"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
+    assert results["optimum"] == {k: v for k, v in direct.to_dict().items() if k != "interval"} | {"left_out": []}
     assert f"optimal return {direct.value:.1f}, 95 % interval {interval['low']:.1f} to" in said
-    means = {row["name"]: row["mean_return"] for row in told["rows"]}
+    means = {row["name"]: row["mean_return"] for row in results["rows"]}
     score = (means["policies"] - means["random"]) / (direct.value - means["random"])
-    assert told["rows"][0]["normalised_score"] == pytest.approx(score)
+    assert results["rows"][0]["normalised_score"] == pytest.approx(score)
 
 
 def test_one_of_several_recordings_in_a_file_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -322,9 +322,9 @@ def test_too_little_memory_is_one_line(
 
     monkeypatch.setattr("animat.evaluation.table.roll_out", roll_out)
     assert main(["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "2"]) == 1
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told.startswith("animat: out of memory") and told.endswith(": ask for fewer episodes (--episodes 2)")
-    assert ("9 bytes" in told) == bool(str(error))
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("animat: out of memory") and message.endswith(": ask for fewer episodes (--episodes 2)")
+    assert ("9 bytes" in message) == bool(str(error))
 
 
 def nothing(folder: Path, recordings: Path, policies: Path) -> None:
@@ -452,7 +452,7 @@ BAD = {
     "no recordings to run by": (
         nothing,
         ["run", "{policies}", "--out", "{folder}/session"],
-        ["animat: --recordings: expected those that the policies were trained on, got none: record first with"],
+        ["animat: --recordings: expected those that the policies were trained on, got none: make some with"],
     ),
     "another training's folder": (
         other_robot,
@@ -541,7 +541,7 @@ BAD = {
     "a folder of others' recordings": (
         lambda folder, *_: (folder / "mine.nwb").write_text("x"),
         ["record", "--out", "{folder}"],
-        ["expected no recordings but those of this series, got mine.nwb; choose another --out"],
+        ["expected only recordings of this series, got mine.nwb; choose another --out"],
     ),
     "a file for a folder": (
         lambda folder, *_: (folder / "taken").write_text("x"),
@@ -648,9 +648,9 @@ def test_inspect_goes_on_after_a_file_that_cannot_be_read(
     assert "2 of 4 files could not be inspected" in lines[2]
     assert said.out.count("usable") == 2
     assert main(["inspect", str(folder), "--json"]) == 1
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert len(told["recordings"]) == 2
-    assert told["unreadable"] == [str(folder / "a.nwb"), str(folder / "z_spikes.csv")]
+    results = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert len(results["recordings"]) == 2
+    assert results["unreadable"] == [str(folder / "a.nwb"), str(folder / "z_spikes.csv")]
 
 
 def test_inspect_that_can_read_none_says_nothing_of_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -726,7 +726,7 @@ def test_an_error_of_an_argument_begins_with_its_option(
         (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
         (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),
         (["train", "cartpole", "pole"], 2, ["animat: unexpected argument 'pole'; see animat train --help"]),
-        (["train", "--robot", "pole"], 2, ["animat: robot: expected its value alone, got --robot before it; see"]),
+        (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
         (["train", "--window-ms", "2"], 2, ["animat: --window-ms: expected two numbers, got '2'; see animat train"]),
         (["trian"], 2, ["train, evaluate", "got 'trian'; did you mean train?"]),
@@ -743,7 +743,7 @@ def test_usage_errors_come_in_one_line(
 
 
 @pytest.mark.oracle
-def test_a_dead_window_is_refused_unless_told_otherwise(
+def test_a_dead_window_is_refused_unless_allowed(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spikes = str(real_data / "brainoware_spikes.csv.gz")
@@ -801,7 +801,7 @@ def test_a_full_disk_while_training_leaves_what_was_there_whole(recordings: Path
 
 
 @pytest.mark.parametrize(("kind", "status"), [(InvalidArgument, 1), (KeyboardInterrupt, 130)])
-def test_what_went_wrong_besides_is_told_too(
+def test_other_faults_are_reported_too(
     kind: type[BaseException], status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(command: Train) -> None:
@@ -814,9 +814,9 @@ def test_what_went_wrong_besides_is_told_too(
     assert capsys.readouterr().err.splitlines()[1:] == ["animat: and then: the device could not be switched off"]
 
 
-def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_warning_about_many_recordings_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
     found = [Finding("binning", "warning", f"at {m} min: lost", m / 100) for m in (0, 20, 10)]
-    say_findings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
+    print_warnings([*found, Finding("bursts", "note", "a few"), Finding("few-samples", "warning", "12 only", 12.0)])
     assert capsys.readouterr().err.splitlines() == [
         "warning: at 20 min: lost (and 2 more like it)",
         "warning: 12 only",
@@ -827,14 +827,14 @@ def test_a_warning_of_many_recordings_is_told_once(capsys: pytest.CaptureFixture
     ("name", "values", "worst"),
     [("few-samples", (29.0, 1.0, 12.0), 1.0), ("no-difference", (0.06, 0.01), 0.01), ("drift", (0.3, -0.6, 0.4), -0.6)],
 )
-def test_the_worst_of_several_warnings_is_told(
+def test_the_worst_of_several_warnings_is_printed(
     name: str, values: tuple[float, ...], worst: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    say_findings([Finding(name, "warning", f"it is {value}", value) for value in values])
+    print_warnings([Finding(name, "warning", f"it is {value}", value) for value in values])
     assert capsys.readouterr().err.startswith(f"warning: it is {worst} (and ")
 
 
-def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"animat {version('animat')}\n"
 
@@ -873,7 +873,7 @@ def test_a_reader_that_closes_early_is_no_error(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])
-def test_output_that_is_closed_is_no_error_and_a_full_disk_is_told_in_a_line(arguments: list[str]) -> None:
+def test_output_that_is_closed_is_no_error_and_a_full_disk_is_reported_in_a_line(arguments: list[str]) -> None:
     closed = subprocess.run(
         ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "animat", *arguments], capture_output=True, text=True
     )
@@ -884,5 +884,5 @@ def test_output_that_is_closed_is_no_error_and_a_full_disk_is_told_in_a_line(arg
         done = subprocess.run(
             [sys.executable, "-m", "animat", *arguments], stdout=full, stderr=subprocess.PIPE, text=True
         )
-    told = "animat: standard output: cannot be written: No space left on device\n"
-    assert (done.returncode, done.stderr) == (1, told)
+    message = "animat: standard output: cannot be written: No space left on device\n"
+    assert (done.returncode, done.stderr) == (1, message)

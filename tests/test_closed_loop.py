@@ -25,7 +25,7 @@ from animat.closed_loop.agents import (
     AnyCondition,
     InTurn,
     OneCondition,
-    interleaved,
+    interleave,
 )
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.outline import Outline
@@ -34,7 +34,7 @@ from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
 from animat.closed_loop.standing import Standing
 from animat.closed_loop.tick import Tick
-from animat.closed_loop.timing import ahead_of_other_programs, among_other_programs
+from animat.closed_loop.timing import drop_real_time_priority, real_time_priority
 from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
@@ -200,7 +200,7 @@ def test_the_ticks_are_beside_the_recording_as_a_table(tmp_path: Path, robot: Ro
             agents,
             tmp_path,
             episodes=3,
-            progress=SimpleNamespace(update=lambda *told: said.append(told)),
+            progress=SimpleNamespace(update=lambda *shown: said.append(shown)),
         )
     last = [tick for tick in session.ticks if tick.episode == 5 and tick.reward is not None]
     returns = [[sum(t.reward or 0.0 for t in session.ticks if t.episode == i)] for i in range(6)]
@@ -304,7 +304,7 @@ def test_a_thread_that_is_left_alone_is_no_longer_ahead_of_other_programs() -> N
     began, may_end, policies = threading.Event(), threading.Event(), list[int]()
 
     def run() -> None:
-        with ahead_of_other_programs(with_those_it_starts=False):
+        with real_time_priority(inherited=False):
             policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
             began.set()
             may_end.wait(60)
@@ -313,7 +313,7 @@ def test_a_thread_that_is_left_alone_is_no_longer_ahead_of_other_programs() -> N
     thread = threading.Thread(target=run)
     thread.start()
     began.wait(60)
-    among_other_programs(thread)
+    drop_real_time_priority(thread)
     may_end.set()
     thread.join()
     if policies[0] != os.SCHED_RR:
@@ -323,7 +323,7 @@ def test_a_thread_that_is_left_alone_is_no_longer_ahead_of_other_programs() -> N
 
 def test_agents_take_turns_in_random_order() -> None:
     rng = np.random.default_rng(1)
-    turns = interleaved([50] * 4, rng)
+    turns = interleave([50] * 4, rng)
     rounds = np.array(turns).reshape(50, 4)
     assert all(set(row.tolist()) == {0, 1, 2, 3} for row in rounds)
     # Each stands in each place about as often as in any other: 12.5 times of 50, standard deviation 3.1.
@@ -331,7 +331,7 @@ def test_agents_take_turns_in_random_order() -> None:
 
 
 def test_agents_with_fewer_episodes_are_spread_over_the_session() -> None:
-    turns = np.array(interleaved([40, 5], np.random.default_rng(2)))
+    turns = np.array(interleave([40, 5], np.random.default_rng(2)))
     assert np.bincount(turns).tolist() == [40, 5]
     before = np.cumsum(turns == 0)[turns == 1]
     # One in each fifth of the session, which eight episodes of the other are in.
@@ -423,13 +423,13 @@ def test_a_culture_settles_before_the_first_episode(tmp_path: Path) -> None:
     assert_read_alike(tmp_path, loop)
     outline = Outline()
     for record in session.log.records:
-        outline.add(record.words)
+        outline.add(record.fields)
     assert (
         outline.moved_at_s == next(tick.wall_s for tick in session.ticks if tick.iteration == 0) > settling[-1].wall_s
     )
 
 
-def test_what_is_told_of_a_session_before_its_first_move() -> None:
+def test_the_note_of_a_session_before_its_first_move() -> None:
     standing = Standing(6)
     assert standing.note() == "warm-up"
     standing.begin("p0")
@@ -576,7 +576,7 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
         assert not list(tmp_path.iterdir())
         run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
         before = (tmp_path / "session.log").read_bytes()
-        with pytest.raises(InvalidArgument, match="a session is there already"):
+        with pytest.raises(InvalidArgument, match="expected no session, got one"):
             run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
         assert (tmp_path / "session.log").read_bytes() == before
         culture.stop()
@@ -626,7 +626,7 @@ def test_by_the_robots_own_physics_the_rule_does_better_than_its_opposite(robot:
     assert lasted[1] > lasted[-1] + 10
 
 
-def test_what_the_device_left_out_is_told(tmp_path: Path) -> None:
+def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
     class Losing(FakeCulture):
         @property
         def left_out(self) -> dict[str, int]:
@@ -647,7 +647,7 @@ def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
         episodes = [episode.number for episode in session.episodes if episode.agent == name]
         chosen = [{tick.chosen for tick in session.ticks if tick.episode == number} for number in episodes]
         assert chosen == [{0}, {1}, {2}, {0}, {1}]
-    assert [told.get("in_turn") for told in session.log.header["agents"]] == [None, *[["p0", "p1", "p2"]] * 2]
+    assert [agent.get("in_turn") for agent in session.log.header["agents"]] == [None, *[["p0", "p1", "p2"]] * 2]
 
 
 def test_a_budget_is_kept_to_the_pulse() -> None:

@@ -20,10 +20,10 @@ import pytest
 
 from animat.cli import main
 from animat.closed_loop.agents import Agent
-from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
+from animat.closed_loop.session_data import LOG_FILE
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.request import Request
@@ -129,16 +129,16 @@ def spikes(change: Callable[[Any, Any], tuple[Any, Any]]) -> Callable[[Observed]
         (garbled(spikes=spikes(lambda t, c: (t, c + 1000))), "channel 10"),
         pytest.param(garbled(spikes=spikes(lambda t, c: (t, c - 1000))), "channel -", marks=pytest.mark.oracle),
         (garbled(spikes=spikes(lambda t, c: (np.where(t > 0.01, np.nan, t), c))), "spike times"),
-        (garbled(spikes=spikes(lambda t, c: (t[::-1], c))), "no rising numbers"),
+        (garbled(spikes=spikes(lambda t, c: (t[::-1], c))), "that do not rise"),
         (garbled(spikes=spikes(lambda t, c: (t + 100.0, c))), "outside of the"),
-        (garbled(spikes=spikes(lambda t, c: (t, c.astype(float)))), "no whole numbers"),
+        (garbled(spikes=spikes(lambda t, c: (t, c.astype(float)))), "not whole numbers"),
         pytest.param(garbled(spikes=spikes(lambda t, c: (None, None))), "cannot be read", marks=pytest.mark.oracle),
         pytest.param(garbled(spikes=lambda o: 7), "cannot be read", marks=pytest.mark.oracle),
         (garbled(stimulus_time_s=lambda o: np.empty(0)), "0,) stimulus times for 1"),
         pytest.param(garbled(stimulus_time_s=lambda o: np.array([np.nan])), "stimulus times", marks=pytest.mark.oracle),
-        (garbled(stimulus_time_s=lambda o: o.stimulus_time_s - 0.002), "2 ms before it was asked for"),
-        (garbled(duration_s=lambda o: 0.001), "a stretch of 0.001 s"),
-        pytest.param(garbled(duration_s=lambda o: float("nan")), "a stretch of nan s", marks=pytest.mark.oracle),
+        (garbled(stimulus_time_s=lambda o: o.stimulus_time_s - 0.002), "2 ms before its requested time"),
+        (garbled(duration_s=lambda o: 0.001), "returned 0.001 s"),
+        pytest.param(garbled(duration_s=lambda o: float("nan")), "returned nan s", marks=pytest.mark.oracle),
         (garbled(start_s=lambda o: 3.0), "went back"),
         (lambda culture, observed: None, "cannot be read"),
     ],
@@ -153,7 +153,7 @@ def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str
 
 
 class Gone(FakeCulture):
-    """Its clock answers so many times, then does what it is told."""
+    """Its clock answers so many times, then fails as requested."""
 
     def __init__(self, then: Callable[[], Any], left: int = 60) -> None:
         super().__init__()
@@ -274,7 +274,7 @@ def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace:
 
 
 @pytest.mark.parametrize("how", ["raises", "hangs"])
-def test_a_culture_that_cannot_be_stopped_is_told(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_culture_that_cannot_stop_is_reported(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
     monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
 
@@ -290,7 +290,7 @@ def test_a_culture_that_cannot_be_stopped_is_told(tmp_path: Path, how: str, monk
         finally:
             released.set()
         assert "got RuntimeError: smoke; BUT the culture" in session.ending.message
-        assert "see to it that the device gives no more pulses" in session.ending.message
+        assert "make sure that the device delivers no more pulses" in session.ending.message
         # Whatever the device does: nothing passes the guard.
         with pytest.raises(UnsafeStimulus, match="stop"):
             culture.stimulate(culture.stimulation_electrodes[:1], session_pulse())
@@ -337,7 +337,7 @@ def test_a_backend_that_hangs(tmp_path: Path, little_grace: None) -> None:
 
 
 class FakeClock:
-    """A clock that moves when it is waited for, or told."""
+    """A clock that moves when a sleeper waits for it, or when it is moved."""
 
     def __init__(self) -> None:
         self.time_s = 100.0
@@ -599,7 +599,7 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "could not be written" in session.ending.message
     assert re.fullmatch(
         r"the log cannot be written: No space left on device; "
-        r"(how it ended could .* is|the last tick could .* is|the last \d+ ticks could not be written and are) lost",
+        r"(the ending could .* is|the last tick could .* is|the last \d+ ticks could not be written and are) lost",
         session.ending.message,
     )
     with pytest.raises(InvalidFile, match="No space left"):
@@ -617,7 +617,7 @@ def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> Non
     assert "animat recover" in session.ending.message
     assert session.ending.message == (
         f"all 5 episodes were run; {tmp_path}/session.nwb: cannot be written: Is a directory "
-        f"(animat recover {tmp_path} writes the files, once that is mended)"
+        f"(once that is fixed, animat recover {tmp_path} writes the files)"
     )
     (tmp_path / "session.nwb" / "in the way").unlink()
     (tmp_path / "session.nwb").rmdir()
@@ -637,7 +637,7 @@ def test_a_session_comes_back_whatever_its_files_are_like(
         session = run(tmp_path, culture, robot=Navigation(episode_limit=3))
     assert session.ending.by == "plan"
     assert str(error) in session.ending.message
-    assert f"(animat recover {tmp_path}" in session.ending.message
+    assert f"animat recover {tmp_path} writes" in session.ending.message
     assert len(session.episodes) == 5
     assert recover_session(tmp_path).episodes == session.episodes
     assert_read_alike(tmp_path, loop_of())
@@ -665,17 +665,17 @@ def test_killed_outright_it_loses_at_most_a_second(tmp_path: Path) -> None:
         [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
     )
     assert process.stdout is not None
-    told = []
-    while len(told) < 2 or told[-1][1] - told[0][1] < 2.0:
+    written = []
+    while len(written) < 2 or written[-1][1] - written[0][1] < 2.0:
         number, at_s = process.stdout.readline().split()
-        told.append((int(number), float(at_s)))
+        written.append((int(number), float(at_s)))
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
     session = read_session(tmp_path)
     assert session.ending.by == "crash"
     # What was done a second before the last sign of life is there, whatever came after it.
-    done = max(number for number, at_s in told if at_s < told[-1][1] - 1.0)
+    done = max(number for number, at_s in written if at_s < written[-1][1] - 1.0)
     assert session.outline.ticks >= done - 1 > 20
     with pytest.raises(InvalidFile):
         read_recording(tmp_path / "session.nwb")
@@ -713,12 +713,12 @@ def test_killed_during_a_long_presentation_the_log_has_what_was_asked(
     process.wait()
     process.stdout.close()
     session = recover_session(tmp_path)
-    told = session.to_dict()
-    assert told["pulses"] + told["unanswered_pulses"] == pulses == 8 * 4
-    assert told["unanswered_pulses"] == 4
+    summary = session.to_dict()
+    assert summary["pulses"] + summary["unanswered_pulses"] == pulses == 8 * 4
+    assert summary["unanswered_pulses"] == 4
     assert len(session.outline.unanswered[0]["stimuli"][0][3]) == 2
     assert main(["recover", str(tmp_path)]) == 0
-    assert "4 pulses were asked for and never answered" in capsys.readouterr().out
+    assert "4 pulses were requested and never answered" in capsys.readouterr().out
     assert_read_alike(tmp_path, loop_of(pulses=4))
 
 
@@ -758,7 +758,7 @@ def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:
             continue
         whole = [record for record, end in zip(written, ends, strict=True) if end <= length]
         found = read_log(other)
-        assert [r.words for r in found.records] == [r.words for r in whole]
+        assert [r.fields for r in found.records] == [r.fields for r in whole]
         for got, want in zip(found.records, whole, strict=True):
             np.testing.assert_array_equal(got.spike_times_s, want.spike_times_s)
             np.testing.assert_array_equal(got.spike_channels, want.spike_channels)

@@ -49,7 +49,7 @@ def test_it_is_dropped_by_python_and_heard_here() -> None:
 
 
 @pytest.mark.parametrize("number", ASKING)
-def test_so_is_a_kill_and_where_a_weak_reference_is_told_of_an_end(number: signal.Signals) -> None:
+def test_so_is_a_kill_and_where_a_weak_reference_is_notified_of_an_end(number: signal.Signals) -> None:
     class Body:
         pass
 
@@ -108,7 +108,7 @@ def test_an_import_that_does_not_end_is(tmp_path: Path, monkeypatch) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
     ("module", "kept"),
-    [("tyro", ""), ("jax._src.interpreters.mlir", "; what was finished is kept; start again to go on")],
+    [("tyro", ""), ("jax._src.interpreters.mlir", "; finished work is kept; run it again to resume")],
 )
 def test_a_command_that_still_imports_ends_in_a_line(
     module: str, kept: str, number: signal.Signals, tmp_path: Path
@@ -161,23 +161,23 @@ def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, cap
     monkeypatch.setattr("animat.cultures.series.record_series", killed)
     before = signal.getsignal(signal.SIGTERM)
     assert animat(["record", "--out", str(tmp_path / "recordings")]) == 130
-    assert capsys.readouterr().err.endswith("animat: interrupted; what was finished is kept; start again to go on\n")
+    assert capsys.readouterr().err.endswith("animat: interrupted; finished work is kept; run it again to resume\n")
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_an_interrupted_session_is_told_to_be_no_start_for_another(tmp_path, monkeypatch, capsys) -> None:
+def test_an_interrupted_session_is_reported_as_not_resumable(tmp_path, monkeypatch, capsys) -> None:
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("animat.cli.run.Run.run", interrupted)
     command = ["run", "policies", "--out", str(tmp_path)]
     assert animat(command) == 130
-    assert capsys.readouterr().err == "animat: interrupted; what was finished is kept\n"
+    assert capsys.readouterr().err == "animat: interrupted; finished work is kept\n"
     (tmp_path / "session.log").touch()
     assert animat(command) == 130
-    told = capsys.readouterr().err
-    assert told.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
-    assert f"its recording is not written yet: animat recover {tmp_path};" in told
+    message = capsys.readouterr().err
+    assert message.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
+    assert f"its recording is not written yet: animat recover {tmp_path};" in message
     (tmp_path / "session.nwb").touch()
     assert animat(command) == 130
     assert "recover" not in capsys.readouterr().err

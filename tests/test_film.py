@@ -13,10 +13,10 @@ from PIL import Image, ImageDraw
 
 from animat.cli import main
 from animat.closed_loop.agents import Agent, AnyCondition, OneCondition
-from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session
+from animat.closed_loop.session_data import LOG_FILE
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument
 from animat.neurons.timeline import fit_timeline
@@ -94,7 +94,7 @@ def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path, pause_s
     assert scene_of_session(tmp_path, (0.0, 58.0 + pause_s)).start_s == 0.0
     # Also where nothing moves yet, and of a session that was killed in its settling.
     records = read_session(tmp_path).log.records
-    first = next(number for number, record in enumerate(records) if record.words.get("tick"))
+    first = next(number for number, record in enumerate(records) if record.fields.get("tick"))
     log = (tmp_path / LOG_FILE).read_bytes()
     (tmp_path / LOG_FILE).write_bytes(log[: records._places[first + 1]])
     for span_s in ((0.5, 1.5), (1.0, pause_s)):

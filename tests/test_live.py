@@ -117,7 +117,7 @@ def test_recordings_are_watched_as_they_are_made(ran: tuple[LiveRun, Path, int],
     assert not (folder / under_way.UNDER_WAY).exists()
 
 
-def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(ran: tuple[LiveRun, Path, int]) -> None:
+def test_every_simulator_is_swapped_in_once_dated_and_kept_with_the_policies(ran: tuple[LiveRun, Path, int]) -> None:
     found, folder, _ = ran
     starts_min = [r.start_min for r in read_recordings([folder / "recordings"])]
     assert [swap["recorded_at_min"] for swap in found.swaps] == pytest.approx(starts_min[1:])
@@ -132,23 +132,23 @@ def test_every_simulator_is_swapped_in_once_dated_and_told_to_the_policies(ran: 
         assert np.all(np.diff(iterations) > 0)
         assert iterations[-1] == found.iterations
         assert len(iterations) > chunks[1]
-        told = policy.provenance["swaps"]
-        assert [swap["recorded_at_min"] for swap in told] == pytest.approx(starts_min)
-        assert told[0]["chunk"] == 0
+        swaps = policy.provenance["swaps"]
+        assert [swap["recorded_at_min"] for swap in swaps] == pytest.approx(starts_min)
+        assert swaps[0]["chunk"] == 0
         assert policy.provenance["training"]["duration_min"] == 30.0
         assert policy.presentation == BLOCKED.presentation
 
 
 def test_what_happened_is_in_the_log_in_order(ran: tuple[LiveRun, Path, int]) -> None:
     found, folder, _ = ran
-    told = lines(folder)
-    whats = [line["what"] for line in told]
+    events = lines(folder)
+    whats = [line["what"] for line in events]
     assert whats == [
         "begun", "recording", "training", "training began", "recording", "swap", "recording", "swap",
         "trained", "closed loop", "end",
     ]  # fmt: skip
     for name in ("at", "wall_s", "culture_min"):
-        assert all(one[name] <= next_[name] for one, next_ in pairwise(told))
+        assert all(one[name] <= next_[name] for one, next_ in pairwise(events))
     assert not (folder / ".exchange").exists()
     json.dumps(found.to_dict())
 
@@ -344,10 +344,10 @@ def test_ctrl_c_keeps_recordings_and_policies_and_stops_the_culture(tmp_path: Pa
     assert list(load_policies(tmp_path / "live" / "policies")) == ["p0"]
     assert not (tmp_path / "live" / ".exchange").exists()
     assert len(read_recordings([tmp_path / "live" / "recordings"])) >= 2
-    told = lines(tmp_path / "live")
-    assert [line["what"] for line in told[-2:]] == ["interrupted", "end"]
-    assert told[-1]["budget"]["pulses"] == culture.pulses
-    assert told[-2]["message"] == "stopped by a person"
+    events = lines(tmp_path / "live")
+    assert [line["what"] for line in events[-2:]] == ["interrupted", "end"]
+    assert events[-1]["budget"]["pulses"] == culture.pulses
+    assert events[-2]["message"] == "stopped by a person"
     with pytest.raises(Mismatch, match="expected an empty folder for a live run, got one with files"):
         live(ONE, culture, PROTOCOL, tmp_path / "live")
 
@@ -364,9 +364,9 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
         assert culture.after_halt == 0
         # The second recording was handed over: nobody knows what came of it.
         assert lines(tmp_path / "live")[-1]["budget"]["pulses"] == culture.pulses == 2 * PULSES
-    told = lines(tmp_path / "live")
-    assert [line["what"] for line in told[-2:]] == ["fault", "end"]
-    assert told[-2]["message"] == "DeviceFailed: gone"
+    events = lines(tmp_path / "live")
+    assert [line["what"] for line in events[-2:]] == ["fault", "end"]
+    assert events[-2]["message"] == "DeviceFailed: gone"
     policies = load_policies(tmp_path / "live" / "policies")
     assert list(policies) == ["p0"]
     assert all(len(policy.learning_curve) for policy in policies.values())
@@ -374,11 +374,11 @@ def test_a_culture_that_fails_meanwhile_is_stopped_and_what_was_trained_is_kept(
 
 @pytest.mark.oracle
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [(KeyboardInterrupt(), "stopped by a person"), (RuntimeError("no dynamic program"), "RuntimeError: no dynamic")],
 )
-def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told(
-    error: BaseException, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_logged(
+    error: BaseException, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
         raise error
@@ -389,8 +389,8 @@ def test_what_ends_a_run_between_training_and_loop_stops_the_culture_and_is_told
             live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK)
         assert culture.is_stopped
     written = lines(tmp_path / "live")
-    assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in told else "interrupted", "end"]
-    assert told in written[-2]["message"]
+    assert [line["what"] for line in written[-3:]] == ["trained", "fault" if "Run" in message else "interrupted", "end"]
+    assert message in written[-2]["message"]
 
 
 @pytest.mark.oracle
@@ -413,7 +413,7 @@ def test_a_session_of_a_live_run_that_still_runs_is_not_recovered(tmp_path: Path
 
 
 @pytest.mark.oracle
-def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
+def test_a_closed_loop_that_failed_is_not_reported_as_completed(tmp_path: Path) -> None:
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("gone")
 
@@ -421,8 +421,8 @@ def test_a_closed_loop_that_failed_is_not_told_as_done(tmp_path: Path) -> None:
     with FakeCulture(fault=fail, at=7) as culture:
         found = live(ONE, culture, PROTOCOL, tmp_path / "live", timetable=QUICK, episodes=1)
     assert found.gap.session.ending.by == "culture"
-    (told,) = [line for line in lines(tmp_path / "live") if line["what"] == "closed loop"]
-    assert (told["ended_by"], told["ended"]) == ("culture", "the culture raised DeviceFailed: gone")
+    (event,) = [line for line in lines(tmp_path / "live") if line["what"] == "closed loop"]
+    assert (event["ended_by"], event["ended"]) == ("culture", "the culture raised DeviceFailed: gone")
 
 
 @pytest.mark.oracle
@@ -448,8 +448,8 @@ def test_a_folder_with_an_earlier_live_run_is_refused_in_a_line(left: str, tmp_p
     with pytest.raises(Mismatch) as refused:
         check_plan(ONE, PROTOCOL, tmp_path, QUICK, 1, {})
     assert str(refused.value) == (
-        f"{tmp_path}: expected an empty folder for a live run, got one with files; choose another, or see what is "
-        f"there: animat watch {tmp_path}"
+        f"{tmp_path}: expected an empty folder for a live run, got one with files; choose another, or see what it "
+        f"holds: animat watch {tmp_path}"
     )
 
 
@@ -570,20 +570,20 @@ def test_from_the_command_line_it_says_what_it_did_and_exits_as_the_loop_ended(
     given += ["--interval-min", "5", "--duration-min", "10", "--episodes", "1", "--json"]
     assert main([*given, "--out", str(tmp_path / "done")]) == 0
     printed = capsys.readouterr().out.splitlines()
-    told = json.loads(printed[-1])
+    results = json.loads(printed[-1])
     assert printed[0].startswith("2 recordings in 10 min of the culture's clock (")
     assert printed[0].endswith("1 swaps of simulators:")
-    assert f"{told['iterations']:,} iterations of each policy, never stopped" in printed[0]
+    assert f"{results['iterations']:,} iterations of each policy without a pause" in printed[0]
     assert "policies p0 to p1 after" in printed[1]
     assert "the recording at 5.2 min" in printed[1]
     assert any(line.split()[:1] == ["random"] for line in printed)
-    assert told["closed_loop"]["session"]["ended_by"] == "plan"
-    assert all(Path(file).is_file() for file in told["recordings"])
-    assert told["policies"] == list(load_policies(tmp_path / "done" / "policies"))
+    assert results["closed_loop"]["session"]["ended_by"] == "plan"
+    assert all(Path(file).is_file() for file in results["recordings"])
+    assert results["policies"] == list(load_policies(tmp_path / "done" / "policies"))
     assert (tmp_path / "done" / "session" / "session.nwb").is_file()
     assert not cultures[0].is_open
-    # Everything is told of one that fails in the loop too, and then it is an error.
+    # A run that fails in the loop is reported in full too, and is then an error.
     assert main([*given, "--out", str(tmp_path / "failed")]) == 1
     printed_too = capsys.readouterr()
-    assert "the session ended before its plan was done: the culture raised DeviceFailed: gone" in printed_too.err
+    assert "the session ended before its plan was completed: the culture raised DeviceFailed: gone" in printed_too.err
     assert printed_too.out.startswith("2 recordings in 10 min")

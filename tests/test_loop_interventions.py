@@ -105,7 +105,7 @@ def test_a_robot_with_one_goal_has_none_switched_and_yoked_ones_need_a_source(tm
     assert [agent.name for agent in agents] == ["random spikes", "yoked", "turned round"]
     with (
         FakeCulture() as culture,
-        pytest.raises(InvalidArgument, match="expected episodes that 'yoked' could repeat, got none"),
+        pytest.raises(InvalidArgument, match="expected episodes for 'yoked' to repeat, got none"),
     ):
         run_session(culture, loop_of(), agents, tmp_path, episodes=1)
 

@@ -109,7 +109,7 @@ def test_a_maxone_is_in_time_however_long_its_sequences_take_to_make(
 
 
 def assert_on(session: Session, chosen: tuple[int, ...]) -> None:
-    """All pulses were in time and on the chosen electrodes, as the session's recording tells."""
+    """All pulses were in time and on the chosen electrodes, as in the session's recording."""
     assert session.ending.by == "plan", session.ending.message
     assert [tick.late_s for tick in session.ticks] == [0.0] * 20
     stimuli = session.recording().stimuli

@@ -147,7 +147,7 @@ def test_the_command_says_how_to_train_on_places(
 ) -> None:
     monkeypatch.setattr(Record, "_series", lambda *_: [])
     assert main(["record", "--places", "halves"]) == 0
-    assert "each place is a condition; --conditions frequency mixes the places" in capsys.readouterr().out
+    assert "each place is a condition; --conditions frequency pools the places" in capsys.readouterr().out
     assert main(["record"]) == 0
     assert "--conditions" not in capsys.readouterr().out
 

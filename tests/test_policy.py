@@ -22,7 +22,7 @@ from safetensors import safe_open
 from safetensors.numpy import load, save
 from scipy import stats
 
-from animat.cli.responses import fit_as
+from animat.cli.responses import simulator_settings
 from animat.closed_loop.loop import Loop
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
@@ -421,7 +421,7 @@ def used(policy: Policy) -> None:
     """What a closed loop and an evaluation read of a policy, before a culture is opened."""
     assert math.isfinite(policy.act(np.zeros(len(policy.scales), np.float32), np.random.default_rng(0)))
     assert math.isfinite(policy.act_greedily(np.full(len(policy.scales), 10.0, np.float32)))
-    fit_as(policy.fitted, None, None, None)
+    simulator_settings(policy.fitted, None, None, None)
     if policy.fitted.get("by") is not None:
         with suppress(InvalidArgument):
             conditions_named(policy.fitted["by"])

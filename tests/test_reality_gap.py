@@ -724,7 +724,7 @@ class TestCommand:
         assert self.command(folder, "--controls", "random") == 0
         before = (folder / "session" / "session.log").read_bytes()
         assert self.command(folder) == 1
-        assert "a session is there already; choose another folder" in capsys.readouterr().err
+        assert "expected no session, got one; choose another folder" in capsys.readouterr().err
         assert (folder / "session" / "session.log").read_bytes() == before
 
     def test_for_a_killed_session_it_says_how_to_recover_it_and_changes_nothing(
@@ -734,7 +734,7 @@ class TestCommand:
         session.mkdir()
         (session / "session.log").write_bytes(b"what a killed program left")
         assert self.command(folder) == 1
-        assert f"`animat recover {session}` does it; choose another folder" in capsys.readouterr().err
+        assert f"use `animat recover {session}`; choose another folder" in capsys.readouterr().err
         assert [file.name for file in session.iterdir()] == ["session.log"]
 
     def test_a_recording_that_could_not_be_written_is_an_error(
@@ -746,7 +746,7 @@ class TestCommand:
         printed = capsys.readouterr()
         assert "session.nwb: cannot be written" in printed.err
         assert "animat recover" in printed.err
-        assert "is its recording" not in printed.out
+        assert f"recording: {folder}" not in printed.out
 
     def test_a_polite_kill_closes_the_culture(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def kill(culture: FakeCulture, observed: Observed) -> Observed:
@@ -778,7 +778,7 @@ class TestCommand:
             "animat: fake: expected it to close, got ConnectionResetError: the device is gone"
         )
         assert "random" in printed.out
-        assert "is its recording" in printed.out
+        assert f"recording: {folder}" in printed.out
 
     @pytest.mark.oracle
     def test_electrodes_that_differ_from_the_recordings_are_reported(

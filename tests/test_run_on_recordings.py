@@ -1,4 +1,4 @@
-"""`animat run` beside recordings: it says where the culture is not theirs, and takes the conditions of the policies."""
+"""`animat run` on recordings: it says where the culture is not theirs, and takes the conditions of the policies."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def run(out: Path, policy: Policy, recordings: Path, *more: str) -> int:
         (["--culture-seed", "2"], True, "of virtual culture 1, but this is virtual culture 2"),
     ],
 )
-def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
+def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_reported(
     more: list[str],
     has_state: bool,
     words: str,
@@ -120,7 +120,7 @@ def test_a_virtual_culture_that_is_not_as_it_was_recorded_is_told(
 
 
 @pytest.mark.oracle
-def test_recordings_of_no_virtual_culture_are_told(
+def test_recordings_of_no_virtual_culture_are_reported(
     tmp_path: Path, small_ones: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
@@ -136,7 +136,7 @@ def recorded_by(series: Path, folder: Path, *pulses: Pulse | None) -> Path:
     return folder
 
 
-OTHERS, WEAK = " as the others had", Pulse((Phase(200, amplitude_mv=-100), Phase(200, amplitude_mv=100)))
+OTHERS, WEAK = " as in the other recordings", Pulse((Phase(200, amplitude_mv=-100), Phase(200, amplitude_mv=100)))
 USUAL = " the usual one on a virtual"
 
 
@@ -164,8 +164,8 @@ def test_a_loop_delivers_the_pulse_of_its_recordings_and_names_it_first(
     mine.write_text(json.dumps({"pulse": (file or WEAK).to_list()}))
     given = [] if file is None else ["--protocol", str(mine)]
     assert run(tmp_path / "session", policy_of(0), recordings, "--at-min", "1", *given) == 0
-    told = read_session(tmp_path / "session").log.header["loop"]["pulse"]
-    assert Pulse.from_list(told) == delivered
+    pulse = read_session(tmp_path / "session").log.header["loop"]["pulse"]
+    assert Pulse.from_list(pulse) == delivered
     printed = capsys.readouterr()
     assert f"each pulse: {delivered}" in printed.err.split("the session is planned for")[0].splitlines()
     found = {f["name"]: f["message"] for f in json.loads(printed.out.splitlines()[-1])["findings"]}
@@ -174,11 +174,11 @@ def test_a_loop_delivers_the_pulse_of_its_recordings_and_names_it_first(
 
 
 @pytest.mark.parametrize(
-    ("minutes", "told"),
+    ("minutes", "text"),
     [(0.0, "0 min"), (1 / 60, "0.02 min"), (14400.25, "14400.25 min"), (1_500_004.0, "1500004 min")],
 )
-def test_minutes_have_two_decimals_at_most(minutes: float, told: str) -> None:
-    assert in_min(minutes) == told
+def test_minutes_have_two_decimals_at_most(minutes: float, text: str) -> None:
+    assert in_min(minutes) == text
 
 
 def test_a_rehearsal_of_currents_is_given_voltages(

@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.closed_loop.agents import Agent, OneCondition
-from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
+from animat.closed_loop.session_data import LOG_FILE
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.formats.nwb import read_nwb, write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
@@ -49,14 +49,14 @@ def with_header(folder: Path, header: Any, records: bytes) -> Path:
 
 def as_logged(folder: Path) -> dict[str, Any]:
     """Spikes and stimuli of a session, from its log by hand: two electrodes a pulse, times rising."""
-    seen = [record for record in read_log(folder / LOG_FILE).records if record.words["kind"] == "seen"]
+    seen = [record for record in read_log(folder / LOG_FILE).records if record.fields["kind"] == "seen"]
     # A file has them channel by channel: spikes of one time are read in the order of their channels.
     spikes = sorted(pair for record in seen for pair in zip(record.spike_times_s, record.spike_channels, strict=True))
-    columns = zip(*(row for record in seen for row in record.words["stimuli"]), strict=True)
+    columns = zip(*(row for record in seen for row in record.fields["stimuli"]), strict=True)
     return {
         "spike_times_s": [time_s for time_s, _ in spikes],
         "spike_channels": [channel for _, channel in spikes],
-        "time_s": [s for record in seen if record.words["tick"] for s in record.words["tick"]["pulse_time_s"]],
+        "time_s": [s for record in seen if record.fields["tick"] for s in record.fields["tick"]["pulse_time_s"]],
         **dict(zip(("frequency_hz", "pattern", "presentation", "electrodes"), columns, strict=True)),
     }
 
@@ -101,7 +101,7 @@ def test_a_damaged_log_is_not_written_over_what_holds_more(tmp_path: Path, capsy
     for file in files:
         file.unlink()
     assert main(["recover", str(tmp_path / "session")]) == 0
-    assert "from where it is torn or damaged on, are lost" in capsys.readouterr().out
+    assert "from where it is torn or damaged, are lost" in capsys.readouterr().out
     assert len(session.ticks_file.read_bytes()) < len(before[0])
     # What was recovered is no less than what the log has: it is recovered again.
     assert main(["recover", str(tmp_path / "session")]) == 0
@@ -133,7 +133,7 @@ def test_a_table_that_cannot_be_written_is_made_later(tmp_path: Path, monkeypatc
 def long_log(folder: Path, ticks: int) -> None:
     """A log of so many ticks, as the loop writes it, with the spikes of all at the same times after each pulse."""
     header = read_log(ran(folder / "short").folder / LOG_FILE).header
-    last = next(w for w in read_log(folder / "short" / LOG_FILE).records.words() if w["kind"] == "seen" and w["tick"])
+    last = next(w for w in read_log(folder / "short" / LOG_FILE).records.fields() if w["kind"] == "seen" and w["tick"])
     log = LogWriter(folder / "long" / LOG_FILE, header)
     spikes_s, channels = np.linspace(0.001, 0.009, 40), np.arange(40) % 16
     for n in range(ticks):

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.session import read_session
+from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
 from animat.watch.app import stop_session
 from animat.watch.session import SessionView, _in_force
@@ -75,7 +75,7 @@ def test_what_it_came_to_is_what_the_session_says(folder: Path) -> None:
         assert agent["half"] == pytest.approx(12.7062 * np.std(returns, ddof=1) / math.sqrt(2), rel=1e-4)
     spikes = sum(len(record.spike_times_s) for record in session.log.records)
     assert found["spikes"]["n"] == sum(found["counts"]) == spikes
-    seen = [record.words for record in session.log.records if record.words["kind"] == "seen"]
+    seen = [record.fields for record in session.log.records if record.fields["kind"] == "seen"]
     on = [electrode for words in seen for row in words["stimuli"] for electrode in row[3]]
     assert found["fullest"] == [found["fullest"][0], max(on.count(e) for e in on)]
     assert on.count(int(found["fullest"][0])) == found["fullest"][1]
@@ -115,12 +115,12 @@ def test_a_log_is_followed_while_it_grows(folder: Path, tmp_path: Path) -> None:
     ticks = 0
     for number, record in enumerate(log.records):
         writer.append(record)
-        ticks += bool(record.words.get("tick"))
+        ticks += bool(record.fields.get("tick"))
         if number % 7 == 0:
             found = whole(view)
             assert found["n_ticks"] == ticks
             assert not found["damage"]
-            assert found["state"] == ("running" if record.words["kind"] != "end" else "ended")
+            assert found["state"] == ("running" if record.fields["kind"] != "end" else "ended")
     writer.close()
     found, other = whole(view), whole(SessionView(folder))
     for name in ("ticks", "counts", "agents", "percentiles", "pulses", "end_s"):

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from animat.closed_loop.gathering import LOG_FILE
 from animat.closed_loop.log import read_log
+from animat.closed_loop.session_data import LOG_FILE
 from animat.errors import AnimatError
 from animat.watch.picture import picture_of
 from animat.watch.session import SessionView
@@ -65,7 +65,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def records(folder: Path) -> list[Any]:
     """The words of each record, the header's first, and its spikes."""
     log = read_log(folder / LOG_FILE)
-    return [(log.header, b"", 0), *((r.words, _spikes(r), len(r.spike_times_s)) for r in log.records)]
+    return [(log.header, b"", 0), *((r.fields, _spikes(r), len(r.spike_times_s)) for r in log.records)]
 
 
 def _spikes(record: Any) -> bytes:

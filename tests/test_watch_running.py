@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 
-from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.session import Session, read_session
+from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.errors import AnimatError, InvalidArgument
 from animat.watch.serving import watching
 from watching import OWN, PORT, TOKEN, asked, session_in

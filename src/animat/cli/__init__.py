@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints. What the commands do is in the modules that they call."""
+"""The command line: it parses, calls and prints. The modules that it calls do the work."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ Command = (
 
 COMMANDS = {command.__metadata__[0].name: command.__origin__ for command in get_args(Command)}
 
-_LESS: dict[type, str] = {
+_MEMORY_REMEDIES: dict[type, str] = {
     Evaluate: "ask for fewer episodes (--episodes {episodes})",
     Run: "ask for fewer episodes (--episodes {episodes})",
     Live: "ask for fewer episodes (--episodes {episodes}) or policies (--policies {policies})",
@@ -70,31 +70,31 @@ _LESS: dict[type, str] = {
     Validate: "validate fewer recordings at once",
     Inspect: "inspect fewer recordings at once",
 }
-"""What a command's memory grows with, and what was asked for."""
+"""How to run a command with less memory, with the values of its options."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status.
+    """Run one command and return the exit status.
 
-    0; 1 for an error that a line on standard error names; 2 where the command line cannot be read; 130 after Ctrl-C or
-    a kill; 141 where nobody reads standard output any more.
+    0; 1 for an error, which a line on standard error names; 2 for a command line that cannot be read; 130 after Ctrl-C
+    or a kill; 141 if standard output is no longer read.
     """
     stay_on_cores()
-    # Streams that were closed are None, which the parser and others do not expect: what is written goes nowhere.
+    # Closed streams are None, which the parser and others do not expect: discard what is written to them.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else list(arguments))
         finally:
-            # Here, where it can be caught, rather than as Python exits: help ends with SystemExit.
+            # Here, where errors can be caught, not while Python exits: help ends with SystemExit.
             sys.stdout.flush()
     except OSError as error:
         is_closed = isinstance(error, BrokenPipeError)
-        # That of a file has its name, and that of a connection a type of its own.
+        # Errors of files have a file name, and those of connections their own types.
         if not is_closed and (type(error) is not OSError or error.filename is not None):
             raise
-        # What is still to be written goes nowhere.
+        # Discard the rest of the output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if is_closed:
             return 141
@@ -102,33 +102,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def _run(given: list[str]) -> int:
-    if given == ["--version"]:
+def _run(arguments: list[str]) -> int:
+    if arguments == ["--version"]:
         print(f"animat {importlib.metadata.version('animat')}")
         return 0
     try:
-        command = _parse(given)
+        command = _parse(arguments)
     except InvalidArgument as error:
         print(f"animat: {error}", file=sys.stderr)
         return 2
     if "" not in sys.path:
-        # As for `python -m animat`: robots of one's own may lie in the working folder.
+        # As for `python -m animat`: the working folder may hold the user's own robots.
         sys.path.append("")
     try:
-        with heard_everywhere(), _watched(command):
+        with heard_everywhere(), _live_page(command):
             results = command.run()
     except AnimatError as error:
-        print(f"animat: {_by_option(command, ' '.join(str(error).split()))}", file=sys.stderr)
-        _say_notes(error)
+        print(f"animat: {_name_option(command, ' '.join(str(error).split()))}", file=sys.stderr)
+        _print_notes(error)
         return 1
     except KeyboardInterrupt as error:
         kept = (
             ""
             if isinstance(command, Inspect | Validate | Convert | Evaluate | Replay | ClusterCommand | Watch)
-            else "; what was finished is kept"
+            else "; finished work is kept"
         )
         again = (
-            "; start again to go on"
+            "; run it again to resume"
             if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile)
             else "; a session cannot be resumed: start a new one in another folder"
             if isinstance(command, Run) and (command.out / "session.log").exists()
@@ -137,7 +137,7 @@ def _run(given: list[str]) -> int:
         if isinstance(command, Run) and again and not (command.out / "session.nwb").exists():
             kept = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}{kept}"
         print(f"animat: interrupted{kept}{again}", file=sys.stderr)
-        _say_notes(error)
+        _print_notes(error)
         return 130
     except BrokenPipeError:
         raise
@@ -145,32 +145,32 @@ def _run(given: list[str]) -> int:
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
             print(f"animat: {str(error.filename)[:60]}...: {error.strerror}; choose a shorter name", file=sys.stderr)
             return 1
-        words = out_of_memory(error)
-        if words is None:
+        message = out_of_memory(error)
+        if message is None:
             raise
-        remedy = _LESS.get(type(command), "use a machine with more memory").format(**vars(command))
-        print(f"animat: {words}: {remedy}", file=sys.stderr)
+        remedy = _MEMORY_REMEDIES.get(type(command), "use a machine with more memory").format(**vars(command))
+        print(f"animat: {message}: {remedy}", file=sys.stderr)
         return 1
     if command.json:
         from animat.records import as_json
 
         print(json.dumps(as_json(results)))
-    # Of several files, some of which could not be read or used, as was said on the way.
+    # Some of several files could not be read or used; messages have already named them.
     return 1 if results.get("unreadable") or results.get("unusable") else 0
 
 
 _BUDGET = {"budget.pulses": "budget_pulses", "budget.pulses_per_electrode": "budget_per_electrode"}
-"""The options of arguments that have another name in Python."""
+"""Options whose Python arguments have different names."""
 
 
-def _by_option(command: Command, message: str) -> str:
-    """A message that begins with the name of an argument, beginning with that of the option it is given by."""
+def _name_option(command: Command, message: str) -> str:
+    """Replace the argument's name at the beginning of a message by the name of its option."""
     argument, _, rest = message.partition(": ")
     name = _BUDGET.get(argument, argument)
     options = {field.name for field in dataclasses.fields(command) if "Positional" not in str(field.type)}
-    given = (each if isinstance(each, tuple) else (each,) for each in vars(command).values())
+    values = (value if isinstance(value, tuple) else (value,) for value in vars(command).values())
     # A file or a folder may have the name of an option.
-    paths = {str(path) for each in given for path in each if isinstance(path, Path)}
+    paths = {str(path) for several in values for path in several if isinstance(path, Path)}
     if isinstance(command, Record) and command.protocol is not None:
         from animat.stimulation.protocol import Protocol
 
@@ -183,8 +183,8 @@ def _by_option(command: Command, message: str) -> str:
     return f"--{name.replace('_', '-')}{file}: {rest}"
 
 
-def _watched(command: Command) -> contextlib.AbstractContextManager[None]:
-    """The page of a command that is asked for one (`--watch`), for as long as it runs and is looked at."""
+def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
+    """The live page of a command with `--watch`, served while the command runs or the page is open."""
     if not isinstance(command, Record | Train | Run | Live | Reproduce | StudyFile | TuneFile) or not command.watch:
         return contextlib.nullcontext()
     from animat.watch.serving import watching
@@ -193,7 +193,7 @@ def _watched(command: Command) -> contextlib.AbstractContextManager[None]:
 
 
 def _parse(arguments: list[str]) -> Command:
-    """Read the command line; usage errors come in one line, not in a box."""
+    """Read the command line; raises usage errors in one line, not in a box."""
     if not arguments:
         raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; see animat --help")
     name = arguments[0]
@@ -201,15 +201,15 @@ def _parse(arguments: list[str]) -> Command:
         near = did_you_mean(name, COMMANDS)
         raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {name!r}{near}")
     if "" in arguments:
-        # Where a variable of the shell is not set; a path would be the working folder.
+        # From a shell variable that is not set; as a path it would be the working folder.
         before = arguments[arguments.index("") - 1]
         raise InvalidArgument(f"{before}: expected a value after it, got an empty text")
     fields = dataclasses.fields(COMMANDS[name]) if name in COMMANDS else ()
     options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
     see = f"; see animat {name} --help" if name in COMMANDS else "; see animat --help"
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(output):
             command, unknown = tyro.cli(
                 Command,
                 prog="animat",
@@ -222,37 +222,37 @@ def _parse(arguments: list[str]) -> Command:
     except SystemExit as stop:
         if not stop.code:
             raise
-        given = itertools.takewhile(lambda argument: argument != "--", arguments)
-        _expect_known([each for each in given if each[:2] == "--" and _plain(each) not in options], options, see)
+        leading = itertools.takewhile(lambda argument: argument != "--", arguments)
+        _expect_known([word for word in leading if word[:2] == "--" and _plain(word) not in options], options, see)
         for option, value in itertools.pairwise([*arguments, "--"]):
             if value.startswith("--") and not isinstance(options.get(option.replace("_", "-"), False), bool):
                 raise InvalidArgument(f"{option}: expected a value after it, got none{see}") from None
-        # A box with a title; where the terminal has no such letters, lines of dashes, one of them under the title.
-        lines = [line.strip("│╭╮╰╯ ") for line in said.getvalue().splitlines()[1:]]
+        # A box with a title; on terminals without these characters, lines of dashes, one of them under the title.
+        lines = [line.strip("│╭╮╰╯ ") for line in output.getvalue().splitlines()[1:]]
         parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
-        what = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
-        raise InvalidArgument(f"{what.removeprefix('Error parsing ')}{see}") from None
+        message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
+        raise InvalidArgument(f"{message.removeprefix('Error parsing ')}{see}") from None
     _expect_known(unknown, options, see)
     return command
 
 
 def _plain(option: str) -> str:
-    """An option as help has it: without the value that it may end with, with dashes."""
+    """An option as help shows it: with dashes, without `=VALUE`."""
     return option.partition("=")[0].replace("_", "-")
 
 
 def _expect_known(unknown: Sequence[str], options: Mapping[str, Any], see: str) -> None:
-    for given in unknown[:1]:
-        option = _plain(given)
+    for argument in unknown[:1]:
+        option = _plain(argument)
         if option in options:
-            raise InvalidArgument(f"{option[2:]}: expected its value alone, got {given} before it{see}") from None
-        if given.startswith("-"):
-            raise InvalidArgument(f"unknown option {given}{did_you_mean(option, options) or see}") from None
-        raise InvalidArgument(f"unexpected argument {given!r}{see}") from None
+            raise InvalidArgument(f"{option[2:]}: expected only its value, got {argument} before it{see}") from None
+        if argument.startswith("-"):
+            raise InvalidArgument(f"unknown option {argument}{did_you_mean(option, options) or see}") from None
+        raise InvalidArgument(f"unexpected argument {argument!r}{see}") from None
 
 
 def _options() -> constructors.ConstructorRegistry:
-    """A rule by which the options of every command are read and told."""
+    """A rule for reading and describing the options of every command."""
     registry = constructors.ConstructorRegistry()
     within = False
 
@@ -261,7 +261,7 @@ def _options() -> constructors.ConstructorRegistry:
         nonlocal within
         if within or not dataclasses.is_dataclass(command.type):
             return None
-        within = True  # What else would ask this rule again.
+        within = True  # The lookup below would otherwise call this rule again.
         spec = constructors.ConstructorRegistry.get_struct_spec(command)
         within = False
         if not isinstance(spec, constructors.StructConstructorSpec):
@@ -275,7 +275,7 @@ _NUMBERS = {"INT": "a whole number", "FLOAT": "a number", "FLOAT FLOAT": "two nu
 
 
 def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpec:
-    """The same in our words: an error says what was expected and what came, help what is done without the option."""
+    """The same option with our errors (what was expected, what was given) and help (what happens without it)."""
     kind: Any = Annotated[option.type, DisallowNone]
     spec = constructors.ConstructorRegistry.get_primitive_spec(constructors.PrimitiveTypeInfo.make(kind, set()))
     if option.type is not bool and isinstance(spec, constructors.PrimitiveConstructorSpec):
@@ -293,12 +293,12 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
     # A flag that turns something off would say that its default is True.
     if option.default is None or option.default == () or option.default is True:
         kind = Annotated[kind, arg(help_behavior_hint="")]
-    said = option.helptext() if callable(option.helptext) else option.helptext
-    # Help takes an indented line of a docstring for a new paragraph.
-    return dataclasses.replace(option, type=kind, helptext=said and " ".join(said.split()))
+    text = option.helptext() if callable(option.helptext) else option.helptext
+    # Help would start a new paragraph at an indented line of a docstring.
+    return dataclasses.replace(option, type=kind, helptext=text and " ".join(text.split()))
 
 
-def _say_notes(error: BaseException) -> None:
-    """What went wrong besides, such as a device that could not be switched off."""
+def _print_notes(error: BaseException) -> None:
+    """Print what else went wrong, such as a device that could not be switched off."""
     for note in getattr(error, "__notes__", ()):
         print(f"animat: {' '.join(note.split())}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The command that starts a cluster on this machine, for a try."""
+"""The command that starts a cluster on this machine, to try one out."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class ClusterCommand:
     """A Dask scheduler and workers, for --cluster of train, study, reproduce and tune; until Ctrl-C."""
 
     where: Positional[Literal["local"]]
-    """local: on this machine, for a try; docs/cluster.md has the few lines for several"""
+    """local: on this machine, to try it out; docs/cluster.md has the few lines for several machines"""
     workers: int | None = None
-    """Processes, each on its own core; default: one a core"""
+    """Processes, each on its own core; default: one per core"""
     file: Path = Path("cluster.json")
-    """Where the scheduler writes its address; gone at the end"""
+    """Where the scheduler writes its address; removed at the end"""
     json: bool = False
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Keep it up."""
+        """Run it until Ctrl-C."""
         from animat.execution.local_cluster import local_cluster
 
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers

@@ -1,4 +1,4 @@
-"""The command that brings any recording into animat's own NWB."""
+"""The command that converts any recording to NWB."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from tyro.conf import Positional
 from animat.errors import InvalidArgument, InvalidFile
 from animat.writing import expect_writable
 
-OF_DETECTION = ("band_hz", "threshold", "dead_time_ms", "blank_ms")
-"""Options of finding spikes, which those of a file are not."""
+DETECTION_OPTIONS = ("band_hz", "threshold", "dead_time_ms", "blank_ms")
 
 
 @dataclass(frozen=True)
 class Convert:
-    """Write a recording of any rig as NWB, with who recorded it; find the spikes in raw traces where asked to."""
+    """Write a recording of any rig as NWB, with its metadata; optionally find the spikes in raw traces."""
 
     recording: Positional[Path]
-    """The recording: NWB, MaxWell, CL1, NPZ, CSV; with --reader whatever SpikeInterface reads"""
+    """The recording: NWB, MaxWell, CL1, NPZ, CSV; with --reader any format that SpikeInterface reads"""
     out: Path
     """The NWB file to write"""
     subject_id: str | None = None
-    """The culture's own name"""
+    """The culture's identifier"""
     species: str | None = None
-    """In Latin, such as "Mus musculus\""""
+    """Latin name, such as "Mus musculus\""""
     sex: Literal["M", "F", "U", "O"] | None = None
-    """Of the subject; U, unknown, where it is not given"""
+    """Of the subject; default: U, unknown"""
     age: str | None = None
     """ISO 8601 duration, such as P42D"""
     subject_description: str | None = None
@@ -36,37 +35,37 @@ class Convert:
     experimenter: str | None = None
     """"Last, First"; several separated by semicolons"""
     institution: str | None = None
-    """Where it was recorded"""
+    """Institution of the recording"""
     lab: str | None = None
-    """In which laboratory"""
+    """Laboratory of the recording"""
     keywords: str | None = None
     """Separated by commas"""
     recorded_at: str | None = None
     """ISO 8601 date, such as 2024-05-31T14:00:00+09:00"""
     experiment_description: str | None = None
-    """In words"""
+    """Description of the experiment"""
     start_min: float | None = None
     """Start on the culture's clock, in minutes"""
     start_s: float | None = None
-    """When the recording starts on the clock of its own times, in seconds, if the file does not say"""
+    """Start of the recording on the clock of its time stamps, in seconds, if the file does not state it"""
     stimuli: str | None = None
-    """Which of several things in the file are the stimuli (NWB: the name; MaxWell: the events' type)"""
+    """Which of several series or events in the file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     stimuli_path: Path | None = None
-    """File of stimuli beside CSV spikes or traces"""
+    """File of stimuli that belong to CSV spikes or traces"""
     part: str | None = None
     """Which of several recordings in the file, such as well000/rec0000"""
     raw: bool = False
-    """Find the spikes in the raw traces, in place of those that the rig found"""
+    """Find the spikes in the raw traces, instead of using those that the rig found"""
     reader: str | None = None
     """Find the spikes in traces of another format, by its name in SpikeInterface (to be installed), such as intan"""
     band_hz: tuple[float, float] = (100.0, 3000.0)
-    """Pass band of the filter for finding spikes; 0 0: the traces are filtered already"""
+    """Pass band of the filter for finding spikes; 0 0: the traces are already filtered"""
     threshold: float = 5.0
     """Depth of a spike, in standard deviations of its channel's noise"""
     dead_time_ms: float = 1.0
-    """Of two negative peaks within it, the deeper one is the spike"""
+    """Of two negative peaks within this time, the deeper one is the spike"""
     blank_ms: tuple[float, float] = (0.5, 1.5)
-    """From before to after each stimulus in which nothing is looked for"""
+    """Time before and after each stimulus in which no spikes are sought"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -83,9 +82,9 @@ class Convert:
                 "format with --reader where the folder is one recording"
             )
         finds_spikes = self.raw or self.reader is not None
-        given = [name for name in OF_DETECTION if getattr(self, name) != getattr(Convert, name)]
-        if given and not finds_spikes:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        changed = [name for name in DETECTION_OPTIONS if getattr(self, name) != getattr(Convert, name)]
+        if changed and not finds_spikes:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
             raise InvalidArgument(
                 f"{options}: expected only where spikes are found in raw traces; add --raw or --reader, or leave it out"
             )
@@ -97,7 +96,7 @@ class Convert:
             blank_ms=self.blank_ms,
             recovery_ms=max(20.0, self.blank_ms[1]),
         )
-        origin = Origin(**{each.name: getattr(self, each.name) for each in fields(Origin)})
+        origin = Origin(**{field.name: getattr(self, field.name) for field in fields(Origin)})
         with Bar("converting") as progress:
             recording = convert_recording(
                 self.recording,

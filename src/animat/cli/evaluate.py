@@ -8,7 +8,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.responses import Fitting, policies_for, say_findings
+from animat.cli.responses import SimulatorOptions, policies_for, print_warnings
 from animat.errors import AnimatError, InvalidArgument
 from animat.plain_file import read_plain_text
 from animat.records import json_data, write_json
@@ -18,34 +18,34 @@ _MOST_BYTES = 256 * 1024 * 1024
 
 
 @dataclass(frozen=True)
-class Evaluate(Fitting):
-    """Run trained policies, and controls beside them, on the simulator of a recording, made as in their training."""
+class Evaluate(SimulatorOptions):
+    """Run trained policies, and controls, on the simulator of a recording, made as in their training."""
 
     policies: Positional[Path] = Path("policies")
     """A policy file or a folder of them"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""
     at_min: float | None = None
-    """Minute on the culture's clock whose newest recording answers; default: the last recording"""
+    """Use the newest recording made by this minute of the culture's clock; default: the last recording"""
     episodes: int = 100
     """Episodes of each policy and control"""
     robot: str | None = None
-    """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    """The expected robot, with its import path: my_package.robots:Rover; default: the one they were trained on"""
     mapping: str | None = None
-    """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
+    """The expected mapping, with its import path: my_package.mappings:Steep; default: the one they were trained with"""
     drawn: bool = False
     """Draw actions from the policy, as in training, instead of taking the most probable one"""
     optimum: bool = False
-    """Also compute the best return that any controller could get there, and that of a mere reflex, and scores; a
-    minute, with memory some"""
+    """Also compute the best return that any controller could get there, that of the best reflex, and scores; takes a
+    minute, or several with a memory simulator"""
     interventions: bool = False
-    """Also say whose work it is: what the policies lose without the culture, with the stimuli of another episode,
-    with the mapping turned round; and, of a robot with several goals, what a switch of the goal does, and goal
+    """Also measure whose work it is: what the policies lose without the culture, with the stimuli of another episode,
+    and with the mapping turned round; and, for a robot with several goals, the effect of a switched goal, and goal
     information in bits"""
     seed: int = 1
     """Decides every random draw"""
     out: Path | None = None
-    """File for all of it as JSON; the live page of a training shows evaluation.json of the policies' folder"""
+    """JSON file for all results; the live page of a training shows evaluation.json of the policies' folder"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -79,7 +79,7 @@ class Evaluate(Fitting):
                 interventions=self.interventions,
                 progress=progress,
             )
-        say_findings(evaluation.findings)
+        print_warnings(evaluation.findings)
         print(evaluation.to_text())
         if self.out is not None:
             write_json(self.out, evaluation.to_dict())
@@ -87,14 +87,14 @@ class Evaluate(Fitting):
 
 
 def _expect_no_other(out: Path) -> None:
-    """Raise for a file that is no earlier evaluation: a recording or a policy would be gone."""
+    """Raise for a file that is not an earlier evaluation: a recording or a policy would be lost."""
     if not out.exists():
         return
     try:
-        found = json_data(read_plain_text(out, _MOST_BYTES), "--out")
+        data = json_data(read_plain_text(out, _MOST_BYTES), "--out")
     except AnimatError:
-        found = None
-    if not isinstance(found, dict) or "recorded_at_min" not in found:
+        data = None
+    if not isinstance(data, dict) or "recorded_at_min" not in data:
         raise InvalidArgument(
             f"--out: expected a new file or one of an earlier evaluation, got {out}, which is neither"
         )

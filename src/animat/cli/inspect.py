@@ -1,4 +1,4 @@
-"""The command that looks into recordings."""
+"""The command that inspects recordings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import Responding, say_findings
+from animat.cli.responses import ResponseOptions, print_warnings
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
 from animat.writing import expect_writable
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Inspect(Responding):
-    """Say what is in recordings, whether an Animat can be made of them, and what is wrong with them."""
+class Inspect(ResponseOptions):
+    """Report what is in recordings, whether an Animat can be made from them, and what is wrong with them."""
 
     recordings: Positional[tuple[Path, ...]] = ()
-    """Files, or folders of them: NWB, MaxWell, CL1, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv beside it)"""
+    """Files, or folders of them: NWB, MaxWell, CL1, NPZ, CSV (NAME_spikes.csv with NAME_stimuli.csv)"""
     stimuli: str | None = None
-    """Which of several things in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
+    """Which of several series or events in a file are the stimuli (NWB: the name; MaxWell: the events' type)"""
     part: str | None = None
     """Which of several recordings in a MaxWell file, such as well000/rec0000"""
     optimum: str | None = None
@@ -36,7 +36,7 @@ class Inspect(Responding):
     out: Path | None = None
     """Folder for figures; default: none are drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
-    """Of the figures"""
+    """Format of the figures"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -63,7 +63,7 @@ class Inspect(Responding):
         check_threshold(self.burst_threshold)
         files = list_recordings(self.recordings)
         if self.out is not None:
-            # The figures of the series have a name of their own.
+            # "series" is the stem of the series' own figures.
             expect_unlike_stems([file.name for file in files], "series")
         with Bar("inspecting") as progress:
             return self._inspect(files, by, window_ms, progress)
@@ -79,7 +79,7 @@ class Inspect(Responding):
         from animat.responses.inspection import inspect_recording
 
         inspected, series, unreadable = [], [], []
-        # Reading is one step of each file, drawing another, and the figures of the series are the last.
+        # Reading is one step per file, drawing another, and the figures of the series are the last step.
         steps = 1 if self.out is None else 2
         total = steps * len(files) + (self.out is not None)
         for number, file in enumerate(files):
@@ -93,14 +93,14 @@ class Inspect(Responding):
             except AnimatError as error:
                 if len(files) == 1:
                     raise
-                # The others may be whole.
+                # The others may be readable.
                 print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
                 unreadable.append(str(file))
                 continue
             print(inspection_text(inspection), end="\n\n")
             inspected.append(inspection.to_dict())
             if self.optimum is not None:
-                # Reading is over in no time beside it.
+                # It takes far longer than reading.
                 part = Part(progress, steps * number, 1, total, f"{file.name}, optimal return")
                 inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
             if self.out is not None:
@@ -110,7 +110,7 @@ class Inspect(Responding):
                 inspected[-1]["figures"] = figures
                 series.append((source.start_min, file, inspection.responses))
         unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
-        told: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
+        results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
         if self.out is not None and series:
             progress.update(total - 1, total, "figures of the series")
             first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
@@ -123,16 +123,16 @@ class Inspect(Responding):
             else:
                 if drawn:
                     print(f"figures of the series: {', '.join(map(str, drawn))}")
-                told["figures"] = [str(figure) for figure in drawn]
+                results["figures"] = [str(figure) for figure in drawn]
         if unreadable:
             others = "; the others were" if inspected else ""
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"
             print(f"animat: {count}, as said above{others}", file=sys.stderr)
-        return told
+        return results
 
 
 def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[str, Any]] | None:
-    """What a culture could do with a robot, printed; None where that cannot be told."""
+    """Print and return what a culture could do with a robot; None where that is not known."""
     from animat.compilation import keep_compilations
     from animat.evaluation.optimal_returns import optimal_returns
     from animat.robots.registry import robot_named
@@ -140,13 +140,13 @@ def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[s
     keep_compilations()
     try:
         progress.update(0, 1)
-        found = optimal_returns(responses, robot_named(robot), progress=progress)
+        optima = optimal_returns(responses, robot_named(robot), progress=progress)
     except (InvalidArgument, UnusableData) as error:
         print(f"{robot}: no optimal return: {error}\n")
         return None
     print(f"{robot}, on a histogram of these responses, without memory: a simulator with memory may allow more")
-    for each in found:
-        print(each.to_text())
-        say_findings(each.best.findings())
+    for optimum in optima:
+        print(optimum.to_text())
+        print_warnings(optimum.best.findings())
     print()
-    return [each.to_dict() for each in found]
+    return [optimum.to_dict() for optimum in optima]

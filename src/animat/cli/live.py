@@ -1,4 +1,4 @@
-"""The command that records, trains and runs on one culture while it lives."""
+"""The command that records, trains and runs on one culture."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.named_numbers import read_sac
-from animat.cli.stimulating import Stimulating, expect_no_fault
+from animat.cli.stimulation import StimulationOptions, expect_no_fault
 from animat.errors import InvalidArgument
 from animat.writing import exclusive_lock
 
@@ -21,55 +21,55 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Live(Stimulating):
-    """Parameter shadowing on one culture while it lives: record, train, refresh, then run in closed loop."""
+class Live(StimulationOptions):
+    """Parameter shadowing on one culture as it changes: record, train, refresh, then run in closed loop."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, swing-up, or one of your own, such as
-    my_package.robots:Rover"""
+    """The robot to drive: cartpole, navigation, swing-up, or your own, such as my_package.robots:Rover"""
     mapping: str = "9-thresholds"
-    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
+    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or your own, such as
     my_package.mappings:Steep"""
     goal: str | None = None
-    """What is wanted of the robot in place of its own task, as --goal of animat train"""
+    """A goal that replaces the robot's own task, as --goal of animat train"""
     policies: int = 4
-    """How many policies, each from its own random numbers"""
+    """Number of policies, each with its own random numbers"""
     order: Literal["mixed", "blocked"] = "mixed"
-    """How recordings are presented; mixed is how a closed loop presents"""
+    """Order of the trials in recordings; a closed loop presents mixed trials"""
     pulses: int = 1
-    """Pulses per trial, the last one read"""
+    """Pulses per trial; the response to the last one is read"""
     trials: int = 500
-    """Of each frequency in a recording"""
+    """Trials of each frequency in a recording"""
     interval_min: float = 10.0
     """Minutes of the culture's clock from one recording to the next"""
     duration_min: float = 60.0
     """Minutes of the culture's clock that training lasts"""
     speed: float | None = None
-    """Minutes of the culture's clock in one of ours; default: 30 for a simulated culture, 1 for a living one"""
+    """Minutes of the culture's clock per minute of real time; default: 30 for a simulated culture, 1 for a living
+    one"""
     episodes: int = 5
-    """Of each policy in closed loop, at the end"""
+    """Episodes of each policy in closed loop, at the end"""
     controls: Literal["all", "random"] = "all"
-    """Run between the policies' episodes"""
+    """Controls to run between the policies' episodes"""
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
+    """memory: draw a response that was measured after a similar history, the default except for recordings in blocks;
     histogram: the paper's; empirical: draw any measured value"""
     sac: tuple[str, ...] = ()
-    """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
+    """Settings of the algorithm that replace its defaults, such as discount=0.98 learning_rate=3e-4"""
     recordings: tuple[Path, ...] = ()
-    """For a replay: what it answers from"""
+    """For a replay: the recordings that it responds from"""
     seed: int = 1
-    """Decides every random draw, but what the culture does and when simulators are swapped"""
+    """Decides every random draw, except what the culture does and when simulators are swapped"""
     out: Path = Path("live")
     """Folder for recordings, policies, the session, and live.log"""
     watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
+    """Serve a live page for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Live."""
+        """Record, train and run."""
         from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
@@ -85,15 +85,15 @@ class Live(Stimulating):
 
         simulated = self.culture in ("virtual", "replay")
         if self.speed is not None and self.speed != 1 and not simulated:
-            raise InvalidArgument(f"--speed: expected 1, as a living culture has its own time, got {self.speed:g}")
+            raise InvalidArgument(f"--speed: expected 1, as a living culture runs in real time, got {self.speed:g}")
         if (self.culture == "replay") != bool(self.recordings):
             raise InvalidArgument(
                 f"--recordings: expected some for a replay and none for others, got {len(self.recordings)} for "
                 f"{self.culture}: a live run records the culture itself"
             )
         self._expect_culture_seed()
-        default_speed = 30.0 if simulated else 1.0
-        timetable = Timetable(self.interval_min, self.duration_min, default_speed if self.speed is None else self.speed)
+        speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
+        timetable = Timetable(self.interval_min, self.duration_min, speed)
         robot = robot_named(self.robot)
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         training = Training(
@@ -107,13 +107,13 @@ class Live(Stimulating):
         )
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         protocol = Protocol(order=self.order, pulses=self.pulses, trials=self.trials, pulse=pulse_for(self.culture))
-        settings = self._of_the_loop()
+        settings = self._loop_settings()
         check_plan(training, protocol, self.out, timetable, self.episodes, settings, account)
         keep_compilations()
         recordings = read_recordings(self.recordings) if self.recordings else []
         seed = 1 if self.culture_seed is None else self.culture_seed
         with (
-            ExitStack() as told,
+            ExitStack() as stack,
             exclusive_lock(self.out),
             Bar("culture") as progress,
             culture_of(
@@ -135,8 +135,8 @@ class Live(Stimulating):
                 report=partial(print, file=sys.stderr),
                 **settings,
             )
-            # It is told even where the culture cannot be closed then.
-            told.callback(self._report, ran)
+            # Reported even if closing the culture fails.
+            stack.callback(self._report, ran)
         return ran.to_dict()
 
     def _report(self, ran: LiveRun) -> None:
@@ -144,7 +144,7 @@ class Live(Stimulating):
 
         print(
             f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
-            f"({ran.wall_s:.0f} s of ours); {ran.iterations:,} iterations of each policy, never stopped; "
+            f"({ran.wall_s:.0f} s of real time); {ran.iterations:,} iterations of each policy without a pause; "
             f"{len(ran.swaps)} swaps of simulators:"
         )
         for swap in ran.swaps:

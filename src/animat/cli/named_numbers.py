@@ -1,4 +1,4 @@
-"""Options of numbers by name: `NAME=VALUE ...`, of robots and of the algorithm."""
+"""Options that take named numbers, `NAME=VALUE ...`: parameters of robots and settings of the algorithm."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def read_numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
-    """What was given as `NAME=NUMBER`, by name, each once (else InvalidArgument); whole numbers stay whole."""
+    """Read `NAME=NUMBER` pairs, each name once (else InvalidArgument); whole numbers stay whole."""
     numbers: dict[str, float] = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
@@ -27,7 +27,7 @@ def read_numbers(option: str, pairs: Sequence[str]) -> dict[str, float]:
 
 
 def read_sac(pairs: Sequence[str]) -> SAC:
-    """The algorithm's settings, those given in place of its defaults; InvalidArgument for one that cannot be."""
+    """The algorithm's settings, with `pairs` in place of its defaults; InvalidArgument for an impossible one."""
     from animat.training.settings import SAC
 
     numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]

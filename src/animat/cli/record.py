@@ -1,4 +1,4 @@
-"""The command that records a culture, whichever it is, at intervals."""
+"""The command that records a culture at intervals."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ _PRESENTED = ("order", "pulses", "trials", "places")
 
 @dataclass(frozen=True)
 class Record:
-    """Record a culture: one NWB file a recording. Goes on where it stopped."""
+    """Record a culture: one NWB file per recording. Resumes where it stopped."""
 
     culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
-    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1 and maxone: the devices"""
+    """virtual: simulated neurons on a simulated array; replay: responds from recordings; cl1 and maxone: the devices"""
     recordings: tuple[Path, ...] = ()
-    """For a replay: what it answers from"""
+    """For a replay: the recordings that it responds from"""
     selection: Path | None = None
-    """For a maxone: the file of its electrodes"""
+    """For a MaxOne: the file of its electrodes"""
     seed: int = 1
-    """Which culture; of a replay or a device the order of stimuli, and a CL1's patterns"""
+    """Which virtual culture; for a replay or a device the order of stimuli, and a CL1's patterns"""
     paper: bool = False
     """The paper's protocol: blocks of one frequency, 100 trials of each, 15 recordings; default: what a closed
     loop needs, frequencies mixed, 1,000 trials of each, 2 recordings"""
     sessions: int | None = None
-    """How many recordings; default: 2, with --paper 15"""
+    """Number of recordings; default: 2, with --paper 15"""
     interval_min: float = 10.0
     """Minutes from one recording to the next"""
     order: Literal["blocked", "mixed"] | None = None
     """mixed: frequencies shuffled, as in a closed loop, the default; blocked: all stimuli of one together (paper)"""
     pulses: int | None = None
-    """Pulses per trial, the last one read; default: 1"""
+    """Pulses per trial; the response to the last one is read; default: 1"""
     trials: int | None = None
-    """Presentations at each frequency, and at each place of --places; default: 1000, proportionally fewer with several
+    """Trials of each frequency, and of each place of --places; default: 1000, proportionally fewer with several
     pulses or places (except corners); with --paper 100"""
     places: str | None = None
-    """corners: four places at 20 Hz, for a robot with two commands; halves, quadrants, or a file of JSON with groups of
-    electrodes, [[1, 2], [3, 4]]: each at each frequency is a condition then, presented so often; default: at each
-    frequency all of the culture's patterns"""
+    """corners: four places at 20 Hz, for a robot with two commands; halves, quadrants, or a JSON file with groups of
+    electrodes, [[1, 2], [3, 4]]: each place at each frequency is then a condition with that many trials; default: all
+    of the culture's patterns at each frequency"""
     protocol: Path | None = None
-    """A file of JSON in place of these, as Protocol.to_json writes it, with frequencies, times and pulse too; what it
-    leaves out is as by default"""
+    """A JSON file that replaces these options, as Protocol.to_json writes it, with frequencies, times and pulse too;
+    what it leaves out has its default"""
     out: Path = Path("recordings")
     """Folder for the files"""
     watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
+    """Serve a live page for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -62,42 +62,37 @@ class Record:
         """Record."""
         from animat.progress import Bar
 
-        if (self.culture == "replay") != bool(self.recordings):
-            raise InvalidArgument(
-                "--recordings: expected some for --culture replay, got none"
-                if self.culture == "replay"
-                else f"--recordings: expected none for --culture {self.culture}, got {len(self.recordings)}"
-            )
-        if (self.culture == "maxone") != (self.selection is not None):
-            raise InvalidArgument(
-                "--selection: expected a file of electrodes for --culture maxone, got none"
-                if self.culture == "maxone"
-                else f"--selection: expected none for --culture {self.culture}, got {self.selection}"
-            )
         # Before any device is powered.
+        for option, some, kind, value in (
+            ("--recordings", "some", "replay", len(self.recordings) or None),
+            ("--selection", "a file of electrodes", "maxone", self.selection),
+        ):
+            if (self.culture == kind) != (value is not None):
+                expected, got = (some, "none") if value is None else ("none", value)
+                raise InvalidArgument(f"{option}: expected {expected} for --culture {self.culture}, got {got}")
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
-        asked = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
-        asked += ["--paper"] if self.paper else []
-        if asked and self.protocol is not None:
-            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(asked)} too; put them into the file")
+        options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
+        options += ["--paper"] if self.paper else []
+        if options and self.protocol is not None:
+            raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(options)} too; put them in the file")
         protocol = self._protocol()
         if self.protocol is not None:
-            _say_too_fast(protocol)
+            _warn_too_fast(protocol)
         if protocol.is_rest:
             print(
-                'warning: the only place is "none", so nothing is ever delivered, and no robot can be driven by '
+                'warning: the only place is "none", so nothing is ever delivered, and no robot can be driven with '
                 "such recordings; to stimulate, add groups of electrodes",
                 file=sys.stderr,
             )
         _expect_no_others(self.out)
-        there = set(self.out.glob("*"))
+        before = set(self.out.glob("*"))
         with Bar("recording") as progress:
             files = self._series(progress)
-        were_there = "; all were there already" if files and there.issuperset(self.out.glob("*")) else ""
-        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{were_there}")
+        existed = "; all existed already" if files and before.issuperset(self.out.glob("*")) else ""
+        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{existed}")
         if protocol.places:
-            print("each place is a condition; --conditions frequency mixes the places")
+            print("each place is a condition; --conditions frequency pools the places")
         return {"recordings": [str(file) for file in files]}
 
     def _series(self, progress: Progress) -> list[Path]:
@@ -110,10 +105,10 @@ class Record:
             lambda: culture_of(
                 self.culture, seed=self.seed, recordings=recordings, selection=self.selection, progress=progress
             ),
-            # A virtual culture has as many patterns as are usual.
+            # A virtual culture has the usual number of patterns.
             self._protocol() if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
             self.out,
-            sessions=self._sessions,
+            sessions=(15 if self.paper else 2) if self.sessions is None else self.sessions,
             interval_min=self.interval_min,
             seed=self.seed,
             progress=progress,
@@ -122,14 +117,8 @@ class Record:
             print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
         return series.files
 
-    @property
-    def _sessions(self) -> int:
-        if self.sessions is not None:
-            return self.sessions
-        return 15 if self.paper else 2
-
     def _protocol(self, patterns: int = 100) -> Protocol:
-        """What is asked for; of what is not said, the usual for a culture of this kind with so many patterns."""
+        """The protocol of the options, with the usual values for the culture's kind and number of patterns."""
         from animat.cultures.kinds import pulse_for
         from animat.stimulation.places import read_places
         from animat.stimulation.protocol import CLOSED_LOOP, PAPER, TWO_COMMANDS, read_protocol
@@ -138,35 +127,35 @@ class Record:
         usual = replace(PAPER if self.paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
-        asked = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
-        asked["places"] = None if self.places is None else read_places(self.places)
-        protocol = replace(usual, **{name: value for name, value in asked.items() if value is not None})
+        options = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
+        options["places"] = None if self.places is None else read_places(self.places)
+        protocol = replace(usual, **{name: value for name, value in options.items() if value is not None})
         if self.trials is not None or self.paper:
             return protocol
-        # Of several pulses, or of more conditions, fewer: a recording takes as long, and is over when the next is due.
+        # Fewer with several pulses or more conditions: the recording takes as long, and ends before the next is due.
         times = protocol.pulses * (1 if self.places == "corners" else max(1, protocol.n_places))
         return replace(protocol, trials=max(1, protocol.trials // times))
 
 
 def _expect_no_others(folder: Path) -> None:
-    """Raise for recordings of no series, which would be read as if they were of this one, and for other work."""
+    """Raise for recordings of no series, which would be read as part of this one, and for other work."""
     if not folder.is_dir():
         return
     expect_no_other(folder, "recording")
     others = sorted(file.name for file in folder.glob("[!.]*.nwb") if not file.name.startswith("recording_"))
     if others:
         shown = f"{', '.join(others[:3])}{' ...' if len(others) > 3 else ''}"
-        raise Mismatch(f"{folder}: expected no recordings but those of this series, got {shown}; choose another --out")
+        raise Mismatch(f"{folder}: expected only recordings of this series, got {shown}; choose another --out")
 
 
-def _say_too_fast(protocol: Protocol) -> None:
-    """Warn of frequencies whose pulses come before the response to the one before is over."""
+def _warn_too_fast(protocol: Protocol) -> None:
+    """Warn of frequencies whose next pulse comes before the response window ends."""
     from animat.responses.windows import DEFAULT_WINDOW_MS
 
     fast = [f"{hz:g} Hz" for hz in protocol.frequencies_hz if 1000 / hz < DEFAULT_WINDOW_MS[1]]
     if fast:
         print(
             f"warning: at {', '.join(fast)} the next pulse comes before the response window ends at "
-            f"{DEFAULT_WINDOW_MS[1]:g} ms, so that responses hold its artefact: read them with a shorter --window-ms",
+            f"{DEFAULT_WINDOW_MS[1]:g} ms, so responses contain its artefact: read them with a shorter --window-ms",
             file=sys.stderr,
         )

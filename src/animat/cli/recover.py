@@ -1,4 +1,4 @@
-"""The command that makes a recording of a session that was killed."""
+"""The command that recovers the recording of a session that was killed."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class Recover:
 
     def run(self) -> dict[str, Any]:
         """Recover."""
-        from animat.closed_loop.session import recover_session, told_lost, told_unanswered
+        from animat.closed_loop.session import lost_message, recover_session, unanswered_message
         from animat.progress import Bar
 
         with Bar("reading the log") as progress:
             session = recover_session(self.session, progress)
-        told = session.to_dict()
+        summary = session.to_dict()
         print(
-            f"{session.recording_file} and {session.ticks_file.name}: {told['ticks']} ticks, {told['pulses']} pulses; "
-            f"it ended: {told['ended']}"
+            f"{session.recording_file} and {session.ticks_file.name}: {summary['ticks']} ticks, "
+            f"{summary['pulses']} pulses; it ended: {summary['ended']}"
         )
-        if told["unanswered_pulses"]:
-            print(told_unanswered(session))
-        if told["lost_bytes"]:
-            print(told_lost(told["lost_bytes"]))
-        return {"recording": str(session.recording_file), **told}
+        if summary["unanswered_pulses"]:
+            print(unanswered_message(session))
+        if summary["lost_bytes"]:
+            print(lost_message(summary["lost_bytes"]))
+        return {"recording": str(session.recording_file), **summary}

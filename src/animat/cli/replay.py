@@ -8,29 +8,29 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.responses import Fitting, policies_for
+from animat.cli.responses import SimulatorOptions, policies_for
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.plain_file import is_nothing
 
 
 @dataclass(frozen=True)
-class Replay(Fitting):
+class Replay(SimulatorOptions):
     """Film a closed-loop session, or policies on the simulator, in real time: robot, spikes, command and return."""
 
     source: Positional[Path] = Path("session")
-    """A session's folder, also of one that was killed; or a policy file or a folder of them"""
+    """A session's folder, even if it was killed; or a policy file or a folder of them"""
     recordings: tuple[Path, ...] = ()
-    """Of policies: files or folders of recordings of one culture, whose simulator answers"""
+    """For policies: files or folders of recordings of one culture, whose simulator responds"""
     at_min: float | None = None
-    """Of policies: minute whose newest recording answers; default: the last recording"""
+    """For policies: use the newest recording made by this minute; default: the last recording"""
     span_s: tuple[float, float] | None = None
-    """What to show, in s from the start; default: a minute, of a session from just before the first move"""
+    """What to show, in s from the start; default: a minute, for a session from just before the first move"""
     robot: str | None = None
-    """The robot that is expected, and imported: my_package.robots:Rover"""
+    """The expected robot, with its import path: my_package.robots:Rover"""
     mapping: str | None = None
-    """Of policies: the mapping that is expected, and imported: my_package.mappings:Steep"""
+    """For policies: the expected mapping, with its import path: my_package.mappings:Steep"""
     seed: int = 1
-    """Of policies: decides every random draw"""
+    """For policies: decides every random draw"""
     out: Path = Path("film.gif")
     """The film: .gif, or .mp4, which needs animat[film]"""
     json: bool = False
@@ -38,7 +38,7 @@ class Replay(Fitting):
 
     def run(self) -> dict[str, Any]:
         """Film."""
-        from animat.closed_loop.session import told_lost
+        from animat.closed_loop.session import lost_message
         from animat.progress import Bar
         from animat.report.film.session import is_session, scene_of_session
         from animat.report.film.writing import check_film, write_film
@@ -53,12 +53,12 @@ class Replay(Fitting):
         if is_nothing(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
-            for option, given in (
+            for option, value in (
                 ("--recordings", self.recordings or None),
                 ("--at-min", self.at_min),
                 ("--mapping", self.mapping),
             ):
-                if given is not None:
+                if value is not None:
                     raise InvalidArgument(f"{option}: expected none with a session, which is shown as it was")
             scene = scene_of_session(self.source, self.span_s)
             if expected not in (None, scene.robot.name):
@@ -72,9 +72,13 @@ class Replay(Fitting):
             write_film(scene, self.out, progress)
         print(f"{self.out}: {scene.title}, {scene.start_s:g} to {scene.stop_s:.1f} s")
         if scene.lost_bytes:
-            print(told_lost(scene.lost_bytes))
-        told = {"film": str(self.out), "span_s": [scene.start_s, scene.stop_s], "robot": scene.robot.name}
-        return told | {"lost_bytes": scene.lost_bytes}
+            print(lost_message(scene.lost_bytes))
+        return {
+            "film": str(self.out),
+            "span_s": [scene.start_s, scene.stop_s],
+            "robot": scene.robot.name,
+            "lost_bytes": scene.lost_bytes,
+        }
 
     def _on_simulator(self) -> Any:
         from animat.report.film.simulated import scene_of_policies

@@ -1,4 +1,4 @@
-"""The command that runs the studies that come with animat: the paper's, and that of context."""
+"""The command that runs the studies that come with animat: the paper's, and the context study."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from animat.cli.jobs import JobOptions
 from animat.cli.study import run_and_report
-from animat.cli.working import Working
 from animat.errors import InvalidArgument
 
 
 @dataclass(frozen=True)
-class Ours:
-    """Which of the studies that come with animat; its options come before those of all."""
+class StudyOptions:
+    """Which of the studies that come with animat; a base class, so that help lists these options first."""
 
     study: Literal["paper", "context"] = "paper"
     """paper: the paper's comparisons; context: which tasks need more than a reflex, what the policies do beyond one,
-    and whose work it is; for a study of your own: animat study FILE"""
+    and whose work it is; for your own study: animat study FILE"""
     quick: bool = False
-    """Every step with fewer policies, iterations and recordings: a first look, no results"""
+    """Every step with fewer policies, iterations and recordings: a first look, not results"""
     culture_seed: str = "1"
     """Which virtual culture; several: 1-5, or 1,3,8"""
     seed: int = 1
@@ -27,8 +27,8 @@ class Ours:
 
 
 @dataclass(frozen=True)
-class Reproduce(Working, Ours):
-    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Goes on where it stopped."""
+class Reproduce(JobOptions, StudyOptions):
+    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Resumes where it stopped."""
 
     def run(self) -> dict[str, Any]:
         """Run it."""
@@ -55,16 +55,16 @@ class Reproduce(Working, Ours):
         from animat.studies.context_tasks import ContextStudy, quick_context_study
 
         study = (quick_context_study if self.quick else ContextStudy)(cultures=tuple(cultures), seed=self.seed)
-        with self.at_work("study") as how:
-            found = run_context_study(study, self.out, **how)
-        report = write_context_page(study, found)
+        with self.executing("study") as execution:
+            results = run_context_study(study, self.out, **execution)
+        report = write_context_page(study, results)
         for robot in study.robots:
-            print(f"{robot}: {in_short([row for row in found.rows if row.robot == robot])}")
+            print(f"{robot}: {in_short([row for row in results.rows if row.robot == robot])}")
         print(f"report: {report}")
         return {
-            "folder": str(found.folder),
+            "folder": str(results.folder),
             "report": str(report),
-            "done_now_cpu_s": found.done_now,
-            "rows": [asdict(row) for row in found.rows],
-            "lost": [asdict(row) for row in found.lost],
+            "done_now_cpu_s": results.done_now,
+            "rows": [asdict(row) for row in results.rows],
+            "lost": [asdict(row) for row in results.lost],
         }

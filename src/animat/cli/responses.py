@@ -1,4 +1,4 @@
-"""What commands that read responses share: their options, and how findings are said."""
+"""What commands that read responses share: their options, and how warnings are printed."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Responding:
+class ResponseOptions:
     """How responses are read from recordings; the same in every command that reads them."""
 
     conditions: str | None = None
-    """What the agent picks from: frequency, interval:5,10+-25%, electrode, pattern, "frequency x electrode", all;
+    """What the agent chooses from: frequency, interval:5,10+-25%, electrode, pattern, "frequency x electrode", all;
     default: by frequency, and by place where places were recorded"""
     window_ms: tuple[float, float] | None = None
     """Start and end of the response window after a stimulus, in ms; default: 2 10"""
     burst_threshold: float | None = None
-    """Share of active channels above which a response is a burst; 1 keeps all; default: where two groups part"""
+    """Share of active channels above which a response is a burst; 1 keeps all; default: where two groups separate"""
 
 
 @dataclass(frozen=True)
-class Fitting(Responding):
-    """How a neuron simulator is made of responses."""
+class SimulatorOptions(ResponseOptions):
+    """How a neuron simulator is made from responses."""
 
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """memory: draw a response that was measured after a similar history, the default but for recordings in blocks;
+    """memory: draw a response that was measured after a similar history, the default except for recordings in blocks;
     histogram: the paper's; empirical: draw any measured value"""
     bins: int | None = None
     """Bins of a histogram; default: 20"""
     range_hz: float | None = None
-    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: edges at percentiles of each recording"""
+    """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: edges at percentiles of each recording"""
     allow: tuple[str, ...] = ()
     """Findings to allow, by name, such as dead-window"""
 
     def timeline(
         self, recordings: Sequence[Path], trained: Policy | None = None, readouts: str | Readouts | None = None
     ) -> SimulatorTimeline:
-        """Read the recordings and fit a simulator to each: as those that a policy was trained on, unless asked."""
+        """Read the recordings and fit a simulator to each, by the options and otherwise as in a policy's training."""
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_sources
         from animat.responses.conditions import conditions_named
@@ -56,7 +56,7 @@ class Fitting(Responding):
         from animat.responses.windows import DEFAULT_WINDOW_MS
 
         fitted = {} if trained is None else trained.fitted
-        fit = fit_as(fitted, self.simulator, self.bins, self.range_hz)
+        fit = simulator_settings(fitted, self.simulator, self.bins, self.range_hz)
         if not recordings:
             raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
         by = self.conditions or fitted.get("by")
@@ -69,52 +69,56 @@ class Fitting(Responding):
             readouts=readouts or (ALL if trained is None else trained.readouts),
         )
         timeline = fit_timeline(series, **fit)
-        say_findings(timeline.findings)
+        print_warnings(timeline.findings)
         return timeline
 
     def timeline_for(self, policies: Mapping[str, Policy], recordings: Sequence[Path]) -> SimulatorTimeline | None:
-        """As the training of policies had it, by the first that has a mapping; None where none has one."""
+        """Simulators as in the training of the first policy with a mapping; None if no policy has one."""
         trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
         return None if trained is None else self.timeline(recordings, trained)
 
 
-def fit_as(trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None) -> dict[str, Any]:
-    """How simulators are made: as those that policies were trained on, unless another kind is asked for.
+def simulator_settings(
+    trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None
+) -> dict[str, Any]:
+    """Settings of simulators: those of the policies' training, unless a kind is requested.
 
-    Whoever asks for bins asks for a histogram. A kind of None is what suits the recordings (`fit_timeline`).
+    Bins request a histogram. With a kind of None the recordings decide (`fit_timeline`).
 
     Raises:
         InvalidArgument: for bins of a kind that has none.
     """
-    usual = {"kind": None, "bins": 20, "range_hz": None}
-    asked = {"kind": kind, "bins": bins, "range_hz": range_hz}
-    given = (asked,) if kind is not None else (trained, asked)
-    made = usual | {name: known[name] for known in given for name in usual if known.get(name) is not None}
+    defaults = {"kind": None, "bins": 20, "range_hz": None}
+    requested = {"kind": kind, "bins": bins, "range_hz": range_hz}
+    sources = (requested,) if kind is not None else (trained, requested)
+    settings = defaults | {
+        name: source[name] for source in sources for name in defaults if source.get(name) is not None
+    }
     for option, value in (("--bins", bins), ("--range-hz", range_hz)):
         if value is None:
             continue
-        made["kind"] = made["kind"] or "histogram"
-        if made["kind"] != "histogram":
+        settings["kind"] = settings["kind"] or "histogram"
+        if settings["kind"] != "histogram":
             raise InvalidArgument(
-                f"{option}: expected none, as a simulator of kind {made['kind']} has no bins; got {value:g}"
+                f"{option}: expected none, as a simulator of kind {settings['kind']} has no bins; got {value:g}"
             )
-    return made
+    return settings
 
 
-def say_findings(findings: Sequence[Finding]) -> None:
-    """Warnings go to standard error, so that they are seen and results stay readable; notes are for `inspect`.
+def print_warnings(findings: Sequence[Finding]) -> None:
+    """Print warnings to standard error, where they are seen and do not mix with results; notes are for `inspect`.
 
-    What is found in several recordings is told once, where it is worst, with how many others there are.
+    A warning about several recordings is printed once, for the worst of them, with the number of the others.
     """
     for message in warnings_once(findings):
         print(f"warning: {message}", file=sys.stderr)
 
 
 def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:
-    """The policies of a file or a folder, and a robot and a mapping of one's own imported for them.
+    """Load the policies of a file or a folder, after importing their custom robot and mapping.
 
     Raises:
-        Mismatch: for policies of another robot or mapping than was named.
+        Mismatch: for policies with a different robot or mapping.
     """
     from animat.coding.checking import check_mapping
     from animat.coding.mapping import REGISTRY as MAPPINGS
@@ -125,7 +129,7 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
     from animat.training.policy import load_policies
 
     expected = None if robot is None else REGISTRY.name_of(robot)
-    asked = mapping if mapping in (None, "none") else MAPPINGS.name_of(mapping)
+    expected_mapping = mapping if mapping in (None, "none") else MAPPINGS.name_of(mapping)
     policies = load_policies(path)
     for name, policy in policies.items():
         if expected not in (None, policy.robot.name):
@@ -134,10 +138,10 @@ def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str
                 "or no --robot"
             )
         got = "none" if policy.mapping is None else policy.mapping.name
-        if asked not in (None, got):
+        if expected_mapping not in (None, got):
             raise Mismatch(
-                f"{path}, {name}: expected a policy with the mapping {asked}, got one with {got}; give others, or "
-                "no --mapping"
+                f"{path}, {name}: expected a policy with the mapping {expected_mapping}, got one with {got}; give "
+                "others, or no --mapping"
             )
         if not is_ours(without_goal(policy.robot)):
             check_robot(policy.robot)

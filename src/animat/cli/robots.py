@@ -1,4 +1,4 @@
-"""The command that lists the robots: what each observes, and what it can do."""
+"""The command that lists the robots: what each observes and what it can do."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Robots:
     """List the robots that can be trained: what each observes, its parameters, and what it can do."""
 
     names: Positional[tuple[str, ...]] = ()
-    """Which of them, such as cartpole or my_package.robots:Rover; default: all that are known here"""
+    """Robots to list, such as cartpole or my_package.robots:Rover; default: all registered robots"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -25,16 +25,16 @@ class Robots:
         listed, unusable = {}, {}
         for name in self.names or REGISTRY.names():
             try:
-                listed[name] = _told(name)
+                listed[name] = _describe(name)
             except Exception as error:
-                # Anything may go wrong in somebody else's robot. Of all that packages announce the others are listed.
-                wrong = f"{name}: expected a robot, got {type(error).__name__}: {error}"
-                said = error if isinstance(error, InvalidArgument) else InvalidArgument(wrong)
+                # Another package's robot may raise anything. Unless it was named, the other robots are still listed.
+                message = f"{name}: expected a robot, got {type(error).__name__}: {error}"
+                refusal = error if isinstance(error, InvalidArgument) else InvalidArgument(message)
                 if self.names:
-                    raise said from error
-                unusable[name] = str(said)
+                    raise refusal from error
+                unusable[name] = str(refusal)
         for name, robot in listed.items():
-            observed = ", ".join(f"{each['name']} ({each['unit']})" for each in robot["observes"])
+            observed = ", ".join(f"{quantity['name']} ({quantity['unit']})" for quantity in robot["observes"])
             numbers = {k: f"{v:g}" if isinstance(v, float) else v for k, v in robot["parameters"].items()}
             parameters = " ".join(f"{key}={value}" for key, value in numbers.items())
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
@@ -47,7 +47,7 @@ class Robots:
         return {"robots": listed, "unusable": unusable}
 
 
-def _told(name: str) -> dict[str, Any]:
+def _describe(name: str) -> dict[str, Any]:
     from animat.registry import is_ours
     from animat.robots import robot_named, robot_to_dict
     from animat.robots.base import WITHOUT, lacking
@@ -59,7 +59,7 @@ def _told(name: str) -> dict[str, Any]:
     lacks = lacking(robot)
     return {
         "is": (type(robot).__doc__ or "").strip().partition("\n")[0],
-        "observes": [{"name": each.name, "unit": each.unit} for each in robot.observation_spec],
+        "observes": [{"name": quantity.name, "unit": quantity.unit} for quantity in robot.observation_spec],
         "parameters": robot_to_dict(robot)["parameters"],
         "commands": robot.n_commands,
         "can": [name for name in WITHOUT if name not in lacks],

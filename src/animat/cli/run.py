@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import fit_as, policies_for
-from animat.cli.stimulating import Stimulating, expect_no_fault
+from animat.cli.responses import policies_for, simulator_settings
+from animat.cli.stimulation import StimulationOptions, expect_no_fault
 from animat.errors import InvalidArgument, Mismatch, in_min
 from animat.plain_file import expect_no_file
 from animat.writing import exclusive_lock
@@ -32,53 +32,56 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Run(Stimulating):
-    """Run policies in closed loop on a culture, with controls between them: predicted against measured return."""
+class Run(StimulationOptions):
+    """Run policies in closed loop on a culture, interleaved with controls: predicted against measured return."""
 
     policies: Positional[Path] = Path("policies")
     """A policy file or a folder of them"""
     robot: str | None = None
-    """The robot that is expected, and imported: my_package.robots:Rover; default: the one they were trained on"""
+    """The expected robot, with its import path: my_package.robots:Rover; default: the one they were trained on"""
     mapping: str | None = None
-    """The mapping that is expected, and imported: my_package.mappings:Steep; default: the one they were trained with"""
+    """The expected mapping, with its import path: my_package.mappings:Steep; default: the one they were trained with"""
     recordings: tuple[Path, ...] = ()
-    """Recordings the policies were trained on: their percentiles and prediction"""
+    """Recordings that the policies were trained on, for percentiles and prediction"""
     at_min: float | None = None
-    """Minute whose newest recording is taken; default: the last that the policies were trained on"""
+    """Calibrate by the newest recording made by this minute; default: the last that the policies were trained on"""
     protocol: Path | None = None
     """The file of record --protocol that the recordings were made with, if they do not state their pulse"""
     state: Path | None = None
-    """State of a virtual culture to go on from; default: culture.state beside the recordings, where there is one"""
+    """State that a virtual culture continues from; default: culture.state next to the recordings, if it exists"""
     episodes: int = 5
-    """Of each policy; of each control as many at most, and together no more than of policies, but 5 each"""
+    """Episodes of each policy; each control has at most as many, all controls together as many as all policies, but
+    each at least 5"""
     controls: Literal["all", "random", "coupling"] = "all"
     """all: random, constant, silent, shuffled and heuristic; random: only that one; coupling: all, and the best reflex,
-    which is searched for on the simulator first, a minute"""
+    searched for on the simulator first, which takes a minute"""
     interventions: bool = False
-    """Also say whose work it is: the policies with random spikes in place of responses, the stimuli of another episode,
-    the mapping turned round and, of a robot with several goals, the goal switched in mid-episode"""
+    """Also measure whose work it is: run the policies with random spikes in place of responses, with the stimuli of
+    another episode, with the mapping turned round and, for a robot with several goals, with the goal switched in
+    mid-episode"""
     pulses: int | None = None
-    """Pulses per trial; default: as the policies' recordings had"""
+    """Pulses per trial; default: as in the policies' recordings"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """That predicts, as for animat train; default: as the policies were trained"""
+    """The simulator that predicts, as for animat train; default: as in the policies' training"""
     bins: int | None = None
-    """Bins of a histogram; default: as the policies were trained"""
+    """Bins of a histogram; default: as in the policies' training"""
     range_hz: float | None = None
-    """Bins equally wide from 0 to here, in Hz (the paper: 120); default: as the policies were trained"""
+    """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: as in the policies' training"""
     burst_threshold: float | None = None
-    """Share of active channels above which a response is a burst; 1: none is; default: as the policies were trained"""
+    """Share of active channels above which a response is a burst; 1: no response is; default: as in the policies'
+    training"""
     allow: tuple[str, ...] = ()
-    """Findings on the recordings to allow, by name"""
+    """Findings about the recordings to allow, by name"""
     real_time: bool = False
-    """Hold a simulated culture back to real time; a living one always runs in it"""
+    """Hold a simulated culture back to real time; a living one always runs in real time"""
     drawn: bool = False
     """Draw actions from the policies, as in training, instead of taking the most probable one"""
     seed: int = 1
-    """Decides every random draw, but what a living culture does"""
+    """Decides every random draw, except what a living culture does"""
     out: Path = Path("session")
     """Folder for the session's log and recording"""
     watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
+    """Serve a live page for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -97,7 +100,7 @@ class Run(Stimulating):
         from animat.recordings.reading import read_recordings
         from animat.robots.host import HostRobot
 
-        # All that can be wrong is found before the culture is opened; no percentiles are needed to look at the rest.
+        # Everything is checked before the culture is opened.
         check_episodes("--episodes", self.episodes)
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
@@ -106,39 +109,40 @@ class Run(Stimulating):
         first = check_policies(policies)
         if not self.recordings:
             raise InvalidArgument(
-                "--recordings: expected those that the policies were trained on, got none: record first with "
-                "`animat record`, and train on that"
+                "--recordings: expected those that the policies were trained on, got none: make some with "
+                "`animat record`, and train on them"
             )
         if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
             raise InvalidArgument(
                 f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
             )
-        fit = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
+        fit = simulator_settings(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
-        settings = {**self._of_the_loop(), "pulses": self.pulses, "real_time": self.real_time}
+        settings = {**self._loop_settings(), "pulses": self.pulses, "real_time": self.real_time}
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         keep_compilations()
         recordings = read_recordings(self.recordings)
-        calibration = self._calibration(recordings, first)
+        calibration = self._calibration(recordings, first, fit)
         check_conditions(first, calibration)
-        calibrating = next(each for each in recordings if each.start_min == calibration.start_min)
+        calibrating = next(recording for recording in recordings if recording.start_min == calibration.start_min)
         protocol, unknown = self._protocol(recordings, calibrating)
         loop, _ = Loop.of_policy(
             first,
+            # The checks need no percentiles.
             np.zeros(percentiles_shape(first.readouts)),
             conditions=calibration.conditions,
             pulse=protocol.pulse,
             **settings,
         )
         with (
-            ExitStack() as told,
-            # Last, as it makes the folder.
-            _held_for_session(self.out),
+            ExitStack() as stack,
+            # After all checks, as it makes the folder.
+            _lock_for_session(self.out),
             Bar("culture") as progress,
             self._culture(recordings, calibrating, loop.pulse, progress) as culture,
         ):
-            noticed = unknown + _other_than(calibrating, culture, loop)
+            noticed = unknown + _differences(calibrating, culture, loop)
             gap = run_policies(
                 policies,
                 culture,
@@ -155,52 +159,55 @@ class Run(Stimulating):
                 report=partial(print, file=sys.stderr),
                 noticed=noticed,
                 pulse=loop.pulse,
-                # Of recordings that do not tell how many they used, all.
+                # All, if the recordings do not state how many they used.
                 patterns=None if unknown else min(protocol.patterns, len(culture.patterns)),
                 **settings,
             )
-            # It is told even where the culture cannot be closed then.
-            told.callback(self._report, gap)
+            # Reported even if closing the culture fails.
+            stack.callback(self._report, gap)
         return gap.to_dict()
 
     def _report(self, gap: RealityGap) -> None:
         print(gap.to_text())
         if gap.session.recording_file.is_file():
-            print(f"{gap.session.recording_file} is its recording, {self.out / 'session.log'} has every tick")
+            print(f"recording: {gap.session.recording_file}; every tick: {self.out / 'session.log'}")
         expect_no_fault(gap.session, self.out)
 
     def _protocol(
         self, recordings: Sequence[Recording], calibrating: Recording
     ) -> tuple[Protocol, tuple[Finding, ...]]:
-        """What tells pulse and patterns: the recording that calibrates, else --protocol, else what is usual; which."""
+        """The protocol with the pulse and number of patterns, and a warning if the recordings do not state them.
+
+        It is that of the calibrating recording, else of --protocol, else the usual one.
+        """
         from animat.cultures.kinds import pulse_for
         from animat.recordings.findings import Finding
         from animat.stimulation.protocol import CLOSED_LOOP, read_protocol
 
         usual = replace(CLOSED_LOOP, pulse=pulse_for(self.culture))
-        given = None if self.protocol is None else read_protocol(self.protocol, usual)
-        told = [(f"at {in_min(each.start_min)}", each.protocol) for each in recordings]
-        told.append((str(self.protocol), given))
-        pulses = {protocol.pulse: where for where, protocol in told if protocol is not None}
+        option = None if self.protocol is None else read_protocol(self.protocol, usual)
+        stated = [(f"at {in_min(recording.start_min)}", recording.protocol) for recording in recordings]
+        stated.append((str(self.protocol), option))
+        pulses = {protocol.pulse: where for where, protocol in stated if protocol is not None}
         if len(pulses) > 1:
-            (one, there), (other, elsewhere), *_ = pulses.items()
+            (one, where), (other, elsewhere), *_ = pulses.items()
             raise Mismatch(
-                f"--recordings: expected one pulse in all, got {one} ({there}) and {other} ({elsewhere}): give those "
+                f"--recordings: expected one pulse in all, got {one} ({where}) and {other} ({elsewhere}): give those "
                 "that were recorded with the pulse that the loop is to deliver"
             )
-        protocol = calibrating.protocol or given
+        protocol = calibrating.protocol or option
         if protocol is not None and (self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind):
             return protocol, ()
         if protocol is not None:
-            # A replay answers alike whatever the pulse, and its limits are those of voltages.
+            # A replay responds alike to every pulse, and its limits are those of voltages.
             return replace(protocol, pulse=usual.pulse), ()
-        taken = next(iter(pulses), usual.pulse)
+        pulse = next(iter(pulses), usual.pulse)
+        source = "as in the other recordings" if pulses else f"the usual one on a {self.culture}"
         message = (
-            f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not tell its pulse: "
-            f"the loop delivers {taken}, {'as the others had' if pulses else f'the usual one on a {self.culture}'}; "
-            "another is given by --protocol"
+            f"the recording at {in_min(calibrating.start_min)}, which calibrates the loop, does not state its pulse: "
+            f"the loop delivers {pulse}, {source}; to change it, use --protocol"
         )
-        return replace(usual, pulse=taken), (Finding("unknown-pulse", "warning", message),)
+        return replace(usual, pulse=pulse), (Finding("unknown-pulse", "warning", message),)
 
     def _culture(
         self, recordings: Sequence[Recording], calibrating: Recording, pulse: Pulse, progress: Progress
@@ -214,13 +221,13 @@ class Run(Stimulating):
         culture = culture_of(
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
-        # Again when it is open: some devices tell their step of amplitude only then.
+        # Checked again once it is open: some devices report their amplitude step only then.
         Guard(culture.limits, ()).check_pulse(pulse)
         if state is not None:
-            print(f"the culture goes on from {state}", file=sys.stderr)
+            print(f"the culture continues from {state}", file=sys.stderr)
         return culture
 
-    def _calibration(self, recordings: Sequence[Recording], first: Policy) -> Calibration:
+    def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
         from animat.reality_gap import Calibration
         from animat.responses.series import extract_series
         from animat.responses.windows import DEFAULT_WINDOW_MS
@@ -234,24 +241,23 @@ class Run(Stimulating):
             allow=self.allow,
             readouts=first.readouts,
         )
-        made = fit_as(first.fitted, self.simulator, self.bins, self.range_hz)
         adaptive = self.thresholds == "adaptive"
-        return Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **made)
+        return Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
 
 
-def _other_than(recording: Recording, culture: Culture, loop: Loop) -> tuple[Finding, ...]:
-    """Where the culture differs from the one of the recording that calibrates the loop."""
+def _differences(recording: Recording, culture: Culture, loop: Loop) -> tuple[Finding, ...]:
+    """Where the culture differs from that of the calibrating recording."""
     from animat.cultures.same_culture import other_culture, other_patterns
 
-    found = [other_culture(recording, culture)]
+    findings = [other_culture(recording, culture)]
     if loop.encoder.takes_patterns:
-        found.append(other_patterns(recording, culture))
-    return tuple(finding for finding in found if finding is not None)
+        findings.append(other_patterns(recording, culture))
+    return tuple(finding for finding in findings if finding is not None)
 
 
 @contextmanager
-def _held_for_session(folder: Path) -> Iterator[None]:
-    """Hold a folder that can take a new session; the error of one that cannot says what is there."""
+def _lock_for_session(folder: Path) -> Iterator[None]:
+    """Lock a folder for a new session; the error for an unsuitable one says what is there."""
     from animat.closed_loop.session import expect_no_session
 
     expect_no_file(folder, "the session")
@@ -261,7 +267,7 @@ def _held_for_session(folder: Path) -> Iterator[None]:
 
 
 def _conditions(recordings: Sequence[Recording], first: Policy) -> Conditions | None:
-    """What policies pick from: as they were trained, but some of the recordings' frequencies may be all there are."""
+    """The conditions of the policies' training; None for those of the recordings themselves."""
     from animat.responses.conditions import ByFrequency, conditions_named
 
     by = first.fitted.get("by") or "frequency"
@@ -270,6 +276,6 @@ def _conditions(recordings: Sequence[Recording], first: Policy) -> Conditions | 
     if not first.conditions or any(condition.unit != "Hz" for condition in first.conditions):
         return None
     picked = ByFrequency(tuple(condition.value for condition in first.conditions))
-    every = range(len(picked.values_hz))
-    # Where one lacks, the recordings' own conditions say better what is there instead.
-    return picked if all(set(every) <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None
+    every = set(range(len(picked.values_hz)))
+    # If one is missing, an error about the recordings' own conditions is clearer.
+    return picked if all(every <= set(picked.assign(r.stimuli).condition.tolist()) for r in recordings) else None

@@ -1,4 +1,4 @@
-"""The command that runs a study of one's own from a TOML file."""
+"""The command that runs a custom study from a TOML file."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from animat.cli.working import Working
+from animat.cli.jobs import JobOptions
 
 if TYPE_CHECKING:
     from animat.studies.specification import Study
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyFile(Working):
-    """A study of one's own from a TOML file: recordings, robots, arms. Goes on where it stopped."""
+class StudyFile(JobOptions):
+    """Run your own study from a TOML file: recordings, robots, arms. Resumes where it stopped."""
 
     specification: Positional[Path]
-    """The TOML file; animat reproduce leaves one to start from in its folder"""
+    """The TOML file; animat reproduce writes one to start from in its folder"""
 
     def run(self) -> dict[str, Any]:
         """Run it."""
@@ -30,15 +30,15 @@ class StudyFile(Working):
         return run_and_report(read_study(self.specification), self.specification.parent, self)
 
 
-def run_and_report(study: Study, base: Path, command: Working) -> dict[str, Any]:
-    """Run a study, whose files are named as seen from `base`, and print its comparisons."""
+def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
+    """Run a study, whose file names are relative to `base`, and print its comparisons."""
     from animat.studies.cultures import studies_of
 
-    command.say_first(study.robots)
+    command.print_caveats(study.robots)
     return (_run_many if studies_of(study) else _run_one)(study, base, command)
 
 
-def _run_one(study: Study, base: Path, command: Working) -> dict[str, Any]:
+def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.lined_up import lined_up
     from animat.report.results import Results
     from animat.studies.heuristic import not_outperforming
@@ -47,8 +47,8 @@ def _run_one(study: Study, base: Path, command: Working) -> dict[str, Any]:
     from animat.studies.run import run_study
 
     began = time.monotonic()
-    with command.at_work("study") as how:
-        ran = run_study(study, command.out, base=base, **how)
+    with command.executing("study") as execution:
+        ran = run_study(study, command.out, base=base, **execution)
     results = read_typed(results_file(ran.folder), Results)
     cells = []
     for row in results.comparisons:
@@ -59,8 +59,8 @@ def _run_one(study: Study, base: Path, command: Working) -> dict[str, Any]:
         )
     if cells:
         print("\n".join(lined_up(["", "first", "second", "U", "p", ""], cells)))
-    beside = not_outperforming(results)
-    for message in beside:
+    messages = not_outperforming(results)
+    for message in messages:
         print(message)
     if ran.done_now:
         print(f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s; report: {ran.report}")
@@ -72,11 +72,11 @@ def _run_one(study: Study, base: Path, command: Working) -> dict[str, Any]:
         "jobs": ran.jobs,
         "done_now_cpu_s": ran.done_now,
         "comparisons": [asdict(row) for row in results.comparisons],
-        "not_outperforming_the_heuristic": beside,
+        "not_outperforming_the_heuristic": messages,
     }
 
 
-def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
+def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.errors import AnimatError
     from animat.lined_up import lined_up
     from animat.studies.cultures import run_over_cultures
@@ -84,11 +84,11 @@ def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
     from animat.studies.results import MISSING
 
     began = time.monotonic()
-    with command.at_work("study") as how:
-        found = run_over_cultures(study, command.out, base=base, **how)
-    report = write_cultures_page(study, found)
+    with command.executing("study") as execution:
+        results = run_over_cultures(study, command.out, base=base, **execution)
+    report = write_cultures_page(study, results)
     cells = []
-    for row in found.summary:
+    for row in results.summary:
         interval = "" if row.low_95 is None else f"{row.low_95:+.1f} to {row.high_95:+.1f}"
         means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}", f"{row.difference:+.1f}"
         counts = f"{row.larger_in} of {row.cultures}", row.found_better
@@ -96,18 +96,18 @@ def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
     if cells:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(lined_up(head, cells)))
-    jobs = sum(len(each.done_now) for each in found.ran.values())
-    print(f"{len(found.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
-    if found.parquet is None:
+    jobs = sum(len(ran.done_now) for ran in results.ran.values())
+    print(f"{len(results.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
+    if results.parquet is None:
         print(f"scores.csv only, no Parquet table: {MISSING}")
-    for name, why in found.failed.items():
+    for name, why in results.failed.items():
         print(f"failed: {name}: {why}", file=sys.stderr)
-    if found.failed:
-        total = len(found.ran) + len(found.failed)
-        raise AnimatError(f"{len(found.failed)} of {total} cultures failed; the same command tries them again")
+    if results.failed:
+        total = len(results.ran) + len(results.failed)
+        raise AnimatError(f"{len(results.failed)} of {total} cultures failed; the same command tries them again")
     return {
-        "folder": str(found.folder),
+        "folder": str(results.folder),
         "report": str(report),
-        "cultures": list(found.ran),
-        "over_cultures": [asdict(row) for row in found.summary],
+        "cultures": list(results.ran),
+        "over_cultures": [asdict(row) for row in results.summary],
     }

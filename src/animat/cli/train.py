@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.named_numbers import read_numbers, read_sac
-from animat.cli.responses import Fitting, say_findings
+from animat.cli.responses import SimulatorOptions, print_warnings
 from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_min
 from animat.records import as_json
 from animat.writing import expect_writable
@@ -27,67 +27,68 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Train(Fitting):
-    """Train policies for a robot on the simulators of a culture's recordings. Goes on where it stopped."""
+class Train(SimulatorOptions):
+    """Train policies for a robot on the simulators of a culture's recordings. Resumes where it stopped."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, swing-up, shuttle, arm, wheels, detour, one of your own, such as
+    """The robot to drive: cartpole, navigation, swing-up, shuttle, arm, wheels, detour, your own, such as
     my_package.robots:Rover, or any of Gymnasium's, gymnasium:Reacher-v5"""
     recordings: tuple[Path, ...] = ()
     """Files or folders of recordings of one culture"""
     paper: bool = False
     """The paper's setting: 1-threshold, histogram, 10 policies, 60 minutes; default: what works in a closed loop"""
     mapping: str | None = None
-    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or one of your own, such as
+    """From responses to motor commands: 1-threshold, 9-thresholds, linear, or your own, such as
     my_package.mappings:Steep; none: the baseline without neurons; default: 9-thresholds, with --paper 1-threshold"""
     readouts: str | None = None
-    """What becomes a command each: all channels as one; halves or quadrants of the array; or a file of groups of
-    electrodes, {"left": [1, 2], "right": [3, 4]}; default: for one, two or four commands all, halves or quadrants"""
+    """Groups of channels, each for one command: all channels as one; halves or quadrants of the array; or a file of
+    groups of electrodes, {"left": [1, 2], "right": [3, 4]}; default: for one, two or four commands all, halves or
+    quadrants"""
     policies: int | None = None
-    """How many policies, each from its own random numbers; default: 4, with --paper 10"""
+    """Number of policies, each with its own random numbers; default: 4, with --paper 10"""
     iterations: int | None = None
-    """Training iterations of each; default: 400000 for cartpole, 500000 for swing-up, 1000000 for arm, 250000 for
-    others, with --paper twice as many"""
+    """Training iterations of each policy; default: 400000 for cartpole, 500000 for swing-up, 1000000 for arm, 250000
+    for others, with --paper twice as many"""
     seed: int = 1
     """Decides every random draw"""
     shadowing: Literal["on", "off", "drawn"] = "on"
     """on: refresh the simulators during training (parameter shadowing); off: the first one throughout; drawn: each
     episode draws one of those that would have been used"""
     duration_min: float | None = None
-    """Minutes of the culture's clock that training stands for; default: as long as the recordings, with --paper 60"""
+    """Minutes of the culture's clock that training represents; default: the recordings' span, with --paper 60"""
     percentiles: Literal["moving", "first"] = "moving"
     """The mapping's percentiles move with the simulator, or are fixed by the first recording"""
     delivery: Literal["chosen", "shuffled"] = "chosen"
     """shuffled: the paper's control, the delivered condition is drawn at random whatever the policy chose"""
     goal: str | None = None
-    """What is wanted of the robot in place of its own task: "avoid pole_angle outside -12..12 deg; drive cart_position
-    in -0.1..0.1 m within 20"; also reach, minimize, maximize"""
+    """A goal that replaces the robot's own task: "avoid pole_angle outside -12..12 deg; drive cart_position in
+    -0.1..0.1 m within 20"; also reach, minimize, maximize"""
     parameters: tuple[str, ...] = ()
-    """Parameters of the robot in place of its defaults, such as pole_mass_kg=0.55"""
+    """Parameters of the robot that replace its defaults, such as pole_mass_kg=0.55"""
     sac: tuple[str, ...] = ()
-    """Settings of the algorithm in place of its defaults, such as discount=0.98 learning_rate=3e-4"""
+    """Settings of the algorithm that replace its defaults, such as discount=0.98 learning_rate=3e-4"""
     neural_observation: bool = False
-    """Policies see what the neurons remember too, trace and load of the last stimuli and responses"""
+    """Policies also see what the neurons remember: trace and load of the last stimuli and responses"""
     pulse_cost: float = 0.0
-    """What each electrode pulse costs, in the units of the reward: policies are trained on the rewards less
-    that. For conditions that differ in how many electrodes they pulse (animat record --places FILE)"""
+    """Cost of each electrode pulse, in the units of the reward: policies are trained on the rewards less the cost.
+    For conditions that differ in how many electrodes they pulse (animat record --places FILE)"""
     lessons: Path | None = None
-    """Lessons in turn, a TOML file: ranges of parameters, starts and recordings, and when to go on"""
+    """A TOML file of successive lessons: ranges of parameters, starts and recordings, and when to advance"""
     assess: int | None = None
     """Episodes of an assessment after each sixtieth of the training; the best policies so far are kept in OUT/best;
-    default: none, but 20 where lessons say when to go on"""
+    default: none, but 20 where lessons say when to advance"""
     workers: int | None = None
-    """Processes, each on its own core; default: one a core"""
+    """Processes, each on its own core; default: one per core"""
     cluster: str | None = None
-    """On other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
+    """Run on other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
     shared_folder: bool = True
-    """With --cluster: workers do not see --out at the same place, and files go to them and back through this process"""
+    """With --cluster: workers do not see --out at the same path, so files are passed through this process"""
     tensorboard: Path | None = None
-    """Folder for TensorBoard: the learning curves as they come, a run a policy; needs animat[tensorboard]"""
+    """Folder for TensorBoard: live learning curves, one run per policy; needs animat[tensorboard]"""
     out: Path = Path("policies")
     """Folder for the policies"""
     watch: bool = False
-    """Serve a page of it beside, for a browser on this machine; needs animat[watch]"""
+    """Serve a live page for a browser on this machine; needs animat[watch]"""
     json: bool = False
     """End with a line of JSON"""
 
@@ -99,12 +100,12 @@ class Train(Fitting):
         from animat.report.tensorboard import TensorBoard
         from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
 
-        # What can be refused is refused before recordings are read, which can take a while.
+        # Check what can be checked before recordings are read, which can take a while.
         if self.workers is not None and self.workers < 1:
             raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
         if not self.out.is_dir():
             expect_writable(self.out)
-        training, readouts = self._asked_for()
+        training, readouts = self._training()
         board = nullcontext() if self.tensorboard is None else TensorBoard(self.tensorboard)
         expect_trainable(training, is_saved=True)
         expect_folder_for(training, self.out)
@@ -114,8 +115,8 @@ class Train(Fitting):
         training.environment_on(timeline)
         was_finished = is_finished(training, self.out)
         if timeline is not None:
-            print(_control(timeline))
-        # Of a training that goes on it was told before.
+            print(_controllability(timeline))
+        # A resumed training has reported it before.
         random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
         with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
             trained = train(
@@ -130,11 +131,11 @@ class Train(Fitting):
                 callbacks=() if on_row is None else (on_row,),
             )
         if was_finished:
-            print(f"this training was finished before: its policies are in {self.out}, as they were")
-        return self._told(trained, timeline)
+            print(f"this training was finished before: its policies in {self.out} are unchanged")
+        return self._report(trained, timeline)
 
-    def _asked_for(self) -> tuple[Training, str | Readouts]:
-        """The training, and what is read of the neurons."""
+    def _training(self) -> tuple[Training, str | Readouts]:
+        """The training that the options describe, and the readouts."""
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
         from animat.goals.robot import with_goal
@@ -176,7 +177,7 @@ class Train(Fitting):
         return training, readouts
 
     def _lessons(self, robot: Robot[Any]) -> tuple[Lesson, ...]:
-        """Those of the file, which can be taught to this robot."""
+        """Read the lessons, and check that they suit the robot."""
         from animat.training.lessons import expect_lessons, read_lessons
 
         if self.lessons is None:
@@ -189,7 +190,6 @@ class Train(Fitting):
         return lessons
 
     def _timeline(self, readouts: str | Readouts) -> SimulatorTimeline:
-        """The simulators of the recordings."""
         fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
         timeline = fitting.timeline(self.recordings, readouts=readouts)
         if len(timeline.conditions) < 2 and "one-condition" not in self.allow:
@@ -200,14 +200,14 @@ class Train(Fitting):
             )
         return timeline
 
-    def _told(self, trained: dict[str, Policy], timeline: SimulatorTimeline | None) -> dict[str, Any]:
-        """How good the policies are beside random actions, and how they got on at their assessments."""
+    def _report(self, trained: dict[str, Policy], timeline: SimulatorTimeline | None) -> dict[str, Any]:
+        """Print and return how good the policies are compared with random actions, and their assessments."""
         from animat.evaluation.table import evaluate
 
         first = next(iter(trained.values()))
         until = None if timeline is None else first.trained_until_min(float(timeline.start_min[0]))
         evaluation = evaluate(trained, timeline, at_min=until, controls=("random",))
-        say_findings(evaluation.findings)
+        print_warnings(evaluation.findings)
         policies, control = (row.to_dict() for row in evaluation.rows)
         on = "" if evaluation.recorded_at_min is None else f" on the simulator at {in_min(evaluation.recorded_at_min)}"
         error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
@@ -215,14 +215,14 @@ class Train(Fitting):
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{control['mean_return']:.1f}"
         print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
         if self.pulse_cost:
-            net, given = f"{policies['net_return']:.1f}", f"{policies['electrode_pulses']:.1f}"
+            net, pulses = f"{policies['net_return']:.1f}", f"{policies['electrode_pulses']:.1f}"
             print(
-                f"less {self.pulse_cost:g} for each electrode pulse ({given} in an episode): {net}, of random actions "
+                f"less {self.pulse_cost:g} for each electrode pulse ({pulses} per episode): {net}, of random actions "
                 f"{control['net_return']:.1f} ({control['electrode_pulses']:.1f})"
             )
         assessed = {name: _assessed(policy, policy.best) for name, policy in trained.items() if policy.best is not None}
-        for name, told in assessed.items():
-            print(_standing(name, told))
+        for name, assessment in assessed.items():
+            print(_assessment_line(name, assessment))
         return {
             "policies": [str(self.out / f"{name}.safetensors") for name in trained],
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
@@ -235,12 +235,12 @@ class Train(Fitting):
 
 
 _USUAL: dict[str, Any] = {"mapping": "9-thresholds", "policies": 4, "share": 50, "duration_min": None}
-"""What works in a closed loop; `share`: of the paper's iterations, in per cent."""
+"""Settings that work in a closed loop; `share` of the paper's iterations, in per cent."""
 _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100, "duration_min": 60.0}
 
 
 def _random_return(training: Training, timeline: SimulatorTimeline | None) -> float | None:
-    """The mean return of random actions on the first simulator; None for a body that would have to be stepped."""
+    """The mean return of random actions on the first simulator; None for a robot that is stepped on the host."""
     from animat.compilation import keep_compilations
     from animat.evaluation.rollouts import Uniform, roll_out
     from animat.robots.host import HostRobot
@@ -250,12 +250,12 @@ def _random_return(training: Training, timeline: SimulatorTimeline | None) -> fl
     keep_compilations()
     environment = training.environment(0 if timeline is None else len(timeline.conditions))
     simulator = None if timeline is None else timeline.at(float(timeline.start_min[0]))
-    # As many as are evaluated in the end: what is compiled here is there then.
+    # As many episodes as in the final evaluation, which then reuses the compiled program.
     return float(roll_out(environment, simulator, Uniform(), 1, episodes=100, seed=1).returns.mean())
 
 
 def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
-    """The iterations after which a policy was at each lesson, and its best assessment."""
+    """The iterations after which a policy began each lesson, and its best assessment."""
     from animat.training.course import ASSESSED
 
     table = policy.assessments
@@ -264,30 +264,31 @@ def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
     return {"lessons": lessons, "best": as_json(dict(zip(ASSESSED, best.assessments[-1].tolist(), strict=True)))}
 
 
-def _standing(name: str, assessed: dict[str, Any]) -> str:
-    """The same for people."""
+def _assessment_line(name: str, assessed: dict[str, Any]) -> str:
     best, (_, *later) = assessed["best"], assessed["lessons"]
     success = "" if best["success"] is None else f"{best['success']:.0%} succeeded, "
-    on = "".join(f"; lesson {each['lesson']} after {each['after_iterations']:,}" for each in later)
-    return f"{name}: best after {best['iterations']:,.0f} iterations ({success}return {best['mean_return']:.1f}){on}"
+    lessons = "".join(f"; lesson {each['lesson']} after {each['after_iterations']:,}" for each in later)
+    return (
+        f"{name}: best after {best['iterations']:,.0f} iterations ({success}return {best['mean_return']:.1f}){lessons}"
+    )
 
 
-def _control(timeline: SimulatorTimeline) -> str:
+def _controllability(timeline: SimulatorTimeline) -> str:
     """How much the conditions differ, which bounds what any controller can do."""
     shares, names = timeline.fidelities[0].in_simulator, timeline.readouts.names
     if len(names) == 1:
-        told = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
+        text = ", ".join(f"{c.label} {share:.2f}" for c, share in zip(timeline.conditions, shares, strict=True))
     else:
-        of_each = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, of, strict=True)) for of in shares)
-        told = ", ".join(f"{c.label}: {of}" for c, of in zip(timeline.conditions, of_each, strict=True))
-    said = next((f.message for f in timeline.findings if f.name == "difference"), None)
+        rows = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, row, strict=True)) for row in shares)
+        text = ", ".join(f"{c.label}: {row}" for c, row in zip(timeline.conditions, rows, strict=True))
+    difference = next((f.message for f in timeline.findings if f.name == "difference"), None)
     at = f"in the simulator at {in_min(timeline.start_min[0])}"
-    first = f"P(x >= P50), the share of responses that reach the median, {at}: {told}"
-    return "\n".join([first, *([f"in the recording {said}"] if said else []), *_memories(timeline)])
+    first = f"P(x >= P50), the share of responses that reach the median, {at}: {text}"
+    return "\n".join([first, *([f"in the recording {difference}"] if difference else []), *_memories(timeline)])
 
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
-    """What each simulator remembers, where they are of the kind that does."""
+    """What each memory simulator remembers."""
     import numpy as np
 
     from animat.neurons.history import NO_MEMORY
@@ -297,12 +298,12 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
         simulator = timeline.at(start_min)
         if isinstance(simulator, MemorySimulator):
             decay, weight, _, load_s = memory = simulator.memory
-            near, of = (int(np.median(each)) for each in (simulator.nearest, simulator.followers))
-            told = (
+            near, total = (int(np.median(counts)) for counts in (simulator.nearest, simulator.followers))
+            text = (
                 f"a response depends on the trials before it: each counts {decay:.2g} times as much as the next one, "
                 f"and its stimulus {weight:.2g} times as much as its response. The simulator draws from the {near} "
-                f"responses with the most similar history, of the {of} of a condition"
+                f"responses with the most similar history, out of {total} per condition"
             )
             if load_s:
-                told += f". How much was stimulated in the last {load_s:g} s counts too"
-            yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else told}"
+                text += f". The amount of stimulation in the last {load_s:g} s counts too"
+            yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else text}"

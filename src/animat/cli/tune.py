@@ -1,4 +1,4 @@
-"""The command that searches for settings of a study."""
+"""The command that searches for the best settings of a study."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from animat.cli.working import Working
+from animat.cli.jobs import JobOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class TuneFile(Working):
-    """Search for the best settings of a study with one robot and one arm. Goes on where it stopped."""
+class TuneFile(JobOptions):
+    """Search for the best settings of a study with one robot and one arm. Resumes where it stopped."""
 
     specification: Positional[Path]
-    """The study's TOML file; its table [tune] says what is searched"""
+    """The study's TOML file; its table [tune] defines the search"""
     out: Path = Path("tuning")
-    """Folder for everything; the settings found are best.toml in it"""
+    """Folder for all results; the best settings are in its best.toml"""
 
     def run(self) -> dict[str, Any]:
         """Search."""
@@ -33,10 +33,10 @@ class TuneFile(Working):
         from animat.tuning.run import tune
         from animat.tuning.space import first_settings
 
-        self.say_first(tuning.study.robots)
+        self.print_caveats(tuning.study.robots)
         began = time.monotonic()
-        with self.at_work("tuning") as how:
-            tuned = tune(tuning, self.out, base=self.specification.parent, **how)
+        with self.executing("tuning") as execution:
+            tuned = tune(tuning, self.out, base=self.specification.parent, **execution)
         cells = []
         names = ("own settings", "defaults")[: len(first_settings(tuning.study, tuning.space))]
         for final in sorted(tuned.finals, key=lambda each: -each.mean):
@@ -46,7 +46,7 @@ class TuneFile(Working):
             cells.append([name, mean, error, settings_in_words(final.settings)])
         policies, episodes = tuning.study.policies, tuning.study.episodes
         counted = "1 policy" if policies == 1 else f"{policies} policies"
-        print(f"trained anew, {counted} of each, in {episodes} fresh episodes per policy:")
+        print(f"retrained, {counted} of each, in {episodes} fresh episodes per policy:")
         print("\n".join(lined_up(["", "mean return", "s.e.", "settings"], cells)))
         if tuned.importance:
             shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())

@@ -1,4 +1,4 @@
-"""The command that says whether simulators of a recording predict what was held out of it."""
+"""The command that checks whether simulators of a recording predict its held-out part."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import Responding, say_findings
+from animat.cli.responses import ResponseOptions, print_warnings
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.writing import expect_writable
 
 
 @dataclass(frozen=True)
-class Validate(Responding):
-    """Make simulators of the first half of each recording, predict the second, and say whether to trust them."""
+class Validate(ResponseOptions):
+    """Fit simulators to the first half of each recording, predict the second, and say whether to trust them."""
 
     recordings: Positional[tuple[Path, ...]] = ()
-    """Files of recordings, or folders of them"""
+    """Recording files, or folders of them"""
     simulator: Literal["histogram", "empirical", "memory"] | None = None
-    """The kind that the verdict is on; default: the one that a training would take. All are scored"""
+    """The kind that the verdict is about; default: the one that training would use. All kinds are scored"""
     readouts: str = "all"
-    """What is read: all channels as one; halves or quadrants of the array; or a file of groups of electrodes"""
+    """Groups of channels: all as one; halves or quadrants of the array; or a file of groups of electrodes"""
     allow: tuple[str, ...] = ()
     """Findings to allow, by name, such as dead-window"""
     out: Path | None = None
     """Folder for a figure of each recording; default: none is drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
-    """Of the figures"""
+    """Format of the figures"""
     seed: int = 1
     """Decides every random draw"""
     json: bool = False
@@ -71,23 +71,24 @@ class Validate(Responding):
                         allow=self.allow,
                         readouts=readouts,
                     )
-                    several = range(len(responses.readouts)) if len(responses.readouts) > 1 else [None]
-                    found = [validate(responses, kind=self.simulator, seed=self.seed, readout=d) for d in several]
+                    has_several = len(responses.readouts) > 1
+                    numbers = range(len(responses.readouts)) if has_several else [None]
+                    validations = [validate(responses, kind=self.simulator, seed=self.seed, readout=d) for d in numbers]
                 except (Mismatch, UnusableData) as error:
                     raise type(error)(f"{file}: {error}") from error
-                say_findings(responses.findings)
-                for validation, readout in zip(found, responses.readouts.names, strict=True):
-                    apart = len(found) > 1
+                print_warnings(responses.findings)
+                for validation, readout in zip(validations, responses.readouts.names, strict=True):
                     name, stem = file.name, f"{figure_stem(file.name)}-validation"
-                    name, stem = (f"{name}, {readout}", f"{stem}-{readout}") if apart else (name, stem)
+                    if has_several:
+                        name, stem = f"{name}, {readout}", f"{stem}-{readout}"
                     print(validation_text(name, validation), end="\n\n")
                     validated.append({"name": name, **validation.to_dict()})
                     if self.out is not None:
                         figure = save_figure(draw_validation(name, validation), self.out / f"{stem}.{self.format}")
                         print(f"figure: {figure}\n")
                         validated[-1]["figure"] = str(figure)
-                if len(found) > 1:
-                    of_pairs = correlations(responses)
-                    print(correlations_text(responses.readouts.names, of_pairs), end="\n\n")
-                    validated[-1]["correlations"] = of_pairs.tolist()
+                if has_several:
+                    matrix = correlations(responses)
+                    print(correlations_text(responses.readouts.names, matrix), end="\n\n")
+                    validated[-1]["correlations"] = matrix.tolist()
         return {"recordings": validated}

@@ -13,10 +13,10 @@ from animat.errors import InvalidArgument
 
 @dataclass(frozen=True)
 class Watch:
-    """A page of what runs, ran or was killed in a folder, for a browser on this machine; until Ctrl-C."""
+    """Serve a page of what runs, ran or was killed in a folder, for a browser on this machine, until Ctrl-C."""
 
     folder: Positional[Path]
-    """Of a session, a training, a study, a tuning, recordings, or several of these"""
+    """Folder of a session, a training, a study, a tuning, recordings, or several of these"""
     port: int = 0
     """Port to listen on, on this machine only; 0: any free port"""
     json: bool = False
@@ -29,6 +29,5 @@ class Watch:
         if not self.folder.is_dir():
             got = "a file" if self.folder.exists() else "none"
             raise InvalidArgument(f"{self.folder}: expected a folder to watch, got {got}")
-        said = "(Ctrl-C ends the page, and nothing else)"
-        serve(self.folder, self.port, lambda address: print(f"{address}  {said}", flush=True))
+        serve(self.folder, self.port, lambda address: print(f"{address}  (Ctrl-C ends only the page)", flush=True))
         return {"folder": str(self.folder)}

@@ -1,4 +1,4 @@
-"""Who acts in a closed loop: policies, and the controls that ask whether it is the culture that does the work."""
+"""The agents of a closed loop: policies, and controls that test whether the culture does the work."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 
 class Controller(Protocol):
-    """Whoever chooses conditions: a `Policy`, or anything else that acts like one."""
+    """Anything that chooses conditions: a `Policy`, or anything else that acts like one."""
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The index of the condition to present, given the robot's observation in its own units."""
+        """The index of the condition to present, for the robot's observation in its own units."""
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class AnyCondition:
     n_conditions: int
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """Draw."""
+        """A random condition."""
         return int(rng.integers(self.n_conditions))
 
 
 @dataclass(frozen=True)
 class OneCondition:
-    """One condition always: the constant control."""
+    """Always the same condition: the constant control."""
 
     condition: int
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """That one."""
+        """The condition."""
         return self.condition
 
 
@@ -53,27 +53,27 @@ class Greedy:
     policy: Any
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The most probable one."""
+        """The most probable condition."""
         return self.policy.act_greedily(observation)
 
 
 class ActorController:
-    """Whoever acts on a simulator (`animat.evaluation.rollouts.Actor`), for one observation at a time.
+    """An actor of the simulator (`animat.evaluation.rollouts.Actor`), for one observation at a time.
 
     Args:
-        actor: one, its arrays with a leading axis of actors, as for `roll_out`.
-        environment: that it acts in on the simulator, without what policies see of the neurons.
+        actor: its arrays have a leading axis of actors, of length one, as for `roll_out`.
+        environment: in which it acts on the simulator, without the policies' observation of the neurons.
     """
 
     def __init__(self, actor: Actor, environment: Animat[Any]) -> None:
         self._actor: Actor = jax.tree.map(lambda x: x[0], actor)
         self._environment = environment
-        # Now: what JAX compiles for a first call would come late in a loop.
+        # Compile now: in a loop the first call would come late.
         self.act(np.zeros(len(environment.observation_spec)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """As on the simulator."""
-        # Drawn apart: most actors draw nothing, and whatever else the loop draws is the same beside them.
+        """The condition, chosen as on the simulator."""
+        # From a generator of its own, so that the loop's other draws do not depend on the actor.
         uniforms = rng.spawn(1)[0].random(self._environment.n_drawn, np.float32)
         return int(_decided(self._environment, self._actor, np.asarray(observation, np.float32), uniforms))
 
@@ -90,40 +90,40 @@ def _decided(
 
 @dataclass(frozen=True)
 class InTurn:
-    """Several who take turns, an episode each: a control is then one of all policies, and not of one of them.
+    """Several controllers that take turns, one episode each: a control then represents all policies, not one of them.
 
     Attributes:
-        by_name: who, in their order.
+        by_name: the controllers, in order.
     """
 
     by_name: Mapping[str, Controller]
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The first one's choice; the loop takes each at its turn (`Agent.acting`)."""
+        """The choice of the first; the loop calls each controller in its turn (`Agent.acting`)."""
         return self.acting(0).act(observation, rng)
 
     def acting(self, turn: int) -> Controller:
-        """Whose turn it is."""
+        """The controller whose turn it is."""
         controllers = tuple(self.by_name.values())
         return controllers[turn % len(controllers)]
 
 
 @dataclass(frozen=True, eq=False)
 class Agent:
-    """Someone who acts in some of a session's episodes.
+    """An agent, which acts in some of a session's episodes.
 
     Attributes:
         name: unique in its session.
-        meaning: what it is, in a few words.
-        controller: who chooses.
-        delivery: as of a control (`animat.evaluation.controls.Control`). `"silent"`: what the culture fires by itself
-            is read where the response would be; `"yoked"`: what was given in the last whole episode of those who take
-            turns here, over and over.
-        calibrates: whether its responses count for adaptive thresholds; one condition presented over and over is
-            answered otherwise than between others. The warm-up of its episodes always counts.
-        drawn_from: responses that one is drawn from in place of the culture's; None: the culture's own is read.
-        is_turned_round: whether every command is turned into its opposite.
-        switch_at: after how many iterations the robot is given another goal; None: never.
+        meaning: a short description.
+        controller: chooses the conditions.
+        delivery: as for a control (`animat.evaluation.controls.Control`). `"silent"`: spontaneous activity is read in
+            place of the response; `"yoked"`: the stimuli of the last whole episode of one of its controllers are
+            repeated.
+        calibrates: whether its responses count for adaptive thresholds; responses to one condition differ when it is
+            presented over and over. The warm-up of its episodes always counts.
+        drawn_from: responses from which one is drawn in place of the culture's; None: the culture's own is read.
+        is_turned_round: whether every command is reversed.
+        switch_at: the iteration after which the robot gets another goal; None: never.
     """
 
     name: str
@@ -136,18 +136,18 @@ class Agent:
     switch_at: int | None = None
 
     def sees_neurons(self, turn: int) -> bool:
-        """Whether whoever chooses in its episode number `turn` sees the history state too."""
+        """Whether the controller of its episode number `turn` also sees the history state."""
         controller = self.acting(turn)
         policy = controller.policy if isinstance(controller, Greedy) else controller
         return bool(getattr(policy, "neural_observation", False))
 
     def acting(self, turn: int) -> Controller:
-        """Who chooses in the agent's episode number `turn`, counted from 0."""
+        """The controller of the agent's episode number `turn`, counted from 0."""
         return self.controller.acting(turn) if isinstance(self.controller, InTurn) else self.controller
 
 
 def random_control(n_conditions: int) -> Agent:
-    """The control that chooses any condition."""
+    """The random control."""
     return Agent(RANDOM.name, RANDOM.meaning, AnyCondition(n_conditions))
 
 
@@ -157,19 +157,20 @@ def agent_of(
     policies: Mapping[str, Controller],
     responses_hz: Float64[np.ndarray, "responses *readouts"],
 ) -> Agent:
-    """A control of the simulator as an agent of a closed loop, where policies take turns in what is done with them.
+    """A control of the simulator as an agent of a closed loop, in which policies take turns.
 
     Args:
+        control: of the simulator.
         environment: robot and mapping.
         policies: by name.
         responses_hz: non-burst responses of all conditions, for random spikes.
 
     Raises:
-        InvalidArgument: for a control that moves the robot by commands of its own: no loop can.
+        InvalidArgument: for a control whose commands do not come from responses, which no loop can run.
     """
     if control.commands is not None:
         raise InvalidArgument(
-            f"control: expected one whose commands come from responses, got {control.name}; it runs on a simulator only"
+            f"control: expected one whose commands come from responses, got {control.name}, which needs a simulator"
         )
     actor = control.actor
     controller: Controller
@@ -186,7 +187,7 @@ def agent_of(
         control.meaning,
         controller,
         control.delivery,
-        # The same stimuli over and over are answered otherwise than among others.
+        # Responses to stimuli that repeat differ from responses to mixed ones.
         calibrates=control.delivery != "yoked" and not isinstance(actor, Constant),
         drawn_from=responses_hz if control.is_drawn else None,
         is_turned_round=control.is_turned_round,
@@ -194,16 +195,16 @@ def agent_of(
     )
 
 
-def interleaved(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
-    """Whose turn each episode is, in random order and spread evenly: whatever drifts in the culture hits all alike.
+def interleave(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
+    """The agent of each episode, in random order and spread evenly, so that drift affects all agents alike.
 
-    The session is cut into as many equal parts as an agent has episodes, and one of them is in each part. Where all
-    have as many, round follows round of all of them.
+    For each agent the session is divided into as many equal parts as it has episodes, with one episode in each part. If
+    all have equally many, they act in rounds.
 
     Args:
         episodes: of each agent.
-        rng: of the places within the parts.
+        rng: draws the places within the parts.
     """
     places = [(part + rng.random()) / n for n in episodes for part in range(n)]
-    whose = np.repeat(np.arange(len(episodes)), episodes)
-    return [int(who) for who in whose[np.argsort(places, kind="stable")]]
+    agents = np.repeat(np.arange(len(episodes)), episodes)
+    return [int(agent) for agent in agents[np.argsort(places, kind="stable")]]

@@ -1,4 +1,4 @@
-"""The first record of a session's log: what the session is, looked at before anything is made of it."""
+"""The first record of a session's log, which describes the session; it is checked before use."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from animat.stimulation.protocol import Presentation
 FORMAT = "animat closed-loop session 1"
 
 
-def _held(value: str) -> str:
-    # By HDF5: the session's recording says it too.
+def _hdf5_text(value: str) -> str:
+    # The session's recording stores it in HDF5.
     if "\0" in value or any("\ud800" <= c <= "\udfff" for c in value):
         raise ValueError(f"expected text without null characters and halves of surrogate pairs, got {shown(value)}")
     return value
@@ -39,7 +39,7 @@ def _date(value: str) -> str:
     return value
 
 
-_Text = Annotated[str, Strict(), AfterValidator(_held)]
+_Text = Annotated[str, Strict(), AfterValidator(_hdf5_text)]
 _Electrode = Annotated[Whole, Field(ge=-(2**63), lt=2**63)]
 _OrNaN = Annotated[float, Strict()]
 
@@ -60,7 +60,7 @@ class _Agent(TypedDict):
     name: _Text
 
 
-class _Words(TypedDict):
+class _Fields(TypedDict):
     channels: _Channels
     sampling_rate_hz: _OrNaN
     start_min: Number
@@ -73,15 +73,15 @@ class _Words(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What a session's files are made by.
+    """The description of a session, from which its files are made.
 
     Attributes:
         channels: of the culture.
         sampling_rate_hz: of the culture; NaN: unknown.
-        start_min: of the session, on the culture's clock.
+        start_min: start of the session on the culture's clock.
         recorded_at: when it began, ISO 8601.
         provenance: of the culture.
-        presentation: how the loop presented.
+        presentation: how stimuli were presented.
         conditions: their labels.
         agents: their names.
         observed: the columns of the robot's observation, with their units.
@@ -103,28 +103,28 @@ class Header:
 
 
 def observed_columns(robot: Robot[Any]) -> list[str]:
-    """The numbers of a robot's observation, each by its name and unit: `cart_velocity_m_per_s`."""
+    """Column names of a robot's observation, with units: `cart_velocity_m_per_s`."""
     return [f"{q.name}_{q.unit.replace('/', '_per_')}" if q.unit else q.name for q in robot.observation_spec]
 
 
-def read_header(file: Path, words: Mapping[str, Any]) -> Header:
+def read_header(file: Path, fields: Mapping[str, Any]) -> Header:
     """The header of a session's log.
 
     Args:
         file: the log, for messages.
-        words: of its first record.
+        fields: of its first record.
 
     Raises:
-        InvalidFile: for a field that is missing or cannot be, named.
+        InvalidFile: naming a field that is missing or invalid.
     """
-    if words.get("format") != FORMAT:
-        raise InvalidFile(f"{file}: expected {FORMAT!r}, got {shown(words.get('format'))}")
+    if fields.get("format") != FORMAT:
+        raise InvalidFile(f"{file}: expected {FORMAT!r}, got {shown(fields.get('format'))}")
     try:
-        known = read_record(_Words, words)
-        loop, rate_hz = words["loop"], known["sampling_rate_hz"]
+        known = read_record(_Fields, fields)
+        loop, rate_hz = fields["loop"], known["sampling_rate_hz"]
         if rate_hz <= 0 or np.isinf(rate_hz):
             raise InvalidArgument(f"sampling_rate_hz: expected a rate above 0 Hz, got {rate_hz}")
-        # Logs of before read all channels as one, and had the robot alone.
+        # Older logs read all channels as one, and have the robot instead of `observed`.
         readouts = Readouts.from_dict(loop.get("readouts"))
         observed = known["observed"] if "observed" in known else observed_columns(robot_from_dict(loop.get("robot")))
         return Header(

@@ -1,4 +1,4 @@
-"""Ctrl-C, a polite kill and a terminal that is gone in a closed loop: asked for an end, it ends in its own time."""
+"""Ctrl-C, SIGTERM and a lost terminal in a closed loop: they request an end instead of interrupting the loop."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from animat.ctrl_c import KILLS, handled
 
 
 @contextmanager
-def told_instead(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` for Ctrl-C, SIGTERM and SIGHUP, in place of raising somewhere; nothing outside of the main thread.
+def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` on Ctrl-C, SIGTERM and SIGHUP, instead of raising; has no effect outside of the main thread.
 
-    Ctrl-C and SIGHUP are left alone where they are ignored.
+    Ctrl-C and SIGHUP stay ignored where they were ignored before.
     """
     with handled((signal.SIGINT, *KILLS), lambda *_: stop()):
         yield

@@ -1,4 +1,4 @@
-"""How a closed loop is run: how actions are presented and answers read, and what happens when something goes wrong."""
+"""The settings of a closed loop: how actions are presented and responses read, and what happens on failures."""
 
 from __future__ import annotations
 
@@ -31,53 +31,53 @@ OnBurst = Literal["use", "repeat", "skip"]
 OnLate = Literal["continue", "stop"]
 
 MOST_WARM_UP = 100
-"""Presentations of each condition in a warm-up: as many as a recording holds; more wears a culture out for nothing."""
+"""Most trials of each condition in a warm-up, as many as in a recording; more would only wear the culture out."""
 SETTLINGS = 10
-"""How many pauses the settling has, where thresholds adapt and an action is one pulse."""
+"""Number of pauses in the settling, where thresholds adapt and an action is one pulse."""
 SETTLING_ROUNDS = 6
-"""Presentations of each condition after each pause of the settling: with five of them 2.3 s, next to a pause of 2 s."""
+"""Trials of each condition after each pause of the settling: 2.3 s with five conditions, next to a pause of 2 s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
     """The settings of a closed loop.
 
-    An action is a trial of a condition: `pulses` pulses, the first one 1/f after the last pulse of the action
-    before it and the others 1/f apart, on the condition's electrodes or, where it names none, each one of the patterns
-    in random order; the response to the last one is read.
+    An action is a trial of a condition: `pulses` pulses, the first one 1/f after the last pulse of the previous action
+    and the others 1/f apart, on the condition's electrodes or, if it names none, each on one of the patterns in random
+    order; the response to the last one is read.
 
     Attributes:
         robot: that is driven.
         mapping: from a response to a command.
-        conditions: what is chosen from; each tells its stimuli (`animat.responses.condition.Condition`).
-        percentiles: of the simulator that the policy was trained on, in Hz, shape (11,); of several readouts
-            (readouts, 11).
-        adaptive_from: responses of that recording, which adaptive thresholds start from (see
+        conditions: to choose from; each states its stimuli (`animat.responses.condition.Condition`).
+        percentiles: of the simulator that the policy was trained on, in Hz, shape (11,), or (readouts, 11) for several
+            readouts.
+        adaptive_from: responses of that recording, from which adaptive thresholds start (see
             `animat.closed_loop.adaptive`). None: thresholds are fixed.
         pulses: of a trial.
         window_ms: the response window.
-        burst_threshold: ratio of active channels above which a response is a burst; 1: none is.
-        pulse: what each electrode delivers.
+        burst_threshold: ratio of active channels above which a response is a burst; 1: no response is.
+        pulse: delivered by each electrode.
         patterns: how many of the culture's patterns are used, the first ones; None: all.
         on_burst: `"use"` the response as any other; `"repeat"` the stimulus, at most `most_repeats` times; `"skip"`
-            it, and move the robot by the command before it (0 where there was none).
+            it, and move the robot by the previous command (0 if there was none).
         most_repeats: of one action; the response after that is used.
-        on_late: when a pulse comes later than it should: `"continue"`, or `"stop"` the session; it is logged.
-        pause_s: observed without a stimulus before each episode, and each time in the settling.
-        warm_up: how often each condition is presented after that, in random order, before the robot moves: a culture
-            that has rested answers otherwise than in a recording. The responses count for adaptive thresholds. None:
-            2 where an action is one pulse, 0 where it is several, which are each other's past.
+        on_late: after a late pulse: `"continue"`, or `"stop"` the session; it is logged.
+        pause_s: seconds without a stimulus before each episode, and each time in the settling.
+        warm_up: trials of each condition after the pause, in random order, before the robot moves: a rested culture
+            responds differently from a recorded one. The responses count for adaptive thresholds. None: 2 where an
+            action is one pulse, 0 where it is several, which are each other's history.
         settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode. A recording
-            tires a culture more than a loop does. The culture recovers in the first minute. None: `SETTLINGS` where
+            tires a culture more than a loop does, and the culture recovers in the first minute. None: `SETTLINGS` where
             thresholds adapt and an action is one pulse, else 0.
-        patience_s: how much longer than it should a culture may take to answer before it counts as hung; and how long
-            the robot, and whoever acts, may take.
+        patience_s: time beyond the expected that a culture may take to answer before it counts as hung; and the time
+            that the robot, and an agent, may take.
         real_time: whether a culture that is faster is held back to real time.
         readouts: groups of channels that are read, by their electrodes: one for each command of the robot.
-        remembering: how responses become the history state, for agents that see it; None: nobody does.
+        remembering: how responses become the history state, for agents that see it; None: no agent does.
 
     Raises:
-        InvalidArgument: for a setting that cannot be.
+        InvalidArgument: for an invalid setting.
         UnusableData: for conditions that cannot be delivered (`animat.coding.encoder.Encoder`).
     """
 
@@ -106,9 +106,9 @@ class Loop:
         expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
         percentiles = np.array(self.percentiles, np.float32)
         if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):
-            of_each = f" for each of {len(self.readouts)} readouts" if len(self.readouts) > 1 else ""
+            each = f" for each of {len(self.readouts)} readouts" if len(self.readouts) > 1 else ""
             raise InvalidArgument(
-                f"percentiles: expected {N_PERCENTILES} rising numbers in Hz{of_each}, got {self.percentiles}"
+                f"percentiles: expected {N_PERCENTILES} rising numbers in Hz{each}, got {self.percentiles}"
             )
         percentiles.setflags(write=False)
         object.__setattr__(self, "percentiles", percentiles)
@@ -133,71 +133,71 @@ class Loop:
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
         if self.patience_s == 0:
-            raise InvalidArgument("patience_s: expected above 0 s, got 0: nothing answers at once")
+            raise InvalidArgument("patience_s: expected above 0 s, got 0: no answer is immediate")
         if self.patterns is not None and self.patterns < 1:
             raise InvalidArgument(f"patterns: expected at least 1, got {self.patterns}")
 
     def _check_start(self, recorded: AdjustedRanks) -> None:
-        """Thresholds start from responses that they can be of."""
+        """Check the responses from which adaptive thresholds start."""
         if not isinstance(recorded, AdjustedRanks):
             raise InvalidArgument(f"adaptive_from: expected calibration.adjusted, got {type(recorded).__name__}")
         n, shape = [len(each) for each in recorded.ranks], (len(self.conditions), len(self.readouts))
         if (len(n), recorded.slopes.shape[1]) != shape or not all(n):
             raise InvalidArgument(
-                f"adaptive_from: expected responses to each of {shape[0]} conditions, in as many readouts as the loop "
-                f"has ({shape[1]}), got {n} in {recorded.slopes.shape[1]}"
+                f"adaptive_from: expected responses to each of {shape[0]} conditions, in the loop's number of readouts "
+                f"({shape[1]}), got {n} in {recorded.slopes.shape[1]}"
             )
         if self.remembering not in (None, recorded.remembering):
-            raise InvalidArgument("remembering: expected adaptive_from.remembering, got another one")
+            raise InvalidArgument("remembering: expected adaptive_from.remembering, got a different one")
 
     def rounds_before(self, episode: int, *, is_silent: bool) -> list[int]:
-        """How often each condition is presented after each of the pauses before an episode."""
+        """Trials of each condition after each of the pauses before an episode."""
         settling = self.settling if episode == 0 else 0
         return [SETTLING_ROUNDS] * (settling or 0) + [0 if is_silent else self.warm_up or 0]
 
     @property
     def history(self) -> Remembering | None:
-        """How its responses become the history state, for thresholds that adapt or for agents; None: nobody asks."""
+        """How responses become the history state, for adaptive thresholds or for agents; None: not needed."""
         return self.remembering if self.adaptive_from is None else self.adaptive_from.remembering
 
     @property
     def presentation(self) -> Presentation:
-        """How it presents; conditions are mixed, as each is chosen when it is its turn."""
+        """How stimuli are presented: mixed, as each condition is chosen when its turn comes."""
         return Presentation("mixed", self.pulses)
 
     @property
     def encoder(self) -> Encoder:
-        """What its actions are as stimuli."""
+        """From actions to stimuli."""
         return Encoder(self.conditions, self.pulses)
 
     @property
     def decoder(self) -> Decoder:
-        """What its responses are as commands."""
+        """From responses to commands."""
         return Decoder(self.mapping, self.readouts)
 
     @classmethod
     def of_policy(
         cls, policy: Policy, percentiles: ArrayLike, *, pulses: int | None = None, **settings: Any
     ) -> tuple[Self, tuple[Finding, ...]]:
-        """The loop that a policy was trained for, and where it differs from how the policy's recordings were made.
+        """The loop for a policy, and its differences from the policy's recordings.
 
         Args:
-            policy: its robot, mapping, readouts, conditions, window and presentation are taken, but for those in
+            policy: its robot, mapping, readouts, conditions, window and presentation are used, except for those in
                 `settings`.
             percentiles: of the simulator that it was trained on, in Hz, shape (11,), or (readouts, 11).
-            pulses: of a trial; None: as many as in its recordings (1 where that is not known).
+            pulses: of a trial; None: as many as in its recordings (1 if that is not known).
             settings: the other attributes.
 
         Raises:
             UnusableData: for a policy without neurons.
         """
         if policy.mapping is None:
-            raise UnusableData("policy: expected one that acts through neurons, got one that was trained without")
+            raise UnusableData("policy: expected one that acts through neurons, got one that was trained without them")
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses
-        taken = {"conditions": policy.conditions, "window_ms": policy.window_ms, "readouts": policy.readouts}
-        settings = {**taken, **settings}
+        trained = {"conditions": policy.conditions, "window_ms": policy.window_ms, "readouts": policy.readouts}
+        settings = {**trained, **settings}
         if settings["window_ms"] is None:
             del settings["window_ms"]
         loop = cls(
@@ -225,6 +225,6 @@ def _differences(policy: Policy, loop: Loop) -> tuple[Finding, ...]:
     findings = list(other_presentation(policy.presentation, loop.presentation))
     if policy.window_ms is not None and policy.window_ms != loop.window_ms:
         trained, read = describe_window(policy.window_ms), describe_window(loop.window_ms)
-        message = f"the policy was trained on responses {trained}, the loop reads those {read}"
+        message = f"the policy was trained on responses {trained}, but the loop reads those {read}"
         findings.append(Finding("other-window", "warning", message))
     return tuple(findings)

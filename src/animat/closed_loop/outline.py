@@ -1,4 +1,4 @@
-"""What a session came to, counted record by record: its episodes, its ticks in numbers, and what was never answered."""
+"""A session in numbers, counted record by record: its episodes, ticks, and unanswered requests."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ class Episode:
 
     Attributes:
         number: in the session, from 0.
-        agent: who acted.
-        start: what was observed before the first step; empty where the log is of before this was written.
+        agent: its name.
+        start: the observation before the first step; empty in older logs, which do not have it.
         total: the sum of rewards, in the task's own units.
         iterations: of the robot.
         terminated: whether it ended by itself and not at the limit.
-        is_whole: whether it came to its end; what the session broke off has no return.
-        pulses: that the culture was given.
-        warm_up_pulses: those of them before the robot moved; all that follows is without the warm-up.
+        is_whole: whether it was completed; an episode that the session cut short has no return.
+        pulses: that the culture received.
+        warm_up_pulses: those before the robot moved; the following counts exclude the warm-up.
         electrode_pulses: one for each electrode of each pulse.
-        trials: repeated ones among them.
+        trials: including repeated ones.
         bursts: responses that were bursts.
         late: trials that came late.
     """
@@ -45,12 +45,12 @@ class Episode:
 
 
 class Outline:
-    """Counts as records are added, in their order.
+    """Counts of a session's records, which are added in order.
 
     Attributes:
-        left_out: what the culture's device reported and the session does not have, by what it is; known at the end.
-        ticks: how many.
-        pulses: that the culture was given.
+        left_out: what the culture's device reported and the session lacks, by kind; known at the end.
+        ticks: number of ticks.
+        pulses: that the culture received.
         bursts: responses that were bursts.
         late: ticks whose pulses came late.
         latest_s: the largest lateness.
@@ -64,48 +64,48 @@ class Outline:
         self.moved_at_s: float | None = None
         self._starts: dict[int, tuple[float, ...]] = {}
         self._episodes: dict[int, Episode] = {}
-        self._asked: dict[int, dict[str, Any]] = {}
+        self._pending: dict[int, dict[str, Any]] = {}
         self._answered = -1
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
-        """Every episode that was begun, in the order of time."""
+        """Every episode that began, in order of time."""
         return tuple(episode for _, episode in sorted(self._episodes.items()))
 
     @property
     def unanswered(self) -> tuple[dict[str, Any], ...]:
-        """What was asked of the culture and never answered in a way that can be used: whether its pulses came is not
-        known, and they are in no recording. The words of its record: when, which stimuli."""
+        """Fields of requests that were never answered in a usable way: whether their pulses were delivered is not
+        known, and no recording has them."""
         return tuple(
-            words
-            for words in self._asked.values()
-            if any(pattern != NOTHING for _, pattern, *_ in words["stimuli"]) and words.get("is_admitted", True)
+            fields
+            for fields in self._pending.values()
+            if any(pattern != NOTHING for _, pattern, *_ in fields["stimuli"]) and fields.get("is_admitted", True)
         )
 
     @property
     def unanswered_pulses(self) -> int:
-        """How many pulses were asked for and never answered."""
-        return sum(pattern != NOTHING for words in self.unanswered for _, pattern, *_ in words["stimuli"])
+        """Number of pulses that were requested and never answered."""
+        return sum(pattern != NOTHING for fields in self.unanswered for _, pattern, *_ in fields["stimuli"])
 
-    def add(self, words: Mapping[str, Any]) -> None:
-        """Count one record in."""
-        kind, stretch = words["kind"], words.get("stretch")
+    def add(self, fields: Mapping[str, Any]) -> None:
+        """Count one record."""
+        kind, stretch = fields["kind"], fields.get("stretch")
         if kind == "seen":
-            # Sessions that were logged before this was have no stretches.
+            # Older logs do not number their stretches.
             if stretch is not None:
-                self._asked.pop(stretch, None)
+                self._pending.pop(stretch, None)
                 self._answered = max(self._answered, stretch)
-            if words["tick"]:
-                self._add_tick(words["tick"], electrode_pulses_of(words))
+            if fields["tick"]:
+                self._add_tick(fields["tick"], count_electrode_pulses(fields))
         elif kind in ("asked", "event"):
-            # What is under way is looked at while it is answered: it may be written down after its answer.
-            # So may it be after the event that ended it, which knows more.
-            if stretch is not None and stretch > self._answered and (kind == "event" or stretch not in self._asked):
-                self._asked[stretch] = dict(words)
+            # Another thread writes the request: its record may follow that of its answer, or that of the event that
+            # ended it, which has more fields.
+            if stretch is not None and stretch > self._answered and (kind == "event" or stretch not in self._pending):
+                self._pending[stretch] = dict(fields)
         elif kind == "start":
-            self._starts[words["episode"]] = tuple(words["observation"])
+            self._starts[fields["episode"]] = tuple(fields["observation"])
         elif kind == "end":
-            self.left_out = words.get("left_out", {})
+            self.left_out = fields.get("left_out", {})
 
     def _add_tick(self, tick: Mapping[str, Any], electrode_pulses: int) -> None:
         number, n_pulses, is_late = tick["episode"], len(tick["pulse_time_s"]), tick["late_s"] > 0
@@ -135,6 +135,6 @@ class Outline:
             episode.iterations += 1
 
 
-def electrode_pulses_of(seen: Mapping[str, Any]) -> int:
-    """How many electrodes were pulsed in a stretch of time, each as often as it was, from the words of its record."""
-    return sum(len(electrodes) for _, _, _, electrodes in seen["stimuli"])
+def count_electrode_pulses(fields: Mapping[str, Any]) -> int:
+    """The number of electrode pulses in a stretch of time, from the fields of its record."""
+    return sum(len(electrodes) for _, _, _, electrodes in fields["stimuli"])

@@ -1,4 +1,4 @@
-"""A robot that is moved one step at a time, outside of any compiled loop; one that is stepped on the host, too."""
+"""Robots that are moved one step at a time, outside of a compiled loop, in JAX or on the host."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from animat.wrappers import other_goal
 
 
 class Moved(NamedTuple):
-    """What a step did.
+    """The result of a step.
 
     Attributes:
         reward: in the task's own units.
         terminated: the task ended by itself.
         observation: after the step, in the robot's own units.
-        truncated: the robot itself cut the episode off; at its `episode_limit` whoever runs it does.
+        truncated: the robot itself cut the episode off; at its `episode_limit` the caller does.
     """
 
     reward: float
@@ -37,24 +37,23 @@ class Runner(Protocol):
     """A robot with its state."""
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Start an episode where the robot draws it, the same number in the same state; returns what is observed."""
+        """Start an episode where the robot draws it, in the same state for the same number; returns the observation."""
 
     def step(self, u: ArrayLike) -> Moved:
-        """Move by a command in [-1, 1], or by several."""
+        """Move by one or several commands in [-1, 1]."""
 
     def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Give the robot another goal, the same number the same one; returns what is observed."""
+        """Give the robot another goal, the same for the same number; returns the observation."""
 
 
 @lru_cache(maxsize=8)
 def _compiled(robot: Robot[Any]) -> tuple[Callable[..., Any], ...]:
-    """A step, a start, and another goal: one program for every runner of this robot."""
+    """A step, a start, and another goal: compiled once for all runners of a robot."""
 
     def stepped(uniforms: Any, state: Any, u: Any) -> tuple[Any, Any]:
         after, reward, terminated = robot.advance(uniforms, state, u)
-        # In one array: three, and waiting for each, took longer than the step itself.
-        told = jnp.stack([reward, terminated])
-        return after, jnp.concatenate([told, robot.observe(after)])
+        # One array: to wait for each of three took longer than the step itself.
+        return after, jnp.concatenate([jnp.stack([reward, terminated]), robot.observe(after)])
 
     def started(key: Any, number: int) -> tuple[Any, Any]:
         state = robot.reset(jax.random.fold_in(key, number))
@@ -69,73 +68,69 @@ def _compiled(robot: Robot[Any]) -> tuple[Callable[..., Any], ...]:
 
 
 class RobotRunner:
-    """A robot with its state; its step is compiled once, before the first one, and takes some 30 us.
+    """A robot with its state; its step is compiled once, in advance, and takes some 30 us.
 
     Args:
         robot: that is moved.
-        rng: source of the robot's noise, and of where its episodes start.
+        rng: draws the robot's noise, and the starts of its episodes.
     """
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
         self.robot, self._rng = robot, rng
-        # A robot that cannot be hashed has programs of its own.
+        # A robot that cannot be hashed is compiled for each runner.
         compiled = _compiled if isinstance(robot, Hashable) else _compiled.__wrapped__
         self._step, self._start, self._switch = compiled(robot)
         self._key = jax.random.key(int(rng.integers(2**31)))
-        # Goals are those of starts that no episode has.
+        # Other goals come from starts that no episode has.
         self._goals = jax.random.split(self._key)[1]
-        # Compiled now: in the middle of an episode it would cost some hundred milliseconds.
+        # Compile now: in the middle of an episode it would take some hundred milliseconds.
         self.reset(0)
         self.step(np.zeros(() if robot.n_commands == 1 else robot.n_commands))
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Start an episode where the robot draws it; returns what is observed.
-
-        Args:
-            number: the same number starts in the same state.
-        """
+        """As in `Runner`."""
         self._state, observation = self._start(self._key, number)
         return np.asarray(observation, np.float64)
 
     def step(self, u: ArrayLike) -> Moved:
-        """Move by a command in [-1, 1], or by several."""
+        """As in `Runner`."""
         uniforms = self._rng.random(self.robot.noise_size, dtype=np.float32)
-        self._state, told = self._step(uniforms, self._state, np.asarray(u, np.float32))
-        told = np.asarray(told, np.float64)
-        return Moved(float(told[0]), bool(told[1]), told[2:])
+        self._state, stepped = self._step(uniforms, self._state, np.asarray(u, np.float32))
+        stepped = np.asarray(stepped, np.float64)
+        return Moved(float(stepped[0]), bool(stepped[1]), stepped[2:])
 
     def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Give the robot the goal of another start, the same number the same one; returns what is observed."""
+        """As in `Runner`: the goal of another start."""
         self._state, observation = self._switch(self._goals, number, self._state)
         return np.asarray(observation, np.float64)
 
 
 class HostRunner:
-    """A robot that is stepped on the host, with its state; arguments as of `RobotRunner`, and of `Bodies`."""
+    """A robot that is stepped on the host, with its state; arguments as for `RobotRunner` and `Bodies`."""
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator, *, with_pictures: bool = False) -> None:
         assert isinstance(robot, HostRobot)
         self._entropy = int(rng.integers(2**31))
         self._bodies = Bodies(robot, [(self._entropy, 0)], with_pictures=with_pictures)
-        # What it loads when it first moves would come late in the middle of an episode.
+        # Whatever it loads on its first move would delay an episode.
         self.reset(0)
         self.step(np.zeros(robot.n_commands))
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Start an episode where the robot draws it; returns what is observed; the same number in the same state."""
+        """As in `Runner`."""
         self._bodies.take_seeds([(self._entropy, number)])
         return np.asarray(self._bodies.begin()[0], np.float64)
 
     def step(self, u: ArrayLike) -> Moved:
-        """Move by a command in [-1, 1], or by several."""
+        """As in `Runner`."""
         stepped = self._bodies.step(np.asarray(u, np.float32).reshape(1, -1))
         (reward,), (terminated,), (truncated,) = stepped.reward, stepped.terminated, stepped.truncated
         return Moved(float(reward), bool(terminated), stepped.observation[0].astype(np.float64), bool(truncated))
 
     def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Its goal is its own affair (InvalidArgument)."""
+        """Raise InvalidArgument: the goal of a host robot cannot be switched."""
         raise InvalidArgument(f"robot: expected one whose goal can be switched, got {self._bodies.robot.name}")
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """The body as it is now; None where it gives none."""
+        """A picture of the robot now; None if it draws none."""
         return self._bodies.picture()

@@ -1,4 +1,4 @@
-"""Running a session: the loop in a thread of its own, and a supervisor that writes, watches, and ends it safely."""
+"""Running a session: the loop in its own thread, and a supervisor that logs, watches, and ends it safely."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.agents import Agent, InTurn, interleaved
+from animat.closed_loop.agents import Agent, InTurn, interleave
 from animat.closed_loop.driver import Driver
-from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
-from animat.closed_loop.interrupts import told_instead
+from animat.closed_loop.interrupts import stop_on_signals
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, expect_no_session
+from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.closed_loop.tick import Ending
-from animat.closed_loop.timing import Clock, WallClock, ahead_of_other_programs, among_other_programs
+from animat.closed_loop.timing import Clock, WallClock, drop_real_time_priority, real_time_priority
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
@@ -38,16 +38,16 @@ from animat.progress import Progress, Silent
 from animat.writing import UNCHANGED
 
 MOST_EPISODES = 100_000
-"""Of each agent in a session."""
+"""Most episodes of each agent in a session."""
 _POLL_S = 0.02
 _BATCH, _PAUSE_S = 4, 2.5e-4
 """Records written in a row, some 0.2 ms, and the pause after them: the loop's thread may have a deadline."""
 _SWITCH_S = 2e-4
-"""How long the loop's thread may keep the interpreter while the log is waiting for it; Python's own is 5 ms."""
+"""How long the loop's thread may keep the interpreter while the log waits for it; Python's default is 5 ms."""
 _SYNC_S = 0.5
-"""Between times that the log is put on the disk itself: with polling and writing, a power cut then costs under 1 s."""
+"""Time between flushes of the log to disk: with polling and writing, a power cut then costs under 1 s."""
 _GRACE_S = 2.0
-"""How long the loop's thread gets to come to its end once it was told to."""
+"""How long the loop's thread has to end after a request to stop."""
 
 
 def run_session(
@@ -65,47 +65,46 @@ def run_session(
 ) -> Session:
     """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
-    Whatever happens, every tick but those of the last 0.2 s before a SIGKILL is in `session.log`, with what was asked
-    of the culture and not answered yet. Once this returns, or `recover_session` did its work, `session.nwb` is a
-    recording like any other. Unless the plan was done or the budget spent, the culture is then stopped: it delivers
-    nothing until it is closed and opened again. `ending` says what happened; nothing is raised for it, Ctrl-C and
-    SIGTERM included. A file `STOP` in the folder ends the session before the next pulse. What `progress` raises is
-    raised, once the culture is stopped and the log is written.
+    Whatever happens, `session.log` has every tick except those of the last 0.2 s before a SIGKILL, and the stimuli
+    that were requested and not yet answered. Once this or `recover_session` returns, `session.nwb` is a recording like
+    any other. Unless the plan was completed or the budget spent, the culture is then stopped: it delivers nothing until
+    it is closed and opened again. `ending` says what happened; nothing is raised for it, not even for Ctrl-C and
+    SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An exception of `progress` is raised
+    again, once the culture is stopped and the log is written.
 
     Args:
         culture: open; it stays open.
         loop: the settings.
-        agents: who acts.
-        folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line a tick.
-        episodes: of each agent, or of each its own number.
-        seed: decides every random draw, but what the culture does.
-        account: of a stimulation budget; None: without end.
-        clock: the machine's; None: its monotonic one.
-        progress: told all the time how many episodes are done, and the returns so far.
-        predicted: mean return that is expected of each agent, with its interval; kept in the log for whoever watches.
+        agents: of the session.
+        folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line per tick.
+        episodes: of each agent; one number, or one for each.
+        seed: decides every random draw, except what the culture does.
+        account: of a stimulation budget; None: unlimited.
+        clock: the machine's; None: its monotonic clock.
+        progress: updated continuously with the number of finished episodes and the returns so far.
+        predicted: mean return expected of each agent, with its interval; stored in the log for viewers.
 
     Raises:
-        InvalidArgument: for a culture that is closed or stopped, no agents, one that sees the history state in a loop
-            that does not remember, a prediction of no agent, or a session or a file `STOP` that is in the folder
-            already.
-        Mismatch: for conditions on electrodes that the culture cannot stimulate, or readouts of ones that it does not
-            read, or a folder of other work.
-        InvalidFile: if a file is in the folder's place, or the log cannot be begun.
-        UnsafeStimulus: for a pulse that the culture may not be given.
+        InvalidArgument: for a culture that is closed or stopped, no agents, an agent that sees the history state in a
+            loop without one, a prediction for an unknown agent, or a folder with a session or a file `STOP`.
+        Mismatch: for conditions on electrodes that the culture cannot stimulate, readouts of electrodes that it does
+            not record, or a folder of other work.
+        InvalidFile: if the folder is a file, or the log cannot be begun.
+        UnsafeStimulus: for a pulse beyond the culture's limits.
     """
     planned = [episodes] * len(agents) if isinstance(episodes, int) else list(episodes)
     check_session(culture, loop, agents, planned, seed)
-    if strange := sorted({*(predicted or {})} - {agent.name for agent in agents}):
-        raise InvalidArgument(f"predicted: expected names of agents, got {', '.join(strange)}")
+    if unknown := sorted({*(predicted or {})} - {agent.name for agent in agents}):
+        raise InvalidArgument(f"predicted: expected names of agents, got {', '.join(unknown)}")
     expect_no_session(folder)
     stop_file = Path(folder) / STOP_FILE
     if stop_file.exists():
         raise InvalidArgument(f"{stop_file}: expected none yet, as it ends a session: remove it first")
     account, progress = account or Account(), progress or Silent()
-    turns = _after_their_sources(interleaved(planned, np.random.default_rng([seed, 20])), agents)
+    turns = _put_sources_first(interleave(planned, np.random.default_rng([seed, 20])), agents)
     driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed, stop_file)
     file = Path(folder) / LOG_FILE
-    # As whoever reads the log has it.
+    # As it is read back from the log.
     header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed, predicted or {})))
     read_header(file, header)
     with closing(LogWriter(file, header)) as log:
@@ -114,10 +113,10 @@ def run_session(
         try:
             session.write()
         except Exception as error:
-            # What was measured comes back, whatever its files are like.
-            told = error if isinstance(error, AnimatError) else f"its files cannot be made: {describe_error(error)}"
-            told = str(told).removesuffix(UNCHANGED)
-            message = f"{ending.message}; {told} (animat recover {folder} writes the files, once that is mended)"
+            # Return the session even if its files cannot be written.
+            fault = error if isinstance(error, AnimatError) else f"its files cannot be made: {describe_error(error)}"
+            fault = str(fault).removesuffix(UNCHANGED)
+            message = f"{ending.message}; {fault} (once that is fixed, animat recover {folder} writes the files)"
             session = replace(session, ending=replace(ending, message=message))
     return session
 
@@ -136,62 +135,62 @@ class _Supervisor:
         self._log, self._progress, self._episodes = log, progress, episodes
         self._synced = time.monotonic()
         self._ending: Ending | None = None
-        self._noted = self._seen = -1
+        self._logged_request = self._logged_answer = -1
         self._not_halted: str | None = None
         self._left_out = culture.left_out
 
     def run(self) -> Ending:
-        """Start the loop and stay with it to its end."""
+        """Start the loop and supervise it until its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
         with ExitStack() as stack:
-            stack.enter_context(told_instead(self._stop_for_a_person))
+            stack.enter_context(stop_on_signals(self._stop_for_person))
             if gc.isenabled():
                 # A collection can take 50 ms, and the loop makes no cycles.
                 stack.callback(gc.enable)
                 gc.disable()
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(_SWITCH_S)
-            stack.enter_context(self._ahead(with_those_it_starts=True))
+            stack.enter_context(self._priority(inherited=True))
             thread.start()
             try:
                 ending = self._watch(thread)
             except BaseException as error:
-                # The caller's progress, or a fault of our own: a loop that nobody watches must not go on.
+                # From the caller's progress, or our own: an unsupervised loop must not continue.
                 is_person = isinstance(error, KeyboardInterrupt)
-                told = "stopped by a person" if is_person else f"what watches the loop raised {describe_error(error)}"
+                message = "stopped by a person" if is_person else f"the loop's supervisor raised {describe_error(error)}"
                 with suppress(Exception):
-                    self._end_it(thread, Ending("person" if is_person else "crash", told))
+                    self._end(thread, Ending("person" if is_person else "crash", message))
                 raise
             if ending is not None:
-                return self._end_it(thread, ending)
-            ending = self._ending or Ending("crash", "the loop's thread ended without a word")
+                return self._end(thread, ending)
+            ending = self._ending or Ending("crash", "the loop's thread ended without an ending")
             if ending.by not in ("plan", "budget"):
                 self._halt(ending)
             return self._finish(ending)
 
-    def _end_it(self, thread: threading.Thread, ending: Ending) -> Ending:
-        """End a loop that did not end by itself: it is told to, and left alone if it does not."""
+    def _end(self, thread: threading.Thread, ending: Ending) -> Ending:
+        """Ask a loop that did not end by itself to end, and abandon it if it does not."""
         self._driver.is_stopped = True
         self._halt(ending)
         thread.join(_GRACE_S)
         if thread.is_alive():
-            among_other_programs(thread)
+            drop_real_time_priority(thread)
         self._halt(ending)
         return self._finish(ending)
 
     def _drive(self) -> None:
-        # What the robot or an agent starts has no deadlines.
-        with self._ahead(with_those_it_starts=False):
+        # Threads and programs that the robot or an agent starts have no deadlines.
+        with self._priority(inherited=False):
             self._ending = self._driver.run()
 
-    def _ahead(self, *, with_those_it_starts: bool) -> AbstractContextManager[None]:
-        """Ahead of other programs, if there are deadlines: what computes as fast as it can would leave them nothing."""
+    def _priority(self, *, inherited: bool) -> AbstractContextManager[None]:
+        """Real-time priority if there are deadlines; a loop that never waits would starve other programs."""
         if not self._loop.real_time and self._culture.device is None:
             return nullcontext()
-        return ahead_of_other_programs(with_those_it_starts=with_those_it_starts)
+        return real_time_priority(inherited=inherited)
 
     def _watch(self, thread: threading.Thread) -> Ending | None:
-        """Write and watch while the loop runs; returns why it must be ended from outside, None if it ended."""
+        """Log and watch while the loop runs; returns why it must be ended from outside, or None if it ended."""
         driver = self._driver
         while thread.is_alive():
             thread.join(_POLL_S)
@@ -200,72 +199,72 @@ class _Supervisor:
             except OSError as error:
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
             if thread.is_alive() and (stopped := driver.stopped_by_file()):
-                # The loop sees it before its next trial; pulses of the one under way are not waited for.
+                # The loop checks before its next trial; do not wait for the pulses of the current one.
                 return stopped
-            by_s, who = driver.expected
+            by_s, who = driver.deadline
             if time.monotonic() > by_s and thread.is_alive():
                 return Ending(
-                    "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: left alone"
+                    "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: abandoned"
                 )
             self._progress.update(driver.standing.episodes, self._episodes, driver.standing.note())
         return None
 
     def _write(self) -> None:
         records = self._driver.records
-        # No more than are there now: a loop that is as fast as the log must not keep this thread from watching it.
+        # Only the present records: a loop as fast as the log must not keep this thread from watching it.
         for number in range(len(records)):
             self._log.append(records[0])
-            # Taken away only once it is written: a full disk loses none that could be written later.
-            written = records.popleft().words
-            self._seen = written["stretch"] if written["kind"] == "seen" else self._seen
+            # Removed only once written, so that a full disk loses no record that could be written later.
+            written = records.popleft().fields
+            self._logged_answer = written["stretch"] if written["kind"] == "seen" else self._logged_answer
             if number % _BATCH == _BATCH - 1:
-                # A pause of 0 would keep the processor, and on one core the loop's thread could not go on.
+                # A pause of 0 would not yield the processor to the loop's thread on a single core.
                 time.sleep(_PAUSE_S)
-        asked = self._driver.under_way
-        if asked is not None and asked.stretch > self._noted:
-            # If the answer never comes, or the program is killed meanwhile, it is known what was asked for.
-            self._log.append(Record({"kind": "asked", **asked.to_dict()}))
-            self._noted = asked.stretch
+        request = self._driver.request
+        if request is not None and request.stretch > self._logged_request:
+            # Known even if the answer never comes, or the program is killed meanwhile.
+            self._log.append(Record({"kind": "asked", **request.to_dict()}))
+            self._logged_request = request.stretch
         if time.monotonic() - self._synced > _SYNC_S:
             self._log.sync()
             self._synced = time.monotonic()
 
     def _finish(self, ending: Ending) -> Ending:
-        """Write what is left, and how it ended."""
+        """Log the remaining records and the ending."""
         if self._not_halted is not None:
-            message = f"{ending.message}; BUT {self._not_halted}: see to it that the device gives no more pulses"
+            message = f"{ending.message}; BUT {self._not_halted}: make sure that the device delivers no more pulses"
             ending = replace(ending, message=message)
         try:
-            # Looked at first: a robot that comes back just now has its tick among those that are written.
+            # Read before writing: if the robot answers just now, its finished tick is among the written records.
             unfinished = self._driver.unfinished
             self._write()
-            if unfinished is not None and unfinished.words["stretch"] > self._seen:
+            if unfinished is not None and unfinished.fields["stretch"] > self._logged_answer:
                 self._log.append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
-            words = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
-            self._log.append(Record(words))
+            fields = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
+            self._log.append(Record(fields))
             self._log.sync()
         except OSError as error:
             left, why = len(self._driver.records), error.strerror or str(error)
-            lost = {0: "how it ended", 1: "the last tick"}.get(left, f"the last {left} ticks")
+            lost = {0: "the ending", 1: "the last tick"}.get(left, f"the last {left} ticks")
             message = f"{ending.message}; {lost} could not be written and {'are' if left > 1 else 'is'} lost"
             message += "" if why in ending.message else f" ({why})"
             return Ending("disk" if ending.by in ("plan", "budget") else ending.by, message)
         return ending
 
-    def _stop_for_a_person(self) -> None:
+    def _stop_for_person(self) -> None:
         self._driver.is_stopped = True
-        self._halt(Ending("person", "stopped by a person (Ctrl-C, or a polite kill)"))
+        self._halt(Ending("person", "stopped by a person (Ctrl-C or kill)"))
 
     def _halt(self, ending: Ending) -> None:
-        """Stop the culture, from a thread of its own: a backend that hangs must not hang the end as well."""
-        self._not_halted = f"the culture did not say within {_GRACE_S:g} s that it is stopped"
+        """Stop the culture in a separate thread: a backend that hangs must not block the end as well."""
+        self._not_halted = f"the culture did not confirm within {_GRACE_S:g} s that it is stopped"
         halting = threading.Thread(target=self._halt_now, args=(ending.message,), daemon=True)
         halting.start()
         halting.join(_GRACE_S)
 
     def _halt_now(self, reason: str) -> None:
-        # The guard refuses every stimulus from here on, whatever the backend does about those under way.
+        # From here on the guard refuses every stimulus, whatever the backend does with those already requested.
         try:
             self._culture.stop(reason)
         except Exception as error:
@@ -284,7 +283,7 @@ def _header(
     predicted: Mapping[str, Interval],
 ) -> dict[str, Any]:
     channels = culture.channels
-    told = {name: {"mean": of.value, "low": of.low, "high": of.high} for name, of in predicted.items()}
+    predictions = {name: {"mean": r.value, "low": r.low, "high": r.high} for name, r in predicted.items()}
     return {
         "kind": "header",
         "format": FORMAT,
@@ -295,19 +294,19 @@ def _header(
         "culture": culture.name,
         "provenance": culture.provenance,
         "limits": asdict(culture.limits),
-        # What was spent of it before the session.
+        # Including what was spent before the session.
         "account": account.to_dict(),
         "loop": loop.to_dict(),
         "observed": observed_columns(loop.robot),
-        "agents": [_told(agent) for agent in agents],
+        "agents": [_agent_to_dict(agent) for agent in agents],
         "turns": [agents[turn].name for turn in turns],
         "seed": seed,
-        **({"predicted": told} if told else {}),
+        **({"predicted": predictions} if predictions else {}),
     }
 
 
-def _after_their_sources(turns: list[int], agents: Sequence[Agent]) -> list[int]:
-    """The same turns with no yoked episode before the first one that it could repeat: the two change places."""
+def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
+    """Swap each yoked episode that precedes the first episode that it could repeat with that episode."""
     turns = list(turns)
     for number, agent in enumerate(agents):
         if agent.delivery != "yoked" or number not in turns:
@@ -315,29 +314,29 @@ def _after_their_sources(turns: list[int], agents: Sequence[Agent]) -> list[int]
         assert isinstance(agent.controller, InTurn)
         sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller.by_name]
         if not sources:
-            raise InvalidArgument(f"agents: expected episodes that {agent.name!r} could repeat, got none")
+            raise InvalidArgument(f"agents: expected episodes for {agent.name!r} to repeat, got none")
         if (first := turns.index(number)) < sources[0]:
             turns[first], turns[sources[0]] = turns[sources[0]], turns[first]
     return turns
 
 
-def _told(agent: Agent) -> dict[str, Any]:
-    told = {"name": agent.name, "meaning": agent.meaning, "delivery": agent.delivery}
-    more = {
-        # Episode after episode of this agent, over and over.
+def _agent_to_dict(agent: Agent) -> dict[str, Any]:
+    optional = {
+        # The controllers of successive episodes, in a cycle.
         "in_turn": list(agent.controller.by_name) if isinstance(agent.controller, InTurn) else [],
         "is_drawn": agent.drawn_from is not None,
         "is_turned_round": agent.is_turned_round,
         "switch_at": agent.switch_at,
     }
-    return told | {name: value for name, value in more.items() if value}
+    required = {"name": agent.name, "meaning": agent.meaning, "delivery": agent.delivery}
+    return required | {name: value for name, value in optional.items() if value}
 
 
 def check_episodes(name: str, episodes: int) -> None:
-    """Refuse episodes that are none, or more than a session can plan: whose turn each is is drawn before the first.
+    """Refuse no episodes, or more than a session can plan: all turns are drawn before the first episode.
 
     Raises:
-        InvalidArgument: by the name of the argument or option.
+        InvalidArgument: under the name of the argument or option.
     """
     if not 1 <= episodes <= MOST_EPISODES:
         expected = "at least 1" if episodes < 1 else f"at most {MOST_EPISODES:,}"
@@ -345,18 +344,18 @@ def check_episodes(name: str, episodes: int) -> None:
 
 
 def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episodes: Sequence[int], seed: int) -> None:
-    """Refuse what `run_session` would, of culture, loop and agents, before anything else is done."""
+    """Raise as `run_session` does for its culture, loop and agents."""
     if not culture.is_open or culture.is_stopped:
         state = "stopped" if culture.is_open else "closed"
-        raise InvalidArgument(f"culture: expected an open one that may stimulate, got one that is {state}")
+        raise InvalidArgument(f"culture: expected an open one that can be stimulated, got one that is {state}")
     if not agents or len({agent.name for agent in agents}) < len(agents):
         raise InvalidArgument("agents: expected at least one, each name once")
     if len(episodes) != len(agents):
         raise InvalidArgument(
             f"episodes: expected one number, or one for each of {len(agents)} agents, got {len(episodes)}"
         )
-    for each in episodes:
-        check_episodes("episodes", each)
+    for number in episodes:
+        check_episodes("episodes", number)
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if loop.patterns is not None and loop.patterns > len(culture.patterns):
@@ -369,9 +368,9 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
         )
     loop.readouts.members(culture.channels)
     Guard(culture.limits, ()).check_pulse(loop.pulse)
-    if strange := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
+    if unknown := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(
             f"conditions: expected electrodes that the {culture.name} culture can stimulate "
-            f"({some_of(culture.stimulation_electrodes)}), got {some_of(strange)}: run on the culture that was "
+            f"({some_of(culture.stimulation_electrodes)}), got {some_of(unknown)}: run on the culture that was "
             "recorded, or train on recordings of this one"
         )

@@ -1,4 +1,4 @@
-"""A session of the closed loop as it was written down: its ticks, its episodes, and the recording it became."""
+"""A logged session of the closed loop: its ticks, its episodes, and its recording."""
 
 from __future__ import annotations
 
@@ -11,16 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.gathering import (
-    LOG_FILE,
-    RECORDING_FILE,
-    TICKS_FILE,
-    Gathered,
-    expecting_a_session,
-)
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, Records, read_log
-from animat.closed_loop.outline import Episode, Outline, electrode_pulses_of
+from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
+from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
 from animat.closed_loop.tick import Ending, Tick, TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.marks import expect_no_other
@@ -30,26 +24,26 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away, exclusive_lock, is_unfinished
 
-_TOLD_EVERY = 1000
+_UPDATE_EVERY = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class Ticks(Iterable[Tick]):
-    """Every tick of a log, in the order of time, read from it each time as they are asked for."""
+    """Every tick of a log, in order of time, read again on each iteration."""
 
     records: Records
 
     def __iter__(self) -> Iterator[Tick]:
-        return (Tick.from_dict(words["tick"]) for words in self.records.words() if words.get("tick"))
+        return (Tick.from_dict(fields["tick"]) for fields in self.records.fields() if fields.get("tick"))
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What a log file says of a session; what is long is read when it is asked for.
+    """A session as its log describes it; long parts are read on demand.
 
     Attributes:
-        folder: where it is.
-        log: all that was written.
+        folder: of the session.
+        log: everything that was written.
         ending: how it ended.
     """
 
@@ -59,63 +53,63 @@ class Session:
 
     @property
     def recording_file(self) -> Path:
-        """Where its recording is, once it was written."""
+        """The file of its recording, once written."""
         return self.folder / RECORDING_FILE
 
     @property
     def ticks_file(self) -> Path:
-        """Where its ticks are as a table, once it was written."""
+        """The table of its ticks, once written."""
         return self.folder / TICKS_FILE
 
     @property
     def ticks(self) -> Ticks:
-        """Every tick, in the order of time."""
+        """Every tick, in order of time."""
         return Ticks(self.log.records)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
-        """Every episode that was begun, in the order of time."""
+        """Every episode that began, in order of time."""
         return self.outline.episodes
 
     @property
     def outline(self) -> Outline:
-        """What it came to, in numbers."""
-        return self._gathered.outline
+        """The session in numbers."""
+        return self._data.outline
 
     def recording(self) -> Recording:
-        """The session as a recording: all that was seen, and every pulse as a stimulus of its presentation.
+        """The session as a recording: everything that was observed, and every pulse as a stimulus of its presentation.
 
         The responses that are extracted from it are, bit for bit, those that the loop acted on. All spikes are read
-        into memory; of a long session rather read `recording_file`.
+        into memory; for a long session read `recording_file` instead.
 
         Raises:
-            InvalidFile: if the log does not fit together.
+            InvalidFile: for an inconsistent log.
         """
-        with expecting_a_session(self.folder / LOG_FILE):
+        with expect_session_log(self.folder / LOG_FILE):
             blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.records.spike_blocks()]
-            times_s, channels = (np.concatenate(each) for each in zip(*blocks, strict=True))
-            # Stretches may touch, and times on samples then overlap by one.
+            times_s, channels = (np.concatenate(column) for column in zip(*blocks, strict=True))
+            # Stretches may touch, and times rounded to samples then overlap by one.
             order = np.argsort(times_s, kind="stable")
-            empty = self._gathered.recording_without_spikes(self.ending)
+            empty = self._data.recording_without_spikes(self.ending)
             return replace(empty, spike_times_s=times_s[order], spike_channels=channels[order])
 
     def write(self, progress: Progress | None = None) -> None:
-        """Write the ticks as a table, and the recording after it: once it is there, so are both.
+        """Write the ticks as a table, and then the recording: if the recording exists, both do.
 
         Args:
-            progress: told how many records are read.
+            progress: updated with the number of records read.
 
         Raises:
-            InvalidFile: if the log does not fit together, or a file cannot be written.
+            InvalidFile: for an inconsistent log, or if a file cannot be written.
         """
         header = self._header
-        with expecting_a_session(self.folder / LOG_FILE):
-            with atomic_write(self.ticks_file) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+        with expect_session_log(self.folder / LOG_FILE):
+            with atomic_write(self.ticks_file) as partial, partial.open("w", newline="", encoding="utf-8") as file:
                 table = TickTable(file, header.conditions, header.observed, header.readouts)
-                # Read once: what is asked for next is known.
-                vars(self)["_gathered"] = gathered = self._gather(table, progress)
-            recording = gathered.recording_without_spikes(self.ending)
-            write_nwb(recording, self.recording_file, self.log.records.spike_blocks(), gathered.spike_counts)
+                # Keep what was read, for `outline` and `recording`.
+                vars(self)["_data"] = data = self._collect(table, progress)
+            recording = data.recording_without_spikes(self.ending)
+            write_nwb(recording, self.recording_file, self.log.records.spike_blocks(), data.spike_counts)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
@@ -139,55 +133,55 @@ class Session:
         return read_header(self.folder / LOG_FILE, self.log.header)
 
     @cached_property
-    def _gathered(self) -> Gathered:
-        with expecting_a_session(self.folder / LOG_FILE):
-            return self._gather()
+    def _data(self) -> SessionData:
+        with expect_session_log(self.folder / LOG_FILE):
+            return self._collect()
 
-    def _gather(self, table: TickTable | None = None, progress: Progress | None = None) -> Gathered:
-        """Go through all records once, and write their ticks into a table."""
-        gathered, records = Gathered(self._header), self.log.records
+    def _collect(self, table: TickTable | None = None, progress: Progress | None = None) -> SessionData:
+        """Read all records once, and write their ticks into a table."""
+        data, records = SessionData(self._header), self.log.records
         for number, record in enumerate(records):
-            gathered.add(record)
-            if table is not None and record.words["kind"] == "seen" and record.words["tick"]:
-                table.add({**record.words["tick"], "electrode_pulses": electrode_pulses_of(record.words)})
-            if progress is not None and number % _TOLD_EVERY == 0:
+            data.add(record)
+            if table is not None and record.fields["kind"] == "seen" and record.fields["tick"]:
+                table.add({**record.fields["tick"], "electrode_pulses": count_electrode_pulses(record.fields)})
+            if progress is not None and number % _UPDATE_EVERY == 0:
                 progress.update(number, len(records))
-        return gathered
+        return data
 
 
 def read_session(path: str | os.PathLike[str]) -> Session:
     """Read a session from its folder or its log, whatever ended it.
 
     Raises:
-        InvalidFile: if the log is missing, or something else, or its header cannot be.
+        InvalidFile: if the log is missing or not that of a session, or its header is invalid.
     """
     path = Path(path)
     file = path / LOG_FILE if path.is_dir() else path
     log = read_log(file)
     read_header(file, log.header)
-    ending = Ending("crash", "nothing was written about its end: the program was killed, or still runs")
-    # Nothing is written after it.
-    last = log.records[-1].words if len(log.records) else {}
-    with expecting_a_session(file):
+    ending = Ending("crash", "no ending was written: the program was killed, or is still running")
+    # The ending is the last record.
+    last = log.records[-1].fields if len(log.records) else {}
+    with expect_session_log(file):
         if last.get("kind") == "end":
             ending = Ending(last["by"], last["message"])
     return Session(file.parent, log, ending)
 
 
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
-    """Raise unless a folder can take a new session; says what can be done with one that is there. Makes the folder.
+    """Make the folder of a new session; the error for an existing session says what to do with it.
 
     Raises:
-        InvalidArgument: if a session is there.
-        Mismatch: if work of another kind is there, such as recordings.
-        InvalidFile: if a file is in the folder's place, or the folder cannot be made or written to.
+        InvalidArgument: if the folder holds a session.
+        Mismatch: if it holds work of another kind, such as recordings.
+        InvalidFile: if it is a file, or cannot be made or written to.
     """
     folder = Path(folder)
     expect_no_file(folder, "the session")
     if (folder / LOG_FILE).exists():
-        told = f" that was killed or still runs: its recording was not written, `animat recover {folder}` does it"
-        told = "" if (folder / RECORDING_FILE).exists() else told
-        raise InvalidArgument(f"{folder / LOG_FILE}: a session is there already{told}; choose another folder")
+        state = f" that was killed or is still running: to write its recording, use `animat recover {folder}`"
+        state = "" if (folder / RECORDING_FILE).exists() else state
+        raise InvalidArgument(f"{folder / LOG_FILE}: expected no session, got one{state}; choose another folder")
     expect_no_other(folder, "session")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -198,30 +192,30 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
 
 
 def recover_session(path: str | os.PathLike[str], progress: Progress | None = None) -> Session:
-    """Read a session whose program was killed, and write the recording and the table that it did not come to write.
+    """Read a session whose program was killed, and write its missing recording and table.
 
     Args:
         path: of its folder or its log.
-        progress: told how many records are read.
+        progress: updated with the number of records read.
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
-        Mismatch: if the session still runs, or its table has more ticks than are left in a damaged log.
+        Mismatch: if the session is still running, or its table has more ticks than are left in a damaged log.
     """
-    # What is no session is told before its folder is held.
+    # Read before locking, so that the error for a folder without a session comes first.
     with exclusive_lock(read_session(path).folder):
         session = read_session(path)
-        _expect_no_less(session)
+        _expect_no_loss(session)
         for leftover in session.folder.glob(".*"):
-            # What the killed program was just writing.
+            # Files that the killed program was writing.
             if is_unfinished(leftover) and leftover.name.startswith((f".{RECORDING_FILE}.", f".{TICKS_FILE}.")):
                 clear_away(leftover)
         session.write(progress)
     return session
 
 
-def _expect_no_less(session: Session) -> None:
-    """Raise where the table that is there has more ticks than a damaged log: it would be written over with less."""
+def _expect_no_loss(session: Session) -> None:
+    """Raise if the existing table has more ticks than a damaged log: overwriting it would lose ticks."""
     if not session.log.lost_bytes or not session.ticks_file.exists():
         return
     try:
@@ -237,16 +231,16 @@ def _expect_no_less(session: Session) -> None:
         )
 
 
-def told_lost(lost_bytes: int) -> str:
-    """What a log that is torn or damaged lacks, in a sentence."""
-    return f"{lost_bytes} bytes of the log, from where it is torn or damaged on, are lost"
+def lost_message(lost_bytes: int) -> str:
+    """A sentence about what is missing from a torn or damaged log."""
+    return f"{lost_bytes} bytes of the log, from where it is torn or damaged, are lost"
 
 
-def told_unanswered(session: Session) -> str:
-    """What is to be known of pulses that were never answered, in a sentence."""
+def unanswered_message(session: Session) -> str:
+    """A sentence about pulses that were never answered."""
     n = session.outline.unanswered_pulses
-    pulses, them = ("1 pulse was", "it") if n == 1 else (f"{n} pulses were", "them")
+    pulses, they = ("1 pulse was", "it was") if n == 1 else (f"{n} pulses were", "they were")
     return (
-        f"{pulses} asked for and never answered: whether the culture got {them} is not known; {LOG_FILE} has times and "
-        "electrodes"
+        f"{pulses} requested and never answered: whether {they} delivered is not known; times and electrodes are in "
+        f"{LOG_FILE}"
     )

@@ -1,4 +1,4 @@
-"""What ends a session before its plan is done, and in whose name."""
+"""Early endings of a session, and their causes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from animat.cultures.failures import describe_error
 from animat.errors import UnsafeStimulus
 
 
-def is_there(file: Path) -> bool:
-    """Whether a file is there, asked before every trial.
+def file_exists(file: Path) -> bool:
+    """Whether a file exists; checked before every trial.
 
     Raises:
-        OSError: where that cannot be told, as in a folder that cannot be looked into.
+        OSError: if that cannot be determined, for example in an unreadable folder.
     """
     try:
         file.stat()
@@ -24,7 +24,7 @@ def is_there(file: Path) -> bool:
 
 
 class Stop(Exception):
-    """The session is over before its plan is done."""
+    """The session ends before its plan is completed."""
 
     def __init__(self, ending: Ending) -> None:
         super().__init__(ending.message)
@@ -32,7 +32,7 @@ class Stop(Exception):
 
 
 def ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
-    """The ending that an error of the culture means; `is_stopped`: whether a person stopped it before."""
+    """The ending for an error of the culture; `is_stopped`: whether a person had stopped it before."""
     if is_stopped:
         return Ending("person", "stopped by a person")
     if isinstance(error, UnsafeStimulus) and error.limit in ("stimuli_per_session", "net_charge_per_session"):
@@ -44,7 +44,7 @@ def ending_of(error: Exception, culture: Culture, is_stopped: bool) -> Ending:
 
 
 def _is_lost(error: BaseException | None) -> bool:
-    """Whether an error is of a connection, or caused by one; a device that was too slow is still there."""
+    """Whether an error comes from a lost connection; a timeout does not, as the device is still there."""
     if error is None:
         return False
     return (isinstance(error, OSError) and not isinstance(error, TimeoutError)) or _is_lost(error.__cause__)

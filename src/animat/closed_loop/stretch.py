@@ -1,6 +1,6 @@
-"""A stretch of time of a closed loop: what was asked of the culture, whether its answer can be, what was seen in it.
+"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response.
 
-A closed loop believes no backend's answer that it did not look at.
+The closed loop checks every answer of a backend before using it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from animat.stimulation.stimulus import Stimulus
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """What was asked of the culture; written down too where no answer comes.
+class Request:
+    """A request to the culture; it is logged even if no answer comes.
 
     Attributes:
         stretch: number of the stretch of time in the session, from 0.
-        at_s: when, on the session's clock.
-        stimuli: times counted from then.
+        at_s: time of the request, on the session's clock.
+        stimuli: their times count from `at_s`.
     """
 
     stretch: int
@@ -37,7 +37,7 @@ class Asked:
     stimuli: tuple[Stimulus, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As the words of a record."""
+        """The fields of its record."""
         return {
             "stretch": self.stretch,
             "asked_at_s": self.at_s,
@@ -48,7 +48,7 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What was seen in a stretch of time, on the session's clock, its times on the culture's samples."""
+    """What was observed in a stretch of time; times are on the session's clock, rounded to the culture's samples."""
 
     number: int
     asked_at_s: float
@@ -61,81 +61,81 @@ class Stretch:
 
 
 def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
-    """What was stimulated; when is in the tick."""
+    """Stimuli as rows of plain data; their times are in the tick."""
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
 
 
-def seen_in(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
-    """What was seen, to be written down."""
+def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None, **more: Any) -> Record:
+    """The log record of a stretch of time."""
     span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-    words = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
-    return Record(words, stretch.spike_times_s, stretch.spike_channels)
+    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick, **more}
+    return Record(fields, stretch.spike_times_s, stretch.spike_channels)
 
 
-def wrong_with(
+def check_answer(
     observed: Observed,
     *,
-    asked_s: Float64[np.ndarray, " stimuli"],
+    requested_s: Float64[np.ndarray, " stimuli"],
     duration_s: float,
     since_s: float,
     from_s: float,
     sample_s: float,
     n_channels: int,
 ) -> str | None:
-    """What is wrong with an answer, in a sentence; None for one that can be.
+    """What is wrong with an answer of the culture, in a sentence; None for a possible one.
 
     Args:
         observed: the answer.
-        asked_s: times of the stimuli, counted from `since_s`: none can begin before.
-        duration_s: that was asked for: it is seen up to then at least.
-        since_s: when it was asked for, on the culture's clock.
-        from_s: the soonest time on the culture's clock that it can begin at.
-        sample_s: of the culture; times may be rounded to whole ones.
+        requested_s: requested times of the stimuli, counted from `since_s`: none may begin earlier.
+        duration_s: requested duration, which the answer must cover at least.
+        since_s: time of the request, on the culture's clock.
+        from_s: earliest possible start of the answer, on the culture's clock.
+        sample_s: duration of a sample; times may be rounded to whole samples.
         n_channels: of the culture.
     """
     try:
         times_s, channel = observed.spikes
         pulses_s, start_s, seen_s = observed.stimulus_time_s, observed.start_s, observed.duration_s
         if len(times_s) != len(channel):
-            return f"the culture answered {len(times_s)} spike times for {len(channel)} channels"
-        if pulses_s.shape != asked_s.shape:
-            return f"the culture answered {pulses_s.shape} stimulus times for {len(asked_s)} stimuli"
+            return f"the culture returned {len(times_s)} spike times for {len(channel)} channels"
+        if pulses_s.shape != requested_s.shape:
+            return f"the culture returned {pulses_s.shape} stimulus times for {len(requested_s)} stimuli"
         if start_s < from_s - 1.5 * sample_s:
             return f"the culture's clock went back to {start_s} s"
         if not (isfinite(start_s) and isfinite(seen_s) and start_s + seen_s >= since_s + duration_s - 1e-6):
-            asked = f"{duration_s} s from {since_s} s"
-            return f"the culture answered a stretch of {seen_s} s from {start_s} s where {asked} were asked"
-        for name, given_s in (("spike", times_s), ("stimulus", pulses_s)):
+            requested = f"{duration_s} s from {since_s} s"
+            return f"the culture returned {seen_s} s from {start_s} s where {requested} were requested"
+        for name, returned_s in (("spike", times_s), ("stimulus", pulses_s)):
             # Not (a <= b): a NaN fails it too.
-            if len(given_s) and not (given_s[0] >= -1e-9 and given_s[-1] <= seen_s + 1e-9):
-                return f"the culture answered {name} times outside of the {seen_s:g} s that were seen"
-            if not bool((given_s[1:] >= given_s[:-1]).all()):
-                return f"the culture answered {name} times that are no rising numbers"
-        # From when the answer starts.
-        asked_s = asked_s - (start_s - since_s)
-        if bool((pulses_s < asked_s - 1.5 * sample_s).any()):
-            early_ms = 1000 * float((asked_s - pulses_s).max())
-            return f"the culture answered that a stimulus came {early_ms:.3g} ms before it was asked for"
+            if len(returned_s) and not (returned_s[0] >= -1e-9 and returned_s[-1] <= seen_s + 1e-9):
+                return f"the culture returned {name} times outside of the {seen_s:g} s that it observed"
+            if not bool((returned_s[1:] >= returned_s[:-1]).all()):
+                return f"the culture returned {name} times that do not rise"
+        # Counted from the start of the answer.
+        requested_s = requested_s - (start_s - since_s)
+        if bool((pulses_s < requested_s - 1.5 * sample_s).any()):
+            early_ms = 1000 * float((requested_s - pulses_s).max())
+            return f"the culture returned a stimulus {early_ms:.3g} ms before its requested time"
         if channel.dtype.kind not in "iu":
-            return f"the culture answered channels that are no whole numbers ({channel.dtype})"
+            return f"the culture returned channels that are not whole numbers ({channel.dtype})"
         if len(channel) and not (channel.min() >= 0 and channel.max() < n_channels):
-            return f"the culture answered channel {int(channel.max())} of {n_channels}"
+            return f"the culture returned channel {int(channel.max())} of {n_channels}"
     except Exception as error:
-        return f"the culture answered something that cannot be read: {describe_error(error)}"
+        return f"the culture returned something that cannot be read: {describe_error(error)}"
     return None
 
 
-class Read(NamedTuple):
+class Response(NamedTuple):
     """A response.
 
     Attributes:
-        x_hz: what the decoder is given, one number a readout.
-        told: the same as a tick tells it (`animat.closed_loop.tick.Tick`).
-        is_burst: whether it was one.
+        x_hz: the decoder's input, one number per readout.
+        fields: of its tick (`animat.closed_loop.tick.Tick`).
+        is_burst: whether it was a burst.
     """
 
     x_hz: Float64[np.ndarray, "*readouts"]
-    told: dict[str, Any]
+    fields: dict[str, Any]
     is_burst: bool
 
 
@@ -146,23 +146,23 @@ def read_response(
     members: Bool[np.ndarray, "readouts channels"],
     after_s: Float64[np.ndarray, "1"],
     rng: np.random.Generator,
-) -> Read:
+) -> Response:
     """The response after a pulse, or one drawn in its place."""
     rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
     reads_all = loop.readouts.are_all
     x_hz = rate_hz[0] if reads_all else loop.readouts.read(stretch, members, after_s, loop.window_ms)[0]
-    # Of what was seen, also where another response is drawn.
+    # The culture's own spikes, even if another response is drawn.
     window_s = (loop.window_ms[1] - loop.window_ms[0]) * 1e-3
     spikes = round(float(rate_hz[0]) * window_s * len(stretch.channels))
     if drawn_from is not None:
         x_hz = drawn_from[rng.integers(len(drawn_from))]
         rate_hz = np.atleast_1d(x_hz) if reads_all else rate_hz
     is_burst = bool(active_ratio[0] > loop.burst_threshold) and drawn_from is None
-    told = {
+    fields = {
         "spikes": spikes,
         "rate_hz": float(rate_hz[0]),
         "active_ratio": float(active_ratio[0]),
         "is_burst": is_burst,
         "readout_hz": () if reads_all else tuple(np.atleast_1d(x_hz).tolist()),
     }
-    return Read(x_hz, told, is_burst)
+    return Response(x_hz, fields, is_burst)

@@ -1,4 +1,4 @@
-"""What is written down of every tick of a closed loop, as a table too, and how a session ended."""
+"""The logged data of a tick of a closed loop, the table of ticks, and the ending of a session."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "ro
 
 @dataclass(frozen=True)
 class Tick:
-    """One presentation, its response, and what came of it. Times are in seconds on the session's clock.
+    """One presentation, its response, and the result. Times are in seconds on the session's clock.
 
     Attributes:
         number: of the presentation in the session, from 0.
@@ -21,29 +21,28 @@ class Tick:
         episode: number of the episode in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
             and the warm-up has -1.
-        chosen: the condition that was chosen, by the agent or, in a warm-up, by lot.
-        delivered: the one that the culture got; of a silent agent the chosen one, without its pulses.
-        frequency_hz: that the delivered one was presented at.
-        patterns: of each pulse, -1 where its electrodes are none of the culture's; none of a silent agent.
+        chosen: the condition that was chosen, by the agent or, in a warm-up, at random.
+        delivered: the condition that the culture received; of a silent agent the chosen one, without its pulses.
+        frequency_hz: frequency of the delivered condition.
+        patterns: of each pulse, -1 where its electrodes are not one of the culture's patterns; none of a silent agent.
         pulse_time_s: when each pulse really began.
-        read_after_s: the pulse that the response was read after, or when it would have come.
+        read_after_s: time of the pulse after which the response was read, or when it would have come.
         spikes: in the response window.
-        rate_hz: x of all channels; of an agent whose responses are drawn, what was drawn.
+        rate_hz: x of all channels; of an agent whose responses are drawn, the drawn one.
         readout_hz: x of each readout, where these are groups of channels; else empty.
         active_ratio: share of channels that spiked in the window.
-        is_burst: whether that is above the threshold.
+        is_burst: whether `active_ratio` is above the threshold.
         handled: what was done with the response; `"warm-up"` before the robot of an episode moves; `"unfinished"` if
             something went wrong before the robot had moved.
-        command: the robot was moved by, one for each readout where there are several; None where it was not moved.
+        command: that moved the robot, one for each readout where there are several; None where it was not moved.
         reward: of the step.
         observation: after the step.
         terminated: the task ended by itself.
         truncated: the episode limit ended it.
-        late_s: how much later than they should its pulses came, the largest; 0 within a step of the grid.
-        decided_s: from the end of the response window before, as data were there, until this presentation was handed
-            over.
+        late_s: largest lateness of its pulses; 0 within a step of the grid.
+        decided_s: from when the data of the previous response window had arrived until this presentation was requested.
         wall_s: the machine's clock at the end, from the start of the session.
-        neurons: the history state after it, trace and load; empty where nobody sees that.
+        neurons: the history state after it, trace and load; empty if no agent sees it.
     """
 
     number: int
@@ -74,8 +73,8 @@ class Tick:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """From what `vars` gave, through JSON."""
-        # Logs of before know of no readouts, nor of neurons.
+        """A tick from its `vars`, read back from JSON."""
+        # Older logs have neither readouts nor neurons.
         known: dict[str, Any] = {"readout_hz": (), "neurons": (), **data}
         known = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
         return cls(**{each.name: known[each.name] for each in fields(cls)})
@@ -86,9 +85,9 @@ class Ending:
     """How a session ended.
 
     Attributes:
-        by: `"plan"`, all episodes were run; else what ended it before: the budget, a person (Ctrl-C), a fault of the
-            culture, the silence of whoever should have answered (`"hang"`), a late pulse where that should stop, the
-            robot, the controller, the disk; `"crash"` where nothing was written about it.
+        by: `"plan"`, all episodes were run; else what ended it early: the budget, a person (Ctrl-C), a fault of the
+            culture, a missing answer (`"hang"`), a late pulse with `on_late="stop"`, the robot, the controller, the
+            disk; `"crash"` where no ending was written.
         message: what happened.
     """
 
@@ -104,27 +103,27 @@ HEAD = {
     **{name: name for name in ("electrode_pulses", "spikes", "rate_hz", "active_ratio", "is_burst", "handled")},
     **{name: name for name in ("command", "reward")},
 }
-"""Columns before the observation, and their names in a tick's words. `time_s` is that of the pulse that the response
-was read after, on the session's clock."""
+"""Columns before the observation, and their names in a tick's fields. `time_s` is the time of the pulse after which the
+response was read, on the session's clock."""
 
 TAIL = {"is_terminated": "terminated", "is_truncated": "truncated"}
 TAIL |= {name: name for name in ("late_s", "decided_s", "wall_s")}
-"""After it."""
+"""Columns after the observation."""
 
 
 class TickTable:
-    """Writes ticks as a CSV file, for whoever has a spreadsheet or pandas and not this package.
+    """Writes ticks to a CSV file, for users of a spreadsheet or pandas without this package.
 
-    A line a tick, with all its digits; `Tick` says what the columns are.
+    One line per tick, with all digits; `Tick` describes the columns.
 
-    What is not known is an empty cell: the command and the observation after a response that the robot was not moved
-    by. Flags are 0 or 1; of several pulses, patterns and times have a space between them.
+    Unknown values are empty cells: the command and the observation if the response did not move the robot. Flags are 0
+    or 1; patterns and times of several pulses are separated by spaces.
 
     Args:
         file: open for text, without translation of line ends.
-        conditions: their names, which `chosen` and `delivered` are told by.
+        conditions: their names, for `chosen` and `delivered`.
         observed: the columns of the robot's observation.
-        readouts: names of groups of channels, each with a column of its `rate_hz` and, where they are several, of its
+        readouts: names of groups of channels, each with a column of its `rate_hz` and, if there are several, of its
             `command`; none where all channels are read as one.
     """
 
@@ -136,24 +135,24 @@ class TickTable:
         names = [name.replace(" ", "_") for name in readouts]
         names = list(readouts) if len(set(names)) < len(names) else names
         commands = [f"command_{name}" for name in names] if len(names) > 1 else ["command"]
-        head = [each for column in HEAD for each in (commands if column == "command" else [column])]
+        head = [name for column in HEAD for name in (commands if column == "command" else [column])]
         self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))
 
     def add(self, tick: Mapping[str, Any]) -> None:
-        """Write a tick, as in the words of its record, with its `electrode_pulses`.
+        """Write a tick, as in the fields of its record, with its `electrode_pulses`.
 
         Raises:
             OSError: if it cannot be written.
         """
         command = tick["command"]
-        told = {name: " ".join(map(str, tick[name])) for name in ("patterns", "pulse_time_s")}
-        told |= {name: self._conditions[tick[name]] for name in ("chosen", "delivered")}
+        texts = {name: " ".join(map(str, tick[name])) for name in ("patterns", "pulse_time_s")}
+        texts |= {name: self._conditions[tick[name]] for name in ("chosen", "delivered")}
         flags = {name: int(tick[name]) for name in ("is_burst", "terminated", "truncated")}
-        known = {**tick, **told, **flags}
-        row = [known[name] for name in HEAD.values()]
+        cells = {**tick, **texts, **flags}
+        row = [cells[name] for name in HEAD.values()]
         row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, self._n_readouts)
         row += tick["readout_hz"] if self._n_readouts else ()
         row += tick["observation"] or (None,) * self._n_observed
-        row += (known[name] for name in TAIL.values())
-        # What is not equal to itself is NaN.
+        row += (cells[name] for name in TAIL.values())
+        # NaN is not equal to itself.
         self._writer.writerow([value if value == value else None for value in row])

@@ -1,4 +1,4 @@
-"""The clock of a closed loop, handed in so that a test can have its own."""
+"""The clock of a closed loop, which tests can replace, and real-time priority."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from collections.abc import Iterator
 from typing import Protocol
 
 _SPUN_S = 0.0003
-"""The end of a wait that is spun: the kernel wakes a sleeper up to some 0.1 ms late."""
+"""The last part of a wait, spent spinning: the kernel wakes a sleeper up to some 0.1 ms late."""
 
 
 class Clock(Protocol):
-    """A clock that runs forward, in seconds from anywhere, and waits."""
+    """A monotonic clock, in seconds from any origin, that can wait."""
 
     def now_s(self) -> float:
-        """What it shows."""
+        """The time now."""
 
     def sleep_until(self, time_s: float) -> None:
-        """Return when it shows `time_s`; at once if it is past that."""
+        """Return at `time_s`; immediately if it has passed."""
 
 
 class WallClock:
     """The machine's monotonic clock."""
 
     def now_s(self) -> float:
-        """Seconds since the machine started, or so."""
+        """Seconds since about when the machine started."""
         return time.perf_counter()
 
     def sleep_until(self, time_s: float) -> None:
@@ -40,33 +40,33 @@ class WallClock:
 
 
 @contextlib.contextmanager
-def ahead_of_other_programs(*, with_those_it_starts: bool) -> Iterator[None]:
-    """Run the calling thread before all that has no deadline, where the system lets it.
+def real_time_priority(*, inherited: bool) -> Iterator[None]:
+    """Run the calling thread with real-time priority, where the system allows it.
 
-    Linux lets root, and whoever was given a real-time priority (`ulimit -r`). Elsewhere nothing changes. Threads that
-    are ahead take turns, also on a single core.
+    Linux allows it to root, and to users with a real-time priority limit (`ulimit -r`). Elsewhere nothing changes.
+    Threads with this priority take turns, even on a single core.
 
     Args:
-        with_those_it_starts: whether threads and programs that it starts meanwhile are ahead, too.
+        inherited: whether threads and programs that it starts meanwhile have the priority, too.
     """
     before = None
     with contextlib.suppress(AttributeError, OSError):
-        given = os.sched_getscheduler(0), os.sched_getparam(0)
-        policy = os.SCHED_RR if with_those_it_starts else os.SCHED_RR | os.SCHED_RESET_ON_FORK
+        current = os.sched_getscheduler(0), os.sched_getparam(0)
+        policy = os.SCHED_RR if inherited else os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(1))
-        before = given
+        before = current
     try:
         yield
     finally:
         if before is not None:
             policy, parameters = before
-            # Whoever is not root may not take back that what it starts is not ahead; that does no harm.
+            # Without root the reset on fork cannot be taken back, which does no harm.
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
                 os.sched_setscheduler(0, policy, parameters)
 
 
-def among_other_programs(thread: threading.Thread) -> None:
-    """Take a thread back that runs ahead of other programs and does not end: it must not starve them."""
+def drop_real_time_priority(thread: threading.Thread) -> None:
+    """Take real-time priority from a thread that does not end: it must not starve other programs."""
     with contextlib.suppress(AttributeError, OSError, TypeError):
         os.sched_setscheduler(thread.native_id, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))  # type: ignore[arg-type]

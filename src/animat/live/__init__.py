@@ -1,1 +1,1 @@
-"""Parameter shadowing on a culture while it lives: record, train, refresh, then run in closed loop."""
+"""Parameter shadowing on one culture: record, train, refresh, then run in closed loop."""

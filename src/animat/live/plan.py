@@ -1,4 +1,4 @@
-"""What a live run is to do, and everything about it that can be checked before a culture is opened."""
+"""The plan of a live run, and everything about it that can be checked before a culture is opened."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ from animat.writing import LOCK
 LOG_FILE = "live.log"
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 EXCHANGE = ".exchange"
-"""A folder of simulators and of how training goes, for the processes that train."""
-_NOT_OF_THE_LOOP = ("greedy",)
+"""A folder through which the training processes receive simulators and report progress."""
 
 
 @record
@@ -37,9 +36,9 @@ class Timetable:
     """When the culture is recorded.
 
     Attributes:
-        interval_min: of the culture's clock, between the starts of two recordings.
-        duration_min: of the culture's clock, from the first recording to the end of training.
-        speed: minutes of the culture's clock in one of ours: 1 for a living one.
+        interval_min: minutes of the culture's clock between the starts of two recordings.
+        duration_min: minutes of the culture's clock from the first recording to the end of training.
+        speed: minutes of the culture's clock per minute of real time: 1 for a living culture.
 
     Raises:
         InvalidArgument: for a number that is not above 0.
@@ -51,13 +50,13 @@ class Timetable:
 
     @property
     def recordings(self) -> int:
-        """How many are made: the end of training needs none."""
+        """Number of recordings; none is made at the end of training."""
         return math.ceil(self.duration_min / self.interval_min - 1e-9)
 
 
 @contextmanager
 def for_the_first_recording() -> Iterator[None]:
-    """Say of a budget that does not hold it what can be done."""
+    """Add a remedy to the error for a budget that is too small for the first recording."""
     try:
         yield
     except BudgetSpent as spent:
@@ -73,27 +72,27 @@ def check_plan(
     settings: Mapping[str, Any],
     account: Account | None = None,
 ) -> None:
-    """Raise for what would only come out when the culture is open, or after an hour of training.
+    """Raise for errors that would otherwise appear once the culture is open, or after an hour of training.
 
     Arguments are those of `animat.live.shadowing.live`.
 
     Raises:
-        InvalidArgument: for a training without neurons or with a neural observation, recordings that take longer than
-            an interval, no episodes, or a setting of the closed loop that cannot be.
+        InvalidArgument: for a training without neurons or with neural observation, recordings that take longer than
+            an interval, no episodes, or an invalid setting of the closed loop.
         BudgetSpent: for a budget with fewer pulses than the first recording.
-        InvalidFile: if a file is in the folder's place.
-        Mismatch: if something is in the folder already: a live run is not gone on with, as its culture has lived on.
+        InvalidFile: if the folder is a file.
+        Mismatch: if the folder is not empty: a live run cannot be resumed, as its culture has changed since.
     """
     if training.mapping is None:
-        raise InvalidArgument("mapping: expected one, as a live run is through neurons, got none")
+        raise InvalidArgument("mapping: expected one, as a live run acts through neurons, got none")
     if training.neural_observation:
-        raise InvalidArgument("neural_observation: expected False, as a live run shows none, got True")
+        raise InvalidArgument("neural_observation: expected False, as a live run has none, got True")
     if training.pulse_cost:
         raise InvalidArgument(
-            f"pulse_cost: expected 0, as conditions of a live run do not differ in it, got {training.pulse_cost:g}"
+            f"pulse_cost: expected 0, as all conditions of a live run cost the same, got {training.pulse_cost:g}"
         )
     if training.lessons or training.assess:
-        raise InvalidArgument("lessons, assess: expected none, as a live run has no end that is known, got some")
+        raise InvalidArgument("lessons, assess: expected none, as the end of a live run is not known, got some")
     if (n := training.robot.n_commands) > 1:
         raise InvalidArgument(
             f"robot: expected one command, as a live run reads all channels as one, got {training.robot.name}, which "
@@ -110,13 +109,13 @@ def check_plan(
         places = max(1, protocol.n_places) - (NONE in protocol.places)
         (account or Account()).check_number(len(protocol.frequencies_hz) * places * protocol.trials * protocol.pulses)
     check_episodes("episodes", episodes)
-    of_the_loop = {name: value for name, value in settings.items() if name not in _NOT_OF_THE_LOOP}
+    loop_settings = {name: getattr(protocol, name) for name in ("pulses", "pulse", "patterns")}
+    loop_settings |= {name: value for name, value in settings.items() if name != "greedy"}
     conditions = tuple(Condition(f"{hz:g} Hz", hz, "Hz") for hz in protocol.frequencies_hz)
-    given = {name: getattr(protocol, name) for name in ("pulses", "pulse", "patterns")} | of_the_loop
-    Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **given)
+    Loop(training.robot, training.mapping, conditions, np.zeros(N_PERCENTILES, np.float32), **loop_settings)
     expect_no_file(folder, "the live run")
-    if folder.exists() and any(each.name != LOCK for each in folder.iterdir()):
+    if folder.exists() and any(file.name != LOCK for file in folder.iterdir()):
         raise Mismatch(
-            f"{folder}: expected an empty folder for a live run, got one with files; choose another, or see what is "
-            f"there: animat watch {folder}"
+            f"{folder}: expected an empty folder for a live run, got one with files; choose another, or see what it "
+            f"holds: animat watch {folder}"
         )

@@ -1,4 +1,4 @@
-"""Parameter shadowing as the paper meant it: the culture is recorded while policies train on what it was last."""
+"""Parameter shadowing as the paper intended: the culture is recorded while policies train on its latest recording."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ _POLL_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class LiveRun:
-    """What came of a live run.
+    """The results of a live run.
 
     Attributes:
         recordings: the files.
         policies: by name.
-        swaps: every time that a group of policies went over to newer simulators, dated.
-        iterations: that each policy was trained for at least.
-        culture_min, wall_s: how long it took from the first recording to the end of training.
+        swaps: each time a group of policies switched to newer simulators, with the date.
+        iterations: fewest training iterations of a policy.
+        culture_min, wall_s: time from the first recording to the end of training.
         gap: predicted against measured return.
     """
 
@@ -101,35 +101,35 @@ def live(
 ) -> LiveRun:
     """Record a culture again and again while policies train on its newest simulators, then run them on it.
 
-    The culture is recorded; training starts at once, in processes of its own, and never stops; every `interval_min` the
-    culture is recorded again, and each group of policies goes over to the new simulators at its next chunk. Training
-    ends at `duration_min`, however many iterations that were; `training.iterations` sets the length of a chunk only.
-    Then the policies run in closed loop, with percentiles of the last recording they were trained on.
+    After the first recording training starts in separate processes, and never pauses. Every `interval_min` the culture
+    is recorded again, and each group of policies switches to the new simulators at its next chunk. Training ends at
+    `duration_min`, however many iterations were done; `training.iterations` only sets the length of a chunk. Then the
+    policies run in closed loop, with percentiles of the last recording they were trained on.
 
-    A simulated culture whose clock runs fast is not recorded again before all have gone over to the last simulators.
-    Beside the recordings of a virtual culture lies its state, after the newest of them and in the end after the loop
-    (`culture.state`): `animat run` goes on from it.
+    A simulated culture whose clock runs fast is not recorded again before all groups use the latest simulators. The
+    state of a virtual culture is written next to its recordings (`culture.state`), after each of them and after the
+    loop: `animat run` continues from it.
 
     Args:
         training: robot, mapping, policies, seed, algorithm; its duration is set to the timetable's.
         culture: open.
         protocol: of every recording.
-        folder: for `recordings/`, `policies/`, `session/` and `live.log`, a line of JSON each time something happened.
+        folder: for `recordings/`, `policies/`, `session/` and `live.log`, which has a line of JSON per event.
         timetable: when to record.
         episodes: of each policy in closed loop.
-        with_controls: all of them between the policies' episodes; if not, only the random one.
+        with_controls: run all controls between the policies' episodes; if not, only the random one.
         adaptive: whether the closed loop's thresholds adapt, or are fixed.
         kind: of simulator; None: what suits the protocol (`fit_timeline`).
-        account: of a stimulation budget. Where it does not hold another recording, training goes on with the last.
-        progress: told as the culture's time goes by, and in the closed loop.
+        account: of a stimulation budget. If it is too small for another recording, training continues on the last.
+        progress: updated with the culture's time, and in the closed loop.
         report: as for `run_policies`.
         settings: of the closed loop (`animat.closed_loop.loop.Loop`).
 
     Raises:
-        InvalidArgument, InvalidFile, Mismatch: before anything is delivered, as `animat.live.plan.check_plan` does.
-        BudgetSpent: if the budget does not hold the first recording.
-        AnimatError: if a process that trains fails, or the culture does: the culture is then stopped, and recordings
-            and policies are kept as they are.
+        InvalidArgument, InvalidFile, Mismatch: before anything is delivered, as in `animat.live.plan.check_plan`.
+        BudgetSpent: if the budget is too small for the first recording.
+        AnimatError: if a training process or the culture fails: the culture is then stopped, and recordings and
+            policies are kept as they are.
     """
     timetable = timetable or Timetable()
     account = account or Account()
@@ -144,7 +144,7 @@ def live(
         policies = run.shadow()
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
         calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
-        # Held by itself: nobody recovers a session, in a folder of its own, that still runs.
+        # Its own lock, so that nobody recovers the session while it is running.
         with exclusive_lock(run.folder / SESSION):
             gap = run_policies(
                 policies,
@@ -162,7 +162,7 @@ def live(
                 **settings,
             )
         run.write("closed loop", **gap.session.to_dict())
-        # A culture that failed or hangs is in the middle of something: the state after its last recording is whole.
+        # If the culture failed or hangs, its state may be inconsistent; that after its last recording is not.
         if gap.session.ending.by not in ("culture", "hang"):
             run.keep_state()
     except BaseException as error:
@@ -208,7 +208,6 @@ class _Run:
         try:
             self._train(exchange)
         finally:
-            # It serves those that train.
             shutil.rmtree(exchange.folder, ignore_errors=True)
         policies = self.folder / POLICIES
         return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self._training.policies)}
@@ -227,7 +226,7 @@ class _Run:
                 self._shadow(exchange, trainers)
             except BaseException as error:
                 self.end_early(error)
-                # The policies as they are are better than none.
+                # Unfinished policies are better than none.
                 with suppress(AnimatError):
                     trainers.finish()
                 raise
@@ -239,16 +238,16 @@ class _Run:
         self.write("trained", iterations=self.iterations, swaps=len(self.swaps), wall_s=round(self.wall_s, 1))
 
     def end_early(self, error: BaseException) -> None:
-        """Stimulate no more, and write down why, once."""
+        """Stop the culture and log why, once."""
         if self._ended_early:
             return
         self._ended_early = True
         is_person = isinstance(error, KeyboardInterrupt)
-        told = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
+        message = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
         with suppress(Exception):
-            self._culture.stop(told)
+            self._culture.stop(message)
         with suppress(InvalidFile):
-            self.write("interrupted" if is_person else "fault", message=told)
+            self.write("interrupted" if is_person else "fault", message=message)
 
     def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
         duration_min, published, in_budget = self._timetable.duration_min, 0, True
@@ -257,9 +256,9 @@ class _Run:
             self._wait(minute, trainers, published)
             if not in_budget:
                 continue
-            beside = Part(self._progress, minute, 0, duration_min, f"recording {number + 1}")
+            part = Part(self._progress, minute, 0, duration_min, f"recording {number + 1}")
             try:
-                timeline = self._record(number, beside)
+                timeline = self._record(number, part)
             except BudgetSpent as spent:
                 self.write("budget", message=str(spent))
                 in_budget = False
@@ -270,25 +269,25 @@ class _Run:
         self._wait(duration_min, trainers, published)
 
     def _wait(self, minute: float, trainers: Trainers, number: int) -> None:
-        """Let the culture's clock come to a minute of the run, training going on."""
+        """Wait, while training continues, until the culture's clock is at a minute of the run."""
         due_s = self._wall_zero_s + 60 * minute / self._timetable.speed
         while time.monotonic() < due_s or not trainers.all_use(number):
             self._note(trainers.swaps(_POLL_S))
             passed_min = (time.monotonic() - self._wall_zero_s) * self._timetable.speed / 60
-            told = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
-            note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{told}"
+            mean = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
+            note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{mean}"
             if time.monotonic() >= due_s:
                 note += "; waiting for all policies to train on the last recording"
             self._progress.update(min(passed_min, minute), self._timetable.duration_min, note)
         self._culture.rest(max(0.0, self._zero_s + 60 * minute - self._culture.now_s))
 
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:
-        """Record and fit; None where the recording cannot be trained on, which is written down."""
+        """Record and fit; returns None, and logs why, if the recording cannot be trained on."""
         began_s = time.monotonic()
         folder = self.folder / RECORDINGS
-        # Held as by `animat record`: whoever looks knows that it goes on.
+        # Locked as by `animat record`, so that viewers know that it is in progress.
         with exclusive_lock(folder), PartialRecording(folder) as follow:
-            # What cannot be written is not recorded.
+            # Check the space before stimulating the culture.
             expect_writable(folder, room_bytes=BYTES_PER_MIN * minutes_of(self._protocol))
             seed = order_seed(self._training.seed, number)
             recording = record_within(self.account, self._culture, self._protocol, seed, progress, follow)
@@ -298,7 +297,7 @@ class _Run:
         self.keep_state()
         try:
             series = [*self.used, *extract_series([recording])]
-            # All are fitted again, so that they have one shape.
+            # Fit all of them again, so that their shapes agree.
             timeline = fit_timeline(series, kind=self._kind)
             if self._training.percentiles == "first":
                 timeline = timeline.with_first_percentiles()
@@ -316,7 +315,7 @@ class _Run:
         return timeline
 
     def keep_state(self) -> None:
-        """Write what a virtual culture is now beside its recordings, where `animat run` looks for it."""
+        """Write the state of a virtual culture next to its recordings, where `animat run` looks for it."""
         if isinstance(self._culture, VirtualCulture):
             self._culture.save_state(self.folder / RECORDINGS / STATE_FILE)
 
@@ -327,14 +326,14 @@ class _Run:
             else:
                 self.write("training began", **swap)
 
-    def write(self, what: str, **words: Any) -> dict[str, Any]:
-        """Put down that something happened, with the date and both clocks."""
+    def write(self, what: str, **fields: Any) -> dict[str, Any]:
+        """Log an event, with the date and both clocks."""
         line = {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
             "culture_min": round((self._now_s() - self._zero_s) / 60, 4),
             "what": what,
-            **words,
+            **fields,
         }
         try:
             with (self.folder / LOG_FILE).open("a") as file:
@@ -344,13 +343,13 @@ class _Run:
         return line
 
     def _now_s(self) -> float:
-        """The culture's clock; where a connection is lost, what it showed last."""
+        """The culture's clock; its last known time if the connection is lost."""
         with suppress(Exception):
             self._known_s = self._culture.now_s
         return self._known_s
 
 
 def _publish(exchange: Exchange, number: int, timeline: SimulatorTimeline) -> None:
-    """Put up the newest simulator of a timeline."""
+    """Publish the newest simulator of a timeline."""
     start_min = float(timeline.start_min[-1])
     exchange.publish(number, start_min, jax.device_get(timeline.at(start_min)))

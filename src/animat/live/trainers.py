@@ -1,4 +1,4 @@
-"""The processes that train while the culture is recorded, as seen from the one that records."""
+"""The processes that train while the culture is recorded, and their exchange with the one that records."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ from animat.writing import write_whole
 
 _FINISH = "finish"
 KEEP_S = 10.0
-"""Seconds between times that the policies are written as they are: what a killed run costs of training."""
+"""Seconds between saves of the unfinished policies: the most training that a killed run loses."""
 
 
 class Exchange:
-    """A folder of one run alone, in which one process publishes simulators and others look; its files are whole."""
+    """A folder of one run, in which one process publishes simulators and others read them; files appear complete."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
 
     def publish(self, number: int, start_min: float, simulator: NeuronSimulator) -> None:
-        """Put up a simulator, its arrays on the host; the one with the largest number is in force."""
+        """Publish a simulator, with its arrays on the host; the one with the largest number is the newest."""
         write_whole(self.folder / f"{number:06}.simulator", pickle.dumps((number, start_min, simulator)))
 
     def newest(self, known: int) -> tuple[int, float, NeuronSimulator] | None:
-        """Number, minute and simulator of the newest, if its number is larger than the one that is known."""
+        """Number, minute and simulator of the newest, if its number is larger than `known`."""
         newest = max((int(file.stem) for file in self.folder.glob("[0-9]*.simulator")), default=known)
         if newest <= known:
             return None
         read: tuple[int, float, NeuronSimulator] = pickle.loads((self.folder / f"{newest:06}.simulator").read_bytes())
         return read
 
-    def report(self, first: int, words: dict[str, Any]) -> None:
-        """Say how the group whose first policy is this one does, as plain data."""
-        report(self.folder / f"p{first}.json", words)
+    def report(self, first: int, progress: dict[str, Any]) -> None:
+        """Report the progress of the group whose first policy is `first`, as plain data."""
+        report(self.folder / f"p{first}.json", progress)
 
     def reported(self, first: int) -> dict[str, Any] | None:
-        """What a group said last; None if it has not begun."""
-        words: dict[str, Any] | None = reported(self.folder / f"p{first}.json")
-        return words
+        """A group's last report; None if it has not begun."""
+        progress: dict[str, Any] | None = reported(self.folder / f"p{first}.json")
+        return progress
 
     def finish(self) -> None:
-        """Say that training is to end at the next chunk."""
+        """Request the end of training at the next chunk."""
         (self.folder / _FINISH).touch()
 
     @property
@@ -65,10 +65,10 @@ class Exchange:
 @final
 @dataclass(frozen=True, eq=False)
 class TrainAlongside(Task):
-    """Train a group of policies, before each chunk on the newest simulator of the exchange.
+    """Train a group of policies, each chunk on the newest simulator of the exchange.
 
-    It says which of them it uses, its swaps, and how far it is, by the exchange too, which also tells when to end.
-    Every `keep_s` seconds the policies are written as they are.
+    It reports the simulator in use, its swaps and its progress through the exchange, which also says when to end.
+    Every `keep_s` seconds the unfinished policies are saved.
     """
 
     group: Group
@@ -83,42 +83,42 @@ class TrainAlongside(Task):
         training = self.group.training
         training.register()
         swaps: list[dict[str, Any]] = []
-        # The policies tell what they were trained on, the last of it known only in the end.
+        # The policies' provenance lists their swaps, which are added below.
         group = replace(self.group, provenance={**self.group.provenance, "swaps": swaps})
         together = SideBySide(group)
-        number, simulator, index, kept_s = -1, None, 0, time.monotonic()
-        told: dict[str, Any] = {"using": number, "iterations": 0, "mean_return": float("nan"), "swaps": []}
+        number, simulator, index, saved_s = -1, None, 0, time.monotonic()
+        state: dict[str, Any] = {"using": number, "iterations": 0, "mean_return": float("nan"), "swaps": []}
         while not (self.exchange.is_finished and index):
             newer = self.exchange.newest(number)
             if newer is not None:
                 number, start_min, simulator = newer
-                swaps.append({"chunk": index, "iterations": told["iterations"], "recorded_at_min": start_min})
-                told["using"] = number
-                told["swaps"].append({"swap": number, **swaps[-1]})
-                self.exchange.report(group.members[0], told)
+                swaps.append({"chunk": index, "iterations": state["iterations"], "recorded_at_min": start_min})
+                state["using"] = number
+                state["swaps"].append({"swap": number, **swaps[-1]})
+                self.exchange.report(group.members[0], state)
             if simulator is None:
                 raise AnimatError("live: expected a simulator in the exchange before training began, got none")
-            told["mean_return"] = together.train(index, simulator)
-            if time.monotonic() - kept_s > self.keep_s:
+            state["mean_return"] = together.train(index, simulator)
+            if time.monotonic() - saved_s > self.keep_s:
                 save_policies(group, together.policies(), folder)
-                kept_s = time.monotonic()
+                saved_s = time.monotonic()
             index += 1
-            told["iterations"] = training.chunk(index)[0] * training.algorithm.environments
-            self.exchange.report(group.members[0], told)
+            state["iterations"] = training.chunk(index)[0] * training.algorithm.environments
+            self.exchange.report(group.members[0], state)
         return save_policies(group, together.policies(), folder)
 
 
 class Trainers:
-    """One process a group of policies, which go into a folder; a context manager ends them whatever happens."""
+    """One process per group of policies, which are saved in a folder; leaving the context always ends the processes."""
 
     def __init__(self, groups: Sequence[Group], exchange: Exchange, folder: Path) -> None:
         self._exchange, self._folder = exchange, folder
         self._groups = {group.members[0]: group for group in groups}
         self._futures: dict[Future[Done], Group] = {}
-        self._told: dict[int, dict[str, Any]] = {}
+        self._reports: dict[int, dict[str, Any]] = {}
 
     def __enter__(self) -> Trainers:
-        # The last cores first: the process that records is where it is. All groups train at once, on any number.
+        # The last cores first, to leave one to the process that records. All groups train at once, on any number.
         cores = sorted(os.sched_getaffinity(0), reverse=True)
         self._executor = PinnedProcesses([cores[i % len(cores)] for i in range(len(self._groups))])
         for first, group in self._groups.items():
@@ -132,17 +132,17 @@ class Trainers:
 
     @property
     def iterations(self) -> int:
-        """Of the group that has done the fewest."""
-        fewest: int = min(words["iterations"] for words in self._told.values())
+        """Fewest iterations of a group."""
+        fewest: int = min(report["iterations"] for report in self._reports.values())
         return fewest
 
     @property
     def mean_return(self) -> float:
-        """Of the episodes that ended in the last chunk of a group; NaN for none."""
-        return next((words["mean_return"] for words in self._told.values()), float("nan"))
+        """Mean return of the episodes that ended in the last chunk of a group; NaN if there were none."""
+        return next((report["mean_return"] for report in self._reports.values()), float("nan"))
 
     def swaps(self, wait_s: float) -> list[dict[str, Any]]:
-        """Wait, and return the swaps that were made meanwhile.
+        """Wait, and return the swaps made meanwhile.
 
         Raises:
             AnimatError: if a training failed, or its process ended.
@@ -157,24 +157,25 @@ class Trainers:
                 ) from error
         swaps: list[dict[str, Any]] = []
         for first, group in self._groups.items():
-            words = self._exchange.reported(first)
-            if words is not None:
-                before = self._told.get(first, {"swaps": []})
-                swaps += [{"members": list(group.members), **swap} for swap in words["swaps"][len(before["swaps"]) :]]
-                self._told[first] = words
+            latest = self._exchange.reported(first)
+            if latest is not None:
+                before = self._reports.get(first, {"swaps": []})
+                swaps += [{"members": list(group.members), **swap} for swap in latest["swaps"][len(before["swaps"]) :]]
+                self._reports[first] = latest
         return swaps
 
     def all_use(self, number: int) -> bool:
         """Whether every group trains on the simulator of this number or a newer one."""
-        return len(self._told) == len(self._groups) and all(w["using"] >= number for w in self._told.values())
+        reports = self._reports.values()
+        return len(reports) == len(self._groups) and all(report["using"] >= number for report in reports)
 
     def finish(self, patience_s: float = 120.0) -> list[dict[str, Any]]:
-        """Tell them to end, wait until they have written their policies, and return the last swaps.
+        """Request the end of training, wait until all policies are saved, and return the last swaps.
 
         Raises:
-            AnimatError: if one does not end, or fails.
+            AnimatError: if a process does not end, or fails.
         """
         self._exchange.finish()
         if wait(self._futures, patience_s).not_done:
-            raise AnimatError(f"training: expected it to end within {patience_s:g} s, but it goes on")
+            raise AnimatError(f"training: expected it to end within {patience_s:g} s, but it continues")
         return self.swaps(0.0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from animat.closed_loop.adaptive import AdaptiveThresholds, kept_of
+from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Ranked
 from animat.neurons.remembering import Remembered
@@ -28,7 +28,7 @@ def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     Returns:
         The responses with x read again, for all channels or for readouts; nothing else changes.
     """
-    first = [slice(kept) for kept in kept_of(adjusted)]
+    first = [slice(kept) for kept in kept_counts(adjusted)]
     first_hz, first_ranks = (
         tuple(each[of] for each, of in zip(values, first, strict=True))
         for values in (adjusted.responses_hz, adjusted.ranks)

@@ -92,7 +92,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     shape = loop.decoder.percentiles_shape[:-1]
     no_command, commands = np.full(shape, np.nan).tolist(), []
     read_hz: list[Sequence[float]] = []
-    for record in session.log.records.words():
+    for record in session.log.records.fields():
         tick = record.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue

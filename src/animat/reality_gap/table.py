@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from animat.closed_loop.gathering import in_words
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.session import Session, told_unanswered
+from animat.closed_loop.session import Session, unanswered_message
+from animat.closed_loop.session_data import describe_left_out
 from animat.cultures.budget import Account
 from animat.errors import in_min
 from animat.evaluation.verdict import Verdict
@@ -167,7 +167,7 @@ class RealityGap:
         if self.whose_work:
             lines += intervention_lines(self.rows[0], self.whose_work)
         if outline["unanswered_pulses"]:
-            lines.append(f"  {told_unanswered(self.session)}")
+            lines.append(f"  {unanswered_message(self.session)}")
         if self.session.outline.left_out:
-            lines.append(f"  left out: {in_words(self.session.outline.left_out)}")
+            lines.append(f"  left out: {describe_left_out(self.session.outline.left_out)}")
         return "\n".join(lines)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from animat.closed_loop.gathering import LOG_FILE, RECORDING_FILE, STOP_FILE
+from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, STOP_FILE
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, first_line
 from animat.watch.cultures import CulturesView
 from animat.watch.found import Kind, find, place_within

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from animat.closed_loop.gathering import LOG_FILE
+from animat.closed_loop.session_data import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
 from animat.marks import MARKS

@@ -31,7 +31,7 @@ def picture_of(loop: dict[str, Any], record: Record, earlier: list[list[float | 
 
     The record has a tick; the earlier observations are of its episode.
     """
-    tick = mapped(record.words.get("tick"))
+    tick = mapped(record.fields.get("tick"))
     observation, command = numbers(tick.get("observation")), numbers(tick.get("command"))
     if not observation and earlier:
         observation = earlier[-1]

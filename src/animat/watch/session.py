@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from animat.closed_loop.gathering import LOG_FILE, STOP_FILE
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
 from animat.closed_loop.outline import Outline
+from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import duration_in_words
 from animat.stimulation.stimulus import NOTHING
@@ -98,9 +98,9 @@ class SessionView(View):
         ticks = [(at, tick) for at, record in shown if (tick := self._tick(at, record)) is not None]
         ticks = [(at, tick) for at, tick in ticks if (tick["time_s"] or 0.0) <= to_s]
         adapted = [
-            (span[1], first_readout(record.words["percentiles_hz"]))
+            (span[1], first_readout(record.fields["percentiles_hz"]))
             for _, record in shown
-            if "percentiles_hz" in record.words and (span := _span(record.words)) is not None
+            if "percentiles_hz" in record.fields and (span := _span(record.fields)) is not None
         ]
         spikes, counts = packed([record for _, record in shown], from_s, to_s, len(self._header.channels))
         return {
@@ -123,13 +123,13 @@ class SessionView(View):
         """The record of a tick, and the observations of the same episode before it, for a picture; None without."""
         self._look()
         record = self.tail.record(at)
-        tick = None if record is None else record.words.get("tick")
+        tick = None if record is None else record.fields.get("tick")
         if record is None or not isinstance(tick, dict):
             return None
         earlier: list[list[float | None]] = []
         for before in range(at - 1, max(-1, at - _TRAIL), -1):
             found = self.tail.record(before)
-            past = None if found is None else found.words.get("tick")
+            past = None if found is None else found.fields.get("tick")
             if isinstance(past, dict) and past.get("episode") != tick.get("episode"):
                 break
             if isinstance(past, dict) and past.get("observation"):
@@ -149,8 +149,8 @@ class SessionView(View):
             first = self.tail.record(0)
             if first is None:
                 raise InvalidFile(f"{self.tail.path}: expected a log of a session, got one without a whole beginning")
-            self._header: Header = read_header(self.tail.path, first.words)
-            self._words = first.words
+            self._header: Header = read_header(self.tail.path, first.fields)
+            self._words = first.fields
             self._sums = Sums(self.tail)
             self._generation = self.tail.generation
         return is_whole
@@ -246,18 +246,18 @@ class SessionView(View):
             record = self.tail.record(at)
             if record is None:
                 continue
-            span = _span(record.words)
+            span = _span(record.fields)
             if (span is not None and span[1] < from_s) or len(found) >= _MOST_RECORDS:
                 break
             found.append((at, record))
         return found[::-1]
 
     def _tick(self, at: int, record: Record) -> dict[str, Any] | None:
-        tick = record.words.get("tick")
+        tick = record.fields.get("tick")
         if not isinstance(tick, dict):
             return None
         totals = self._sums.totals
-        chosen = [row[3] for row in listed(record.words.get("stimuli")) if isinstance(row, list) and len(row) == 4]
+        chosen = [row[3] for row in listed(record.fields.get("stimuli")) if isinstance(row, list) and len(row) == 4]
         named = {name: _plain(tick.get(name)) for name in _NUMBERS}
         return {
             **named,

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, record_of, words_of
+from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, parse_fields, parse_record
 from animat.errors import InvalidFile
 
 T = TypeVar("T")
@@ -91,7 +91,7 @@ class Tail:
         if number in self._kept:
             self._kept.move_to_end(number)
             return self._kept[number]
-        found = self._read(number, record_of)
+        found = self._read(number, parse_record)
         if found is not None:
             self._kept[number] = found
             if len(self._kept) > _KEPT:
@@ -101,8 +101,8 @@ class Tail:
     def peek(self, number: int) -> dict[str, Any] | None:
         """The words of a record that is looked at once and not kept; None where it is not whole."""
         if (kept := self._kept.get(number)) is not None:
-            return kept.words
-        return self._read(number, words_of)
+            return kept.fields
+        return self._read(number, parse_fields)
 
     def _read(self, number: int, made_of: Callable[[Path, bytes], T]) -> T | None:
         """What is made of the bytes of a record, if they are those that were written."""

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.gathering import LOG_FILE, expecting_a_session
 from animat.closed_loop.header import read_header
 from animat.closed_loop.session import read_session
+from animat.closed_loop.session_data import LOG_FILE, expect_session_log
 from animat.errors import InvalidArgument, UnusableData
 from animat.goals.robot import robot_of
 from animat.report.film.scene import Moment, Scene
@@ -46,15 +46,15 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
     from_s, to_s = span_s or (0.0, USUAL_S)
     is_found = span_s is not None
     reading = _Reading(header.conditions)
-    with expecting_a_session(file):
+    with expect_session_log(file):
         reading.window_s = float(words["loop"]["window_ms"][1]) * 1e-3
         robot_data, seed = words["loop"] | {"robot": words["loop"]["robot"]}, int(words["seed"])
         for record in session.log.records:
-            is_past = is_found and record.words["kind"] == "seen" and record.words.get("start_s", 0.0) >= to_s
+            is_past = is_found and record.fields["kind"] == "seen" and record.fields.get("start_s", 0.0) >= to_s
             # In a pause before the first trial nothing moves yet: that trial tells where the robot stands.
             if is_past and reading.moments:
                 break
-            reading.add(record.words)
+            reading.add(record.fields)
             if not is_found and reading.moments:
                 # While it does not move, the film begins later and later.
                 is_found = reading.moments[-1].iteration >= 0

@@ -1,4 +1,4 @@
-"""What a session's records come to, all but the spikes, and what its files are called."""
+"""A session's data without the spikes, collected from its records, and the names of its files."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
 TICKS_FILE = "ticks.csv"
 STOP_FILE = "STOP"
-"""In a session's folder: whoever makes it, empty or not, ends the session as Ctrl-C does."""
+"""In a session's folder: creating it, empty or not, ends the session as Ctrl-C does."""
 
 
-class Gathered:
-    """All that a session's files need of its records but the spikes, which stay in the log.
+class SessionData:
+    """What a session's files need from its records, except the spikes, which stay in the log.
 
     Args:
         header: of the session.
 
     Attributes:
-        outline: what the records came to.
+        outline: counts of the records.
         spike_counts: of each channel.
     """
 
@@ -42,54 +42,54 @@ class Gathered:
         self.outline = Outline()
         self.spike_counts = SpikeCounts(len(header.channels))
         self._header = header
-        # Of each pulse, column by column: half a million take 50 MB, and not a gigabyte.
+        # One entry per pulse, in columns: half a million take 50 MB instead of a gigabyte.
         self._time_s, self._frequency_hz = array("d"), array("d")
         self._pattern, self._presentation = array("q"), array("q")
         self._electrodes, self._widths = array("q"), array("q")
         self._watched_s = self._end_s = 0.0
 
     def add(self, record: Record) -> None:
-        """Take in one record."""
-        words = record.words
-        self.outline.add(words)
+        """Add one record."""
+        fields = record.fields
+        self.outline.add(fields)
         self.spike_counts.add(record.spike_times_s, record.spike_channels)
-        if words["kind"] != "seen":
+        if fields["kind"] != "seen":
             return
-        for frequency_hz, pattern, presentation, electrodes in words["stimuli"]:
+        for frequency_hz, pattern, presentation, electrodes in fields["stimuli"]:
             self._frequency_hz.append(frequency_hz)
             self._pattern.append(pattern)
             self._presentation.append(presentation)
             self._electrodes.extend(electrodes)
             self._widths.append(len(electrodes))
-        if words["tick"]:
-            self._time_s.extend(words["tick"]["pulse_time_s"])
-        self._watched_s += words["duration_s"]
-        self._end_s = max(self._end_s, words["start_s"] + words["duration_s"])
+        if fields["tick"]:
+            self._time_s.extend(fields["tick"]["pulse_time_s"])
+        self._watched_s += fields["duration_s"]
+        self._end_s = max(self._end_s, fields["start_s"] + fields["duration_s"])
 
     def recording_without_spikes(self, ending: Ending) -> Recording:
-        """The session as a recording, but for its spikes.
+        """The session as a recording, without its spikes.
 
         Args:
             ending: how the session ended.
 
         Raises:
-            UnusableData: for records that do not fit together.
+            UnusableData: for inconsistent records.
         """
         header, outline = self._header, self.outline
-        words = {
+        metadata = {
             **header.provenance,
-            "session_description": "A closed loop of a neuronal culture on a multi-electrode array with a robot. Who "
-            f"chose the stimuli changes from episode to episode ({', '.join(header.agents)}): {TICKS_FILE} beside this "
-            "file says whose each stimulus was, and what came of it.",
+            "session_description": "A closed loop of a neuronal culture on a multi-electrode array with a robot. The "
+            f"agent that chooses the stimuli changes between episodes ({', '.join(header.agents)}): {TICKS_FILE} next "
+            "to this file states the agent of each stimulus, and the result.",
             "recorded_at": header.recorded_at,
             "closed_loop": header.loop,
             "closed_loop_ended": f"{ending.by}: {ending.message}",
             "closed_loop_unanswered_pulses": str(outline.unanswered_pulses),
         }
         if outline.left_out:
-            words["left_out"] = in_words(outline.left_out)
+            metadata["left_out"] = describe_left_out(outline.left_out)
         duration_s = max(0.0, self._end_s, self.spike_counts.span_s[1], *self._time_s[-1:])
-        words["closed_loop_unwatched_s"] = f"{max(0.0, duration_s - self._watched_s):.6f}"
+        metadata["closed_loop_unwatched_s"] = f"{max(0.0, duration_s - self._watched_s):.6f}"
         return Recording(
             spike_times_s=[],  # type: ignore[arg-type]
             spike_channels=[],  # type: ignore[arg-type]
@@ -100,7 +100,7 @@ class Gathered:
             duration_s=duration_s,
             start_min=header.start_min,
             presentation=header.presentation,
-            **from_words(words),
+            **from_words(metadata),
         )
 
     def _stimuli(self) -> Stimuli:
@@ -117,8 +117,8 @@ class Gathered:
 
 
 @contextmanager
-def expecting_a_session(file: Path) -> Iterator[None]:
-    """Raise InvalidFile where a log's records are whole and yet not those of a session."""
+def expect_session_log(file: Path) -> Iterator[None]:
+    """Raise InvalidFile where the records of an intact log are not those of a session."""
     try:
         yield
     except InvalidFile:
@@ -127,6 +127,6 @@ def expecting_a_session(file: Path) -> Iterator[None]:
         raise InvalidFile(f"{file}: expected a session's log, got {error!r}") from error
 
 
-def in_words(left_out: Mapping[str, int]) -> str:
-    """What the session does not have."""
+def describe_left_out(left_out: Mapping[str, int]) -> str:
+    """What is missing from a session, as text."""
     return ", ".join(f"{count} {what}" for what, count in left_out.items())

@@ -1,4 +1,4 @@
-"""What commands that stimulate a culture share: their options, and how a session that broke off is told."""
+"""What commands that stimulate a culture share: their options, and the error of a session that ended early."""
 
 from __future__ import annotations
 
@@ -13,53 +13,52 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Stimulating:
-    """On which culture, and how much it may be stimulated; the same in every command that does."""
+class StimulationOptions:
+    """Which culture is stimulated, and how much; the same in every command that stimulates one."""
 
     culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
-    """virtual: simulated neurons on a simulated array; replay: answers from recordings; cl1 and maxone: the devices"""
+    """virtual: simulated neurons on a simulated array; replay: responds from recordings; cl1 and maxone: the devices"""
     selection: Path | None = None
-    """For a maxone: the file of its electrodes"""
+    """For a MaxOne: the file of its electrodes"""
     culture_seed: int | None = None
-    """Which virtual culture, or which patterns of a CL1; default: of run that of the recordings, else 1"""
+    """Which virtual culture, or which patterns of a CL1; default: that of the recordings of run, else 1"""
     budget_pulses: int | None = None
-    """Most pulses in all, those of live's recordings included; default: unlimited, apart from the culture's
+    """Most pulses in all, including those of live's recordings; default: unlimited, apart from the culture's
     own limits"""
     budget_per_electrode: int | None = None
     """Most pulses on any one electrode"""
     thresholds: Literal["adaptive", "fixed"] = "adaptive"
-    """The mapping's thresholds in closed loop: adaptive to the culture's newest responses, or fixed by the recording"""
+    """The mapping's thresholds in closed loop: adapted to the culture's newest responses, or fixed by the recording"""
     on_burst: Literal["use", "repeat", "skip"] = "use"
     """A response that is a burst: use it, repeat the stimulus, or skip it and keep the command"""
     on_late: Literal["continue", "stop"] = "continue"
     """A pulse that comes late: continue and log it, or stop"""
     pause_s: float = 2.0
-    """Without stimulation before each episode, and each time in the settling"""
+    """Seconds without stimulation before each episode, and each time in the settling"""
     warm_up: int | None = None
-    """How often each condition is presented before the robot of an episode moves; default: 2 with one pulse, else 0"""
+    """Trials of each condition before the robot moves in an episode; default: 2 with one pulse, else 0"""
     settling: int | None = None
-    """How many times a pause and six trials of each condition precede the first episode, for thresholds to adapt;
+    """How many times a pause and six trials of each condition precede the first episode, so that thresholds adapt;
     default: 10 with one pulse and adaptive thresholds, else 0"""
     patience_s: float = 10.0
-    """How much longer than it should a culture may take to answer before the session is ended"""
+    """Seconds beyond the expected time that a culture may take to respond before the session ends"""
 
     def _expect_culture_seed(self) -> None:
-        """Raise for a seed that no culture has; what makes the culture would call it `seed`, as the policies' is."""
+        """Raise for a negative seed, under the option's name: later it would be called `seed`, as the policies' is."""
         if self.culture_seed is not None and self.culture_seed < 0:
             raise InvalidArgument(f"--culture-seed: expected 0 or more, got {self.culture_seed}")
 
-    def _of_the_loop(self) -> dict[str, Any]:
-        """Settings of the closed loop."""
+    def _loop_settings(self) -> dict[str, Any]:
         names = ("on_burst", "on_late", "pause_s", "warm_up", "settling", "patience_s")
         return {name: getattr(self, name) for name in names}
 
 
 def expect_no_fault(session: Session, folder: Path) -> None:
-    """Turn an ending before its time into an error, now that all is told and written."""
+    """Raise if the session ended early; called once everything is reported and written."""
     ending = session.ending
     if ending.by == "person":
         raise KeyboardInterrupt
     if ending.by != "plan":
-        raise LoopEnded(f"{folder}: the session ended before its plan was done: {ending.message}")
+        raise LoopEnded(f"{folder}: the session ended before its plan was completed: {ending.message}")
     if not session.recording_file.is_file():
         raise InvalidFile(ending.message)
