@@ -156,10 +156,11 @@ class _Supervisor:
                 ending = self._watch(thread)
             except BaseException as error:
                 # From the caller's progress, or our own: an unsupervised loop must not continue.
-                is_person = isinstance(error, KeyboardInterrupt)
-                message = "stopped by a person" if is_person else f"the loop's supervisor raised {describe_error(error)}"
+                by, message = "person", "stopped by a person"
+                if not isinstance(error, KeyboardInterrupt):
+                    by, message = "crash", f"the loop's supervisor raised {describe_error(error)}"
                 with suppress(Exception):
-                    self._end(thread, Ending("person" if is_person else "crash", message))
+                    self._end(thread, Ending(by, message))
                 raise
             if ending is not None:
                 return self._end(thread, ending)

@@ -16,7 +16,7 @@ from animat.closed_loop.tick import Ending
 from animat.errors import AnimatError, InvalidFile
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Recording
-from animat.recordings.told import from_words
+from animat.recordings.metadata import from_metadata
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 
@@ -100,7 +100,7 @@ class SessionData:
             duration_s=duration_s,
             start_min=header.start_min,
             presentation=header.presentation,
-            **from_words(metadata),
+            **from_metadata(metadata),
         )
 
     def _stimuli(self) -> Stimuli:
