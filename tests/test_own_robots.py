@@ -41,7 +41,7 @@ class At(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Slider(Robot[At]):
-    """Moves by the command; the best is to stay in the middle."""
+    """Moves by the command; staying in the middle is best."""
 
     gain_m: float = 0.1
     episode_limit: int = 20
@@ -161,7 +161,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"observe": lambda self, state: jnp.stack([state.y])}, "observe: expected it to run .* AttributeError"),
         ({"reset": lambda self, key: At(jnp.float32(jnp.nan))}, "NaN or infinite ones in a state"),
         ({"reset": lambda self: At(0.0)}, "reset: expected it to run under jax.jit, got TypeError"),
-        ({"reset": lambda self, key: At(0)}, "advance: expected a state as reset gives it"),
+        ({"reset": lambda self, key: At(0)}, "advance: expected the state's structure from reset"),
         ({"advance": lambda self, uniforms, state, u: (state, u)}, r"advance: expected \(state, reward, whether"),
         ({"advance": lambda self, uniforms, state, u: (At(u[None]), u, u > 2)}, r"float32\[\]\), got another .*\[1\]"),
         ({"advance": lambda self, uniforms, state, u: (state, jnp.stack([u]), u > 2)}, r"reward: .*got shape \(1,\)"),
@@ -171,8 +171,8 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"advance": lambda self, uniforms, state, u: (state, float(u), u > 2)}, "advance: expected it to run"),
         ({"heuristic": lambda self, seen: seen}, r"heuristic: expected a command, shape \(\), got shape \(1,\)"),
         ({"heuristic": lambda self, seen: seen.x}, "heuristic: expected it to run .* AttributeError"),
-        ({"observe": lambda self, state: [state.x_m]}, "observe: expected an array, as jnp.stack makes, got a list"),
-        ({"advance": keeping}, "Changed: expected methods that keep nothing of a call for a later one"),
+        ({"observe": lambda self, state: [state.x_m]}, "observe: expected an array, as from jnp.stack, got a list"),
+        ({"advance": keeping}, "Changed: expected methods that keep nothing from one call to the next"),
         ({"succeeded": lambda self, state: state.x_m}, "succeeded: expected true or false, got float32"),
         ({"succeeded": raising}, "succeeded: expected it to run under jax.jit, got ZeroDivisionError"),
         ({"potential": lambda self, state: jnp.stack([state.x_m])}, r"potential: expected a number, .*shape \(1,\)"),
@@ -185,7 +185,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"noise_size": None}, "noise_size: expected a whole number"),
         ({"noise_size": -1}, "noise_size: expected a whole number"),
         ({"episode_limit": 0}, "episode_limit: expected a whole number"),
-        ({"name": None}, "name: expected a text"),
+        ({"name": None}, "name: expected a string"),
         ({"observation_spec": ()}, "observation_spec: expected a tuple of Quantity"),
         ({"observation_spec": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
         ({"observation_spec": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
@@ -225,8 +225,8 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
         (("x", "m", 1.0, 1.0, -1.0), "x: expected low < high of a Quantity, got 1 and -1"),
         (("x", "m", 1.0, 1.0, np.float32(1)), "x: expected low < high of a Quantity, got 1 and 1"),
         (("x", "m", 1.0, np.nan), "x: expected low < high of a Quantity, got nan and inf"),
-        ((1.0, "m", 1.0), "name of a Quantity: expected a text, got 1.0"),
-        (("x", 1.0, 1.0), "unit of a Quantity: expected a text, got 1.0"),
+        ((1.0, "m", 1.0), "name of a Quantity: expected a string, got 1.0"),
+        (("x", 1.0, 1.0), "unit of a Quantity: expected a string, got 1.0"),
     ],
 )
 def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
