@@ -30,7 +30,7 @@ from animat.evaluation.table import evaluate
 from animat.reality_gap.predicting import ROLL_OUTS, episodes_on_host
 from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
-from animat.robots.host import Bodies, Standing
+from animat.robots.host import Bodies, Snapshot
 from animat.robots.registry import REGISTRY
 from animat.studies.paths import record_paths
 from animat.training.folder import describe, expect_trainable
@@ -129,7 +129,7 @@ def test_bodies_stand_where_others_stood() -> None:
         stepped = first.step(rng.uniform(-1, 1, (2, 1)).astype(np.float32))
         first.begin(np.flatnonzero(stepped.ended).tolist())
     second = Bodies(robot, [(7, 0), (7, 1)])
-    assert second.stand(first.standing)
+    assert second.restore(first.snapshot)
     np.testing.assert_array_equal(second.observation, first.observation)
     for _ in range(15):
         command = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
@@ -139,15 +139,15 @@ def test_bodies_stand_where_others_stood() -> None:
         second.begin(np.flatnonzero(other.ended).tolist())
     np.testing.assert_array_equal(first.observation, second.observation)
     # A body that answers otherwise than it did begins anew, and says so.
-    moved = first.standing._replace(observation=first.observation + 1)
-    assert not Bodies(robot, [(7, 0), (7, 1)]).stand(moved)
+    moved = first.snapshot._replace(observation=first.observation + 1)
+    assert not Bodies(robot, [(7, 0), (7, 1)]).restore(moved)
 
 
 def test_what_was_before_an_episode_may_matter_and_is_told() -> None:
     robot = named("Remembers")
-    assert not robot.keeps_state and Standing.of_none(robot, 3).commands.shape == (3, 0, 1)
+    assert not robot.keeps_state and Snapshot.initial(robot, 3).commands.shape == (3, 0, 1)
     (caveat,) = robot.caveats()
-    assert "at each of them episodes begin anew" in caveat and named("Slider").caveats() == ()
+    assert "episodes restart at each checkpoint" in caveat and named("Slider").caveats() == ()
 
 
 class Stopping:
@@ -246,7 +246,7 @@ FAULTS = {
     "MultiBinary": "expected an action space of kind Box or Discrete, got MultiBinary",
     "Unbounded": "expected actions with finite bounds",
     "DictSeen": "expected an observation space of kind Box, got Dict",
-    "Endless": "expected a limit of an episode, got an environment without one: --parameters episode_limit=1000",
+    "Endless": "expected an episode limit, got an environment without one: --parameters episode_limit=1000",
     "Nan": "expected finite observations, got NaN or infinite ones",
     "NanReward": "expected finite rewards, got NaN or infinite ones",
     "Raises": "expected step to succeed, got ZeroDivisionError: a wheel came off",
@@ -374,7 +374,7 @@ def test_replay_may_take_longer_than_a_step(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(host, "PATIENCE_S", 0.2)
     monkeypatch.setattr(bodies_of_others.Slider, "_seen", slowly(bodies_of_others.Slider._seen))
     second = Bodies(robot, [(1,), (2,)])
-    assert second.stand(first.standing)
+    assert second.restore(first.snapshot)
 
 
 def slowly(call: Any) -> Any:
@@ -398,10 +398,10 @@ def test_the_alarm_of_others_and_bodies_that_catch_everything(monkeypatch: pytes
     before = signal.signal(signal.SIGALRM, lambda *_: None)
     try:
         signal.setitimer(signal.ITIMER_REAL, 100.0)
-        assert host.tried(robot, "step", lambda: 3) == 3
+        assert host.call_body(robot, "step", lambda: 3) == 3
         assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 100.0
         with pytest.raises(BodyFailed, match="it hangs"):
-            host.tried(robot, "step", lambda: (swallows(), time.sleep(5)))
+            host.call_body(robot, "step", lambda: (swallows(), time.sleep(5)))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -431,7 +431,7 @@ def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_told() -> None:
         named("Slider", episode_limit=0)
     robot = named("Slider", episode_limit=host.LONGEST_KEPT + 1)
     (caveat,) = robot.caveats()
-    assert "20,001 iterations" in caveat and not Standing.of_none(robot, 2).commands.size
+    assert "20,001 iterations" in caveat and not Snapshot.initial(robot, 2).commands.size
 
 
 def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:

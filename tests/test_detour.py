@@ -1,4 +1,4 @@
-"""Detour, against straight ways walked in small steps, drives straight to the goal, and what its body is in wheels."""
+"""Detour, against straight paths walked in small steps and drives straight to the goal, with the body of `wheels`."""
 
 from __future__ import annotations
 
@@ -103,9 +103,9 @@ def test_the_heuristic_goes_along_what_is_on_the_goals_side_and_else_to_the_goal
 
 
 def test_surroundings_that_block_no_way_are_refused() -> None:
-    with pytest.raises(InvalidArgument, match="walls, obstacles: expected some that block the straight way"):
+    with pytest.raises(InvalidArgument, match="walls, obstacles: expected some that block the straight path"):
         Detour(walls=Detour().walls[:4], obstacles=())
-    with pytest.raises(InvalidArgument, match="start_x_m, start_y_m: expected a place between the walls"):
+    with pytest.raises(InvalidArgument, match="start_x_m, start_y_m: expected a place within the walls"):
         Detour(start_x_m=3.0)
 
 

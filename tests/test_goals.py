@@ -26,7 +26,7 @@ from animat.progress import Silent
 from animat.robots import Cartpole, GymnasiumRobot, Navigation, Quantity, Robot, Shuttle, SwingUp, robot_named
 from animat.robots.base import lacking
 from animat.robots.checking import check_robot
-from animat.robots.grid import grid_for, no_grid
+from animat.robots.grid import grid_for, why_no_grid
 from animat.training.sac import shaped
 from animat.training.settings import SAC
 from animat.wrappers import Wrapper
@@ -309,7 +309,7 @@ def test_the_best_policy_of_a_published_task_as_a_goal_is_as_good_at_the_task(
 
 def test_a_goal_with_within_has_no_grid_and_says_so() -> None:
     robot = with_goal("cartpole", "drive pole_angle in -5..5 deg within 3")
-    assert "within" in (no_grid(robot) or "") and "value_grid" not in lacking(robot)
+    assert "within" in (why_no_grid(robot) or "") and "value_grid" not in lacking(robot)
     with pytest.raises(InvalidArgument, match="within"):
         best_return(WithoutNeurons(robot, (-1.0, 1.0)), None, episodes=0)
 

@@ -26,7 +26,7 @@ from animat.evaluation.heuristic import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import ROBOTS, Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
-from animat.robots.grid import no_grid
+from animat.robots.grid import why_no_grid
 from animat.robots.registry import REGISTRY, register_robot, robot_named
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -253,7 +253,7 @@ def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:
 
     robot = slider(value_grid=without)
     check_robot(robot)
-    assert no_grid(robot) == "gain_m: expected 0.1 or less for an optimal return"
+    assert why_no_grid(robot) == "gain_m: expected 0.1 or less for an optimal return"
 
 
 @pytest.mark.oracle
@@ -332,7 +332,7 @@ def test_a_grid_that_fails_is_none_with_a_reason() -> None:
         return 1 / 0
 
     said = "slider.value_grid: expected a Grid, got ZeroDivisionError: division by zero"
-    assert no_grid(slider(value_grid=broken)) == said
+    assert why_no_grid(slider(value_grid=broken)) == said
 
 
 @dataclasses.dataclass(frozen=True)

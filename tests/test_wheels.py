@@ -207,12 +207,12 @@ def test_goals_are_drawn_from_all_places_that_can_be_reached_and_from_no_other()
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"start_x_m": 0.3, "start_y_m": 0.3}, "start_x_m, start_y_m: expected a place between the walls"),
-        ({"start_x_m": 3.0}, "start_x_m, start_y_m: expected a place between the walls"),
-        ({"obstacles": (), "walls": ()}, "start_x_m, start_y_m: expected a place between the walls"),
+        ({"start_x_m": 0.3, "start_y_m": 0.3}, "start_x_m, start_y_m: expected a place within the walls"),
+        ({"start_x_m": 3.0}, "start_x_m, start_y_m: expected a place within the walls"),
+        ({"obstacles": (), "walls": ()}, "start_x_m, start_y_m: expected a place within the walls"),
         ({"walls": FAR}, r"in at most 196 m\^2"),
-        ({"walls": Wheels().walls[:3]}, "walls: expected them all around the robot, got a gap"),
-        ({"walls": (*Wheels().walls[:3], (0.0, 1.0, 0.0, 0.1))}, "walls: expected them all around the robot"),
+        ({"walls": Wheels().walls[:3]}, "walls: expected walls all around the robot, got a gap"),
+        ({"walls": (*Wheels().walls[:3], (0.0, 1.0, 0.0, 0.1))}, "walls: expected walls all around the robot"),
         ({"step_s": 0.3}, "step_s: expected at most 0.269 at this speed, got 0.3"),
         ({"walls": ((0.0, 0.0, 1.0),)}, "walls: expected to be given, got nothing|walls: expected at least 4"),
         ({"obstacles": ((0.0, 0.0, -1.0),)}, "obstacles: expected at least 1e-09, got -1"),

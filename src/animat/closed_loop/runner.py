@@ -123,7 +123,7 @@ class HostRunner:
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
         """Start an episode where the robot draws it; returns what is observed; the same number in the same state."""
-        self._bodies.take_seeds([(self._entropy, number)])
+        self._bodies.reseed([(self._entropy, number)])
         return np.asarray(self._bodies.begin()[0], np.float64)
 
     def step(self, u: ArrayLike) -> Moved:

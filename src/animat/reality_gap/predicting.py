@@ -102,7 +102,7 @@ def predict(
         return roll_out(*within, control.actor, control.n_actors, episodes=episodes_each, seed=drawn)
 
     found: dict[str, Predicted] = {}
-    # A body on the host hangs in the first thread or is not noticed (`animat.robots.host.within`).
+    # A body on the host hangs in the first thread or is not noticed (`animat.robots.host.time_limit`).
     on_host = isinstance(environment.robot, HostRobot)
     with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         side_by_side = map if pool is None else pool.map

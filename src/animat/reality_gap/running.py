@@ -45,7 +45,7 @@ from animat.reality_gap.table import RealityGap
 from animat.reality_gap.whose_work import half_an_episode, replaced, with_ideal_actuator
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
-from animat.robots.grid import no_grid
+from animat.robots.grid import why_no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
@@ -274,7 +274,7 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
 
 def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
     """What keeps the optimal return from being computed; None where nothing does."""
-    why_not = no_grid(loop.robot)
+    why_not = why_no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         why_not = f"these conditions have too few responses: {', '.join(few)}"
     return None if why_not is None else lacking(loop.robot).get("value_grid", f"no optimal return: {why_not}")

@@ -199,4 +199,5 @@ def _expect_same_structure(what: str, after: Any, before: Any) -> None:
     ]
     if structures[0] != structures[1]:
         leaves = [", ".join(f"{dtype}{list(shape)}" for shape, dtype in of) for _, of in structures]
-        raise InvalidArgument(f"{what}: expected the state's structure from reset ({leaves[0]}), got another ({leaves[1]})")
+        first, other = leaves
+        raise InvalidArgument(f"{what}: expected the state's structure from reset ({first}), got another ({other})")
