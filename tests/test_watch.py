@@ -149,7 +149,7 @@ def test_a_killed_session_is_said_to_be_one(folder: Path, tmp_path: Path) -> Non
     found = whole(SessionView(tmp_path))
     assert found["state"] == "silent"
     assert "it was killed, or it hangs" in found["message"]
-    assert "cut off" in found["damage"]
+    assert "of a truncated one" in found["damage"]
 
 
 def test_what_follows_damage_is_not_shown(folder: Path, tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_stop_makes_the_file_that_the_loop_looks_for(folder: Path, tmp_path: Pat
 def test_stop_does_not_follow_a_link(folder: Path, tmp_path: Path) -> None:
     LogWriter(tmp_path / "in" / LOG_FILE, read_log(folder / LOG_FILE).header).close()
     (tmp_path / "in" / STOP_FILE).symlink_to(tmp_path / "outside")
-    with pytest.raises(InvalidFile, match="STOP: cannot be made"):
+    with pytest.raises(InvalidFile, match="STOP: cannot be created"):
         stop_session(tmp_path / "in")
     assert not (tmp_path / "outside").exists()
 

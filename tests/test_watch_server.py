@@ -17,7 +17,7 @@ from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
 from animat.tuning.run import MANIFEST as TUNING
-from animat.watch.found import _MARKS, find
+from animat.watch.discovery import _MARKS, find
 from watching import OWN, PORT, TOKEN, asked, session_in
 
 pytest.importorskip("starlette", reason="the extra [watch] is not installed")
@@ -131,7 +131,7 @@ def test_a_path_outside_of_the_folder_is_refused(app: Any, folder: Path, place: 
     for path in ("about", "view"):
         answer = asked(app, path, kind="session", **{"in": place})
         assert answer.status == 409
-        assert "expected a folder below the one that is watched" in answer.json["error"]
+        assert "expected a folder inside the watched one" in answer.json["error"]
     assert asked(app, "stop", method="POST", origin=OWN, **{"in": place}).status == 409
     assert not (folder / "outside" / STOP_FILE).exists()
     assert [each.place for each in find(folder / "in")] == ["session"]
@@ -217,7 +217,7 @@ def test_the_command_says_what_is_wrong(
     assert main(["watch", str(tmp_path / "none")]) == 1
     assert "expected a folder to watch, got none" in capsys.readouterr().err
     assert main(["watch", str(tmp_path), "--port", "70000"]) == 1
-    assert "--port: expected one from 1 to 65,535 that is free" in capsys.readouterr().err
+    assert "--port: expected a free port from 1 to 65,535" in capsys.readouterr().err
     monkeypatch.setattr("animat.watch.serving.find_spec", lambda name: None)
     assert main(["watch", str(tmp_path)]) == 1
     assert "pip install 'animat[watch]'" in capsys.readouterr().err

@@ -23,8 +23,8 @@ from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
 from animat.watch.cultures import CulturesView
-from animat.watch.held import is_held
 from animat.watch.recording import RecordingView
+from animat.watch.state import is_locked
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
@@ -290,7 +290,7 @@ def test_recordings_are_inspected_one_after_the_other(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_held_while_a_run_has_locked_it(tmp_path: Path) -> None:
-    assert not is_held(tmp_path)
+    assert not is_locked(tmp_path)
     with exclusive_lock(tmp_path):
-        assert is_held(tmp_path)
-    assert not is_held(tmp_path)
+        assert is_locked(tmp_path)
+    assert not is_locked(tmp_path)
