@@ -1,4 +1,4 @@
-"""What a goal makes of a robot: its reward, its ends and what its episodes come to, counted by hand; and its text."""
+"""A robot with a goal: rewards, ends and outcomes of episodes counted by hand; and the goal's text."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class Walk(NamedTuple):
 
 @dataclass(frozen=True)
 class Walker(Robot[Walk]):
-    """Eleven places in a row; a command moves one to the left or to the right, and fails to with 30 %."""
+    """Eleven places in a row; a command moves one to the left or right, and fails with a probability of 30 %."""
 
     episode_limit: int = 30
     name = "walker"
@@ -274,7 +274,7 @@ def test_the_cartpole_as_a_goal_has_its_own_rewards_and_ends() -> None:
 
 @dataclass(frozen=True)
 class OwnReward(Wrapper[Any]):
-    """The reward of the robot's own task, for whoever strives for the goal."""
+    """The reward of the robot's own task, for a controller that pursues the goal."""
 
     def advance(self, uniforms: Any, state: Any, action: Any, simulator: Any) -> Any:
         after = self.inside.advance(uniforms, state, action, simulator)
@@ -284,7 +284,7 @@ class OwnReward(Wrapper[Any]):
 
 
 def best_controller(environment: Environment[Any], resolution: float, episodes: int) -> np.ndarray:
-    """Returns of the controller that is best by the rewards of the robot, as the environment tells them."""
+    """Returns, by the environment's rewards, of the controller that is best by the robot's rewards."""
     robot = environment.robot
     grid = grid_for(robot).scaled(resolution)
     programme = _Programme(grid, [(environment, None)])
@@ -314,14 +314,14 @@ def test_a_goal_with_within_has_no_grid_and_says_so() -> None:
         best_return(WithoutNeurons(robot, (-1.0, 1.0)), None, episodes=0)
 
 
-def test_an_end_that_a_command_decides_is_not_taken_for_known() -> None:
+def test_an_end_that_a_command_decides_is_not_known_from_the_state() -> None:
     grid = grid_for(with_goal("cartpole", CARTPOLE))
     assert grid.end_is_known and grid.smooth_commands == grid_for(Cartpole()).smooth_commands
     by_speed = grid_for(with_goal("cartpole", "avoid cart_velocity outside -0.3..0.3 m/s"))
     assert not by_speed.end_is_known and by_speed.smooth_commands is None
 
 
-def test_what_a_robot_can_do_besides_it_still_can() -> None:
+def test_a_goal_keeps_the_robots_other_abilities() -> None:
     robot = with_goal(SwingUp(), "drive angle_cosine above 0.9")
     assert not lacking(robot)
     assert robot.heuristic(np.array([1.0, 0.0, 0.0])) == SwingUp().heuristic(np.array([1.0, 0.0, 0.0]))
@@ -343,7 +343,7 @@ def test_its_own_goal_can_be_switched_where_the_body_s_can() -> None:
     assert not hasattr(with_goal(Cartpole(), "avoid pole_angle above 12 deg"), "with_goal_of")
 
 
-def test_roll_outs_tell_what_each_episode_came_to() -> None:
+def test_rollouts_report_the_outcome_of_each_episode() -> None:
     robot = with_goal(Slider(4), "drive x above 0 m; avoid x below -0.5 m")
     actors = Constant(jnp.array([0, 1, 2]))
     ran = roll_out(WithoutNeurons(robot, (-0.9, -0.2, 0.4)), None, actors, 3, episodes=2, seed=1)
@@ -357,12 +357,12 @@ def test_roll_outs_tell_what_each_episode_came_to() -> None:
     )
 
 
-def test_where_an_episode_starts_in_a_region_that_ends_it_is_said() -> None:
+def test_a_start_in_a_region_that_ends_episodes_is_reported() -> None:
     assert "start in" in with_goal(Navigation(), "reach x, y around 0.7, 0.7 radius 10 cm").caveats()[-1]
     assert with_goal(Navigation(), NAVIGATION).caveats() == ()
 
 
-def test_a_goal_travels_as_text_beside_the_robot() -> None:
+def test_a_goal_is_stored_as_text_with_the_robot() -> None:
     robot = with_goal(Navigation(stride_m=0.03), NAVIGATION + "; avoid heading in 100..120 deg weight 0.1")
     data = body_and_goal(robot)
     assert data["goal"] == str(robot.goal) and data["robot"]["name"] == "navigation"

@@ -1,6 +1,6 @@
-"""Robots and mappings of one's own: what cannot be trained or loaded again is refused before the first iteration.
+"""Users' robots and mappings: those that cannot be trained or loaded again are refused before the first iteration.
 
-How a robot is registered, and what is done with it then, is in `test_registered_robots.py`.
+How a robot is registered, and used afterwards, is in `test_registered_robots.py`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from test_training import SMALL, Kept, timeline_of
 
 
 class At(NamedTuple):
-    """Where a slider is."""
+    """The position of a slider."""
 
     x_m: Any
 
@@ -69,7 +69,7 @@ KEPT: list[Any] = []
 
 
 def keeping(self: Any, uniforms: Any, state: At, u: Any) -> tuple[At, Any, Any]:
-    """An iteration that begins where the first that was ever traced began."""
+    """An iteration that starts from the state of the first trace."""
     KEPT.append(state.x_m)
     return At(KEPT[0] + u), u, u > 2
 
@@ -79,12 +79,12 @@ def raising(*_: Any) -> Any:
 
 
 def slider(**changed: Any) -> Robot[Any]:
-    """A slider with other methods or attributes."""
+    """A slider with changed methods or attributes."""
     return type("Changed", (Slider,), changed)()  # type: ignore[no-any-return]
 
 
 class Push(Mapping):
-    """One command, whatever is answered."""
+    """The same command for every response."""
 
     def __init__(self, command: Callable[[Any], Any] = lambda x: 0 * x + 0.5) -> None:
         self._command = command
@@ -235,7 +235,7 @@ def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
 
 
 def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
-    """The first step leads out of the bounds: it may where it begins after the end, and not as the end itself."""
+    """The first step leaves the bounds, which is allowed after the end of an episode, but not at the end itself."""
     bounded = {"observation_spec": (Quantity("x", "m", 1.0, -1.0, 1.0),), "reset": lambda self, key: At(jnp.float32(1))}
     after_the_end = lambda self, uniforms, state, u: (At(state.x_m + (u > -1)), u, u < 2)  # noqa: E731
     check_robot(slider(**bounded, advance=after_the_end))
@@ -247,7 +247,7 @@ def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
     check_robot(slider(**just_below))
 
 
-def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:
+def test_a_robot_without_a_grid_for_its_parameters_says_why() -> None:
     def without(self: Any) -> Any:
         raise InvalidArgument("gain_m: expected 0.1 or less for an optimal return")
 
@@ -258,7 +258,7 @@ def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:
 
 @pytest.mark.oracle
 @pytest.mark.parametrize("scale", [1e-12, 1e-7, 1e7, 1e12])
-def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
+def test_policies_trained_on_any_accepted_scale_act(scale: float) -> None:
     # In the unit that the robot is observed in, it moves as far as the scale says.
     robot = slider(
         observation_spec=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale])
@@ -304,13 +304,13 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
         (lambda x: x.command, "expected commands, got AttributeError"),
     ],
 )
-def test_mappings_that_give_no_commands_are_named(command: Callable[[Any], Any], words: str) -> None:
+def test_mappings_without_valid_commands_are_named(command: Callable[[Any], Any], words: str) -> None:
     with pytest.raises(InvalidArgument, match=f"^Push.command: {words}"):
         train(training("cartpole", Push(command)), timeline_of(), None)
 
 
 @pytest.mark.parametrize("wanted", [float("nan"), 1.5])
-def test_a_heuristic_s_command_is_one(wanted: float) -> None:
+def test_the_command_of_a_heuristic_is_valid(wanted: float) -> None:
     robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
     with pytest.raises(InvalidArgument, match=f"Changed.heuristic: expected commands from -1 to 1, got {wanted:g}"):
         check_robot(robot)
@@ -327,7 +327,7 @@ def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: 
     assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros((1, 1))).tolist() == [nearest]
 
 
-def test_a_grid_that_fails_is_none_with_a_reason() -> None:
+def test_a_grid_that_fails_gives_the_reason() -> None:
     def broken(self: Any) -> Any:
         return 1 / 0
 
@@ -337,7 +337,7 @@ def test_a_grid_that_fails_is_none_with_a_reason() -> None:
 
 @dataclasses.dataclass(frozen=True)
 class LaterNaN(Slider):
-    """Pays by the root of what is left of ten steps: after these, nothing that is a number."""
+    """Rewards the square root of the remainder of ten steps: NaN after these."""
 
     name: ClassVar[str] = "later"
 
@@ -346,7 +346,7 @@ class LaterNaN(Slider):
 
 
 @pytest.mark.oracle
-def test_a_reward_that_is_no_number_later_is_named() -> None:
+def test_a_reward_that_becomes_nan_later_is_named() -> None:
     with pytest.raises(UnusableData, match="later: expected finite rewards and observations, got NaN or infinite ones"):
         train(training(LaterNaN(), None), None, None)
 

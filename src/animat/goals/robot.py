@@ -146,12 +146,8 @@ class RobotWithGoal(Robot[GoalState]):
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and a warning if episodes start in a region that ends them."""
-        seen = self._seen(self.robot.reset(jax.random.key(0)))
-        ending = [
-            objective
-            for objective, (_, inside) in zip(self.goal.objectives, seen, strict=True)
-            if inside and objective.kind in ("avoid", "reach")
-        ]
+        pairs = zip(self.goal.objectives, self._seen(self.robot.reset(jax.random.key(0))), strict=True)
+        ending = [objective for objective, (_, inside) in pairs if inside and objective.kind in ("avoid", "reach")]
         return (*self.robot.caveats(), *(f"goal: episodes of {self.name} start in the region: {of}" for of in ending))
 
     def departures(self) -> tuple[tuple[str, str], ...]:

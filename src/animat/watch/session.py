@@ -207,7 +207,7 @@ class SessionView(View):
         elif is_locked(self.folder):
             state, message = "running", f"{silent}, but its program has not ended: it is waiting, or it hangs"
         else:
-            state, message = "silent", f"{silent}, and it has no end: it was killed, or it hangs"
+            state, message = "silent", f"{silent}, and the log has no end: it was killed, or it hangs"
         return {"state": state, "message": message, "damage": damage, "stop": stop}
 
     def _end_s(self) -> float:

@@ -33,7 +33,7 @@ def state_of(folder: Path, changed_s: float, *, is_done: bool) -> dict[str, Any]
     if locked or (locked is None and silent_s < _SILENT_S):
         return {"state": "running", "message": ""}
     message = (
-        "no program is working in the folder: it was stopped, was killed or failed (its command then reported why); "
-        "start it again and it continues"
+        "no program is working in the folder: the run was stopped, was killed or failed (its command then reported "
+        "why); start it again and it continues"
     )
     return {"state": "silent", "message": message}
