@@ -84,13 +84,13 @@ class Range:
         low, high = (None if end is None else end * factor for end in (self.low, self.high))
         return Range(self.quantity, low, high, spec[self.quantity].unit, self.outside)
 
-    def margin(self, seen: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
+    def margin(self, values: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
         """How far inside it a robot is, in scales of the quantity; below 0 outside.
 
         Args:
-            seen: the quantities by name, in the units of `spec`, as the region is (`in_units`).
+            values: the quantities by name, in the units of `spec`, as the region is (`in_units`).
         """
-        value = seen[self.quantity]
+        value = values[self.quantity]
         distances = [value - self.low] if self.low is not None else []
         distances += [self.high - value] if self.high is not None else []
         nearest = reduce(jnp.minimum, distances) / spec[self.quantity].scale
@@ -143,9 +143,9 @@ class Ball:
         factor = _factor(self.unit, first)
         return Ball(self.quantities, tuple(factor * at for at in self.centre), factor * self.radius, first.unit)
 
-    def margin(self, seen: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
+    def margin(self, values: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
         """As `Range.margin`, in the largest of the scales."""
-        squares = [(seen[name] - at) ** 2 for name, at in zip(self.quantities, self.centre, strict=True)]
+        squares = [(values[name] - at) ** 2 for name, at in zip(self.quantities, self.centre, strict=True)]
         scale = max(spec[name].scale for name in self.quantities)
         return (self.radius - jnp.sqrt(sum(squares[1:], squares[0]))) / scale
 
@@ -155,10 +155,10 @@ Region = Annotated[tuple[Range | Ball, ...], Field(min_length=1)]
 
 
 def margin_of(
-    region: tuple[Range | Ball, ...], seen: Mapping[str, Array], spec: Mapping[str, Quantity]
+    region: tuple[Range | Ball, ...], values: Mapping[str, Array], spec: Mapping[str, Quantity]
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """How far inside a region a robot is (the smallest margin of its parts, in [-1, 1]), and whether it is inside."""
-    margins = [part.margin(seen, spec) for part in region]
+    margins = [part.margin(values, spec) for part in region]
     inside = [m >= 0 if part.includes_edge else m > 0 for part, m in zip(region, margins, strict=True)]
     return jnp.clip(reduce(jnp.minimum, margins), -1.0, 1.0), reduce(jnp.logical_and, inside)
 

@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int
 from animat.errors import InvalidArgument, shown
 from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
-from animat.goals.tally import Outcome, Seen, Tally, add_iteration, empty_tally, outcome
+from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.goals.text import read_goal
 from animat.late import Array, jax, jnp
 from animat.robots.base import WITHOUT, Quantity, Robot, capability
@@ -146,7 +146,7 @@ class RobotWithGoal(Robot[GoalState]):
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and a warning if episodes start in a region that ends them."""
-        pairs = zip(self.goal.objectives, self._seen(self.robot.reset(jax.random.key(0))), strict=True)
+        pairs = zip(self.goal.objectives, self._margins(self.robot.reset(jax.random.key(0))), strict=True)
         ending = [objective for objective, (_, inside) in pairs if inside and objective.kind in ("avoid", "reach")]
         return (*self.robot.caveats(), *(f"goal: episodes of {self.name} start in the region: {of}" for of in ending))
 
@@ -164,28 +164,28 @@ class RobotWithGoal(Robot[GoalState]):
         self, uniforms: Float[Array, " noise_size"], state: GoalState, u: Float[Array, "*commands"]
     ) -> tuple[GoalState, Float[Array, ""], Bool[Array, ""]]:
         robot, _, _ = self.robot.advance(uniforms, state.robot, u)
-        outside, tally, reward, ended = self._judged(self._seen(robot), state.outside, state.tally)
+        outside, tally, reward, ended = self._judge(self._margins(robot), state.outside, state.tally)
         return GoalState(robot, outside, tally), reward, ended
 
-    def _judged(
-        self, seen: Seen, outside: tuple[Int[Array, ""], ...], tally: Tally
+    def _judge(
+        self, margins: Margins, outside: tuple[Int[Array, ""], ...], tally: Tally
     ) -> tuple[tuple[Int[Array, ""], ...], Tally, Float[Array, ""], Bool[Array, ""]]:
         """The counts and tally after an iteration, its reward, and whether it ends the episode."""
-        outside = self._outside(seen, outside)
+        outside = self._outside(margins, outside)
         counts = iter(outside)
         no = jnp.bool_(False)
         failures, reaches, running = [], [], jnp.float32(0.0)
-        for objective, share, (margin, inside) in zip(self._objectives, self._shares, seen, strict=True):
+        for objective, share, (margin, inside) in zip(self._objectives, self._shares, margins, strict=True):
             is_late = no if objective.within is None else next(counts) > objective.within
             failures.append(inside if objective.kind == "avoid" else is_late)
             reaches.append(inside if objective.kind == "reach" else no)
             worth: Any = {"avoid": 1.0, "reach": 0.0, "drive": inside}.get(objective.kind, (1.0 + margin) / 2)
-            running += share / len(seen) * worth
+            running += share / len(margins) * worth
         failed, reached = reduce(jnp.logical_or, failures), reduce(jnp.logical_or, reaches)
         reward = jnp.where(reached, REACHED * self._largest(reaches), running - self._cost)
         failure = FAILED * self._largest(failures) + self._cost * self.episode_limit
         reward = jnp.where(failed, -failure, reward).astype(jnp.float32)
-        tally = add_iteration(self._objectives, tally, seen, failed, reached & ~failed)
+        tally = add_iteration(self._objectives, tally, margins, failed, reached & ~failed)
         return outside, tally, reward, failed | reached
 
     def potential(self, state: GoalState) -> Float[Array, ""]:
@@ -196,10 +196,10 @@ class RobotWithGoal(Robot[GoalState]):
         The other objectives pay on the way.
         """
         potential: Array = jnp.float32(0.0)
-        seen = self._seen(state.robot)
-        for objective, share, (margin, _) in zip(self._objectives, self._shares, seen, strict=True):
+        margins = self._margins(state.robot)
+        for objective, share, (margin, _) in zip(self._objectives, self._shares, margins, strict=True):
             if objective.kind in ("reach", "drive"):
-                potential += POTENTIAL * share / len(seen) * jnp.minimum(margin, 0.0)
+                potential += POTENTIAL * share / len(margins) * jnp.minimum(margin, 0.0)
         return potential
 
     def succeeded(self, state: GoalState) -> Bool[Array, ""]:
@@ -217,21 +217,21 @@ class RobotWithGoal(Robot[GoalState]):
         result: Outcome = jax.device_get(_outcome_along(self)(np.pad(observations, ((0, missing), (0, 0)), "edge")))
         return result
 
-    def _seen(self, robot: Any) -> Seen:
-        return self._seen_in(self.robot.observe(robot))
+    def _margins(self, robot: Any) -> Margins:
+        return self._margins_in(self.robot.observe(robot))
 
-    def _seen_in(self, observation: Float[Array, " observations"]) -> Seen:
-        seen = dict(zip(self._spec, observation, strict=True))
-        return [margin_of(objective.region, seen, self._spec) for objective in self._objectives]
+    def _margins_in(self, observation: Float[Array, " observations"]) -> Margins:
+        values = dict(zip(self._spec, observation, strict=True))
+        return [margin_of(objective.region, values, self._spec) for objective in self._objectives]
 
-    def _outside(self, seen: Seen, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
-        timed = [inside for of, (_, inside) in zip(self._objectives, seen, strict=True) if of.within is not None]
+    def _outside(self, margins: Margins, before: Sequence[Int[Array, ""]] | None = None) -> tuple[Int[Array, ""], ...]:
+        timed = [inside for of, (_, inside) in zip(self._objectives, margins, strict=True) if of.within is not None]
         before = [jnp.int32(0)] * len(timed) if before is None else before
         return tuple(jnp.where(inside, 0, n + 1).astype(jnp.int32) for inside, n in zip(timed, before, strict=True))
 
     def started(self, robot: Any) -> GoalState:
         """An episode that begins with the body in this state."""
-        return GoalState(robot, self._outside(self._seen(robot)), empty_tally(self._objectives))
+        return GoalState(robot, self._outside(self._margins(robot)), empty_tally(self._objectives))
 
     def _largest(self, flags: Sequence[Bool[Array, ""]]) -> Float[Array, ""]:
         """The largest share of the flagged objectives."""
@@ -258,7 +258,7 @@ class RobotWithGoal(Robot[GoalState]):
         def margins_after(row: Array, node: Array, chance: float, u: float) -> Array:
             state = grid.state_at(row, node)
             robot, _, _ = self.robot.advance(jnp.full(self.noise_size, chance), state, jnp.float32(u))
-            pairs = zip(self._objectives, self._seen(robot), strict=True)
+            pairs = zip(self._objectives, self._margins(robot), strict=True)
             margins = [margin for objective, (margin, _) in pairs if objective.can_fail or objective.kind == "reach"]
             return jnp.stack(margins) if margins else jnp.zeros(0)
 
@@ -272,9 +272,9 @@ def _outcome_along(robot: RobotWithGoal) -> Callable[[Any], Outcome]:
 
     def along(observations: Float[Array, "iterations observations"]) -> Outcome:
         def iteration(carry: Any, observation: Array) -> tuple[Any, None]:
-            return robot._judged(robot._seen_in(observation), *carry)[:2], None
+            return robot._judge(robot._margins_in(observation), *carry)[:2], None
 
-        start = robot._outside(robot._seen_in(observations[0])), empty_tally(robot._objectives)
+        start = robot._outside(robot._margins_in(observations[0])), empty_tally(robot._objectives)
         (_, tally), _ = jax.lax.scan(iteration, start, observations[1:])
         return outcome(robot._objectives, tally, robot.episode_limit)
 

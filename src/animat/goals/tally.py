@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from animat.goals.goal import Objective
 from animat.late import Array, jax, jnp
 
-Seen = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
+Margins = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
 """For each objective, the margin in [-1, 1] and whether the robot is in its region."""
 
 
@@ -88,7 +88,7 @@ def empty_tally(objectives: Sequence[Objective]) -> Tally:
 
 
 def add_iteration(
-    objectives: Sequence[Objective], tally: Tally, seen: Seen, failed: Bool[Array, ""], reached: Bool[Array, ""]
+    objectives: Sequence[Objective], tally: Tally, margins: Margins, failed: Bool[Array, ""], reached: Bool[Array, ""]
 ) -> Tally:
     """Add one iteration, unless the episode has ended before it."""
 
@@ -99,9 +99,9 @@ def add_iteration(
 
     after = Tally(
         tally.iterations + 1,
-        tuple(before + inside for before, (_, inside) in zip(tally.inside, seen, strict=True)),
-        tuple(inside for _, inside in seen),
-        tuple(margin(of.kind, *m) for of, *m in zip(objectives, tally.margins, (m for m, _ in seen), strict=True)),
+        tuple(before + inside for before, (_, inside) in zip(tally.inside, margins, strict=True)),
+        tuple(inside for _, inside in margins),
+        tuple(margin(of.kind, *m) for of, *m in zip(objectives, tally.margins, (m for m, _ in margins), strict=True)),
         failed,
         reached,
     )

@@ -44,8 +44,8 @@ def guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint],
             return "requests from other pages are refused"
         if request.method not in ("GET", "HEAD") and not origin:
             return "expected an Origin with a request that changes something"
-        given, slash, _ = request.scope["path"].removeprefix("/").partition("/")
-        if not slash or not hmac.compare_digest(given.encode("utf-8", "replace"), token.encode()):
+        prefix, slash, _ = request.scope["path"].removeprefix("/").partition("/")
+        if not slash or not hmac.compare_digest(prefix.encode("utf-8", "replace"), token.encode()):
             return "expected the token of the printed address"
         return ""
 

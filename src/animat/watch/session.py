@@ -296,7 +296,7 @@ def _thresholds(mapping: Any) -> list[int]:
     from animat.coding.mapping import Thresholds
 
     name = mapping if isinstance(mapping, str) else mapped(mapping).get("name")
-    known = {each.name: list(each.percentile_indices) for each in (Thresholds(1), Thresholds(9))}
+    known = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
     return known.get(str(name), [0, 10])
 
 

@@ -16,7 +16,7 @@ _SILENT_S = 60.0
 def is_locked(folder: Path) -> bool | None:
     """Whether a run has locked a folder; None if the system does not report it."""
     try:
-        numbers = {str(each.stat().st_ino) for each in (folder, folder / LOCK) if each.exists()}
+        numbers = {str(path.stat().st_ino) for path in (folder, folder / LOCK) if path.exists()}
         lines = [line.split() for line in _LOCKS.read_text().splitlines()]
     except OSError:
         return None

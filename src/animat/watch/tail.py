@@ -122,7 +122,7 @@ class Tail:
         self._damaged_at = place
         self.damage = f"{self._places[-1] - place:,} bytes after the last whole record are damaged"
         del self._places[number + 1 :]
-        for later in [each for each in self._kept if each >= number]:
+        for later in [kept for kept in self._kept if kept >= number]:
             del self._kept[later]
 
     def _open(self) -> int:
