@@ -147,7 +147,7 @@ class Cartpole(Robot[CartpoleState]):
 
     def departures(self) -> tuple[tuple[str, str], ...]:
         """The pole's mass, and the angle that ends an episode."""
-        source = "the simulator's value" if math.isclose(self.pole_mass_kg, 0.055) else "chosen for this study"
+        source = "the simulator's" if math.isclose(self.pole_mass_kg, 0.055) else "chosen for this study"
         return (
             (
                 "Pole mass",
