@@ -153,7 +153,7 @@ def test_no_joint_passes_the_bound_of_its_speed() -> None:
 
 
 def test_links_that_reach_nothing_and_too_long_steps_are_refused() -> None:
-    with pytest.raises(InvalidArgument, match="lower_length_m: expected links alike enough to reach a target"):
+    with pytest.raises(InvalidArgument, match="lower_length_m: expected links similar enough to reach a target"):
         TwoLinkArm(upper_length_m=1.0, lower_length_m=0.01)
     with pytest.raises(InvalidArgument, match=r"step_s: expected at most .* for links so light and joints so damped"):
         TwoLinkArm(damping_n_m_s=0.1)

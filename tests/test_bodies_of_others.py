@@ -1,4 +1,4 @@
-"""Environments of Gymnasium as bodies: what their spaces become, training that can be killed, faults in one line."""
+"""Gymnasium environments as bodies: conversion of spaces, training that survives a kill, faults in one line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from animat.evaluation.table import evaluate
 from animat.reality_gap.predicting import ROLL_OUTS, episodes_on_host
 from animat.robots import host, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.gymnasium import GymnasiumRobot
-from animat.robots.host import Bodies, Standing
+from animat.robots.host import Bodies, Snapshot
 from animat.robots.registry import REGISTRY
 from animat.studies.paths import record_paths
 from animat.training.folder import describe, expect_trainable
@@ -120,7 +120,7 @@ def test_bodies_move_as_gymnasium_itself_moves_them(id: str) -> None:
     assert terminated or truncated
 
 
-def test_bodies_stand_where_others_stood() -> None:
+def test_a_snapshot_restores_bodies() -> None:
     robot = named("Slider")
     first = Bodies(robot, [(7, 0), (7, 1)])
     first.begin()
@@ -129,7 +129,7 @@ def test_bodies_stand_where_others_stood() -> None:
         stepped = first.step(rng.uniform(-1, 1, (2, 1)).astype(np.float32))
         first.begin(np.flatnonzero(stepped.ended).tolist())
     second = Bodies(robot, [(7, 0), (7, 1)])
-    assert second.stand(first.standing)
+    assert second.restore(first.snapshot)
     np.testing.assert_array_equal(second.observation, first.observation)
     for _ in range(15):
         command = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
@@ -139,19 +139,19 @@ def test_bodies_stand_where_others_stood() -> None:
         second.begin(np.flatnonzero(other.ended).tolist())
     np.testing.assert_array_equal(first.observation, second.observation)
     # A body that answers otherwise than it did begins anew, and says so.
-    moved = first.standing._replace(observation=first.observation + 1)
-    assert not Bodies(robot, [(7, 0), (7, 1)]).stand(moved)
+    moved = first.snapshot._replace(observation=first.observation + 1)
+    assert not Bodies(robot, [(7, 0), (7, 1)]).restore(moved)
 
 
-def test_what_was_before_an_episode_may_matter_and_is_told() -> None:
+def test_dependence_on_earlier_episodes_is_reported() -> None:
     robot = named("Remembers")
-    assert not robot.keeps_state and Standing.of_none(robot, 3).commands.shape == (3, 0, 1)
+    assert not robot.keeps_state and Snapshot.initial(robot, 3).commands.shape == (3, 0, 1)
     (caveat,) = robot.caveats()
-    assert "at each of them episodes begin anew" in caveat and named("Slider").caveats() == ()
+    assert "episodes restart at each checkpoint" in caveat and named("Slider").caveats() == ()
 
 
 class Stopping:
-    """A progress that ends the training after some chunks, as a kill would."""
+    """A progress that ends the training after some chunks, like a kill."""
 
     def __init__(self, chunks: int) -> None:
         self.chunks = chunks
@@ -194,7 +194,7 @@ def test_stopped_and_started_again_it_ends_in_the_same_bits(
 
 @pytest.mark.oracle
 def test_it_learns_what_can_be_learned(tmp_path: Path) -> None:
-    """To stay in the middle: the reward of any other place is less; of random commands it drifts away by their mean."""
+    """To stay in the middle: any other place is rewarded less, and random commands drift away by their mean."""
     asked = training(named("Slider"), policies=1, iterations=16_000, algorithm=replace(SMALL, hidden=32, batch=64))
     policies = trained(asked, None, tmp_path)
     table = evaluate(policies, None, episodes=20)
@@ -246,7 +246,7 @@ FAULTS = {
     "MultiBinary": "expected an action space of kind Box or Discrete, got MultiBinary",
     "Unbounded": "expected actions with finite bounds",
     "DictSeen": "expected an observation space of kind Box, got Dict",
-    "Endless": "expected a limit of an episode, got an environment without one: --parameters episode_limit=1000",
+    "Endless": "expected an episode limit, got an environment without one: --parameters episode_limit=1000",
     "Nan": "expected finite observations, got NaN or infinite ones",
     "NanReward": "expected finite rewards, got NaN or infinite ones",
     "Raises": "expected step to succeed, got ZeroDivisionError: a wheel came off",
@@ -285,7 +285,7 @@ def test_episodes_that_would_never_end_are_refused_before_training() -> None:
     expect_trainable(replace(few, iterations=enough), is_saved=False)
 
 
-def test_versions_of_all_that_moves_a_body_are_told() -> None:
+def test_versions_of_all_packages_behind_a_body_are_reported() -> None:
     description = describe(Training(robot_named("gymnasium:Pendulum-v1"), None), None)
     assert description["versions"]["gymnasium"] == importlib.metadata.version("gymnasium")
     assert description["versions"]["learner"] == f"revision {LEARNER}"
@@ -351,7 +351,7 @@ def test_mujoco_bodies_are_trained(tmp_path: Path) -> None:
     assert not np.array_equal(random.returns, row.returns)
 
 
-def test_a_body_that_exits_is_told_as_one_that_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_that_exits_is_reported_like_one_that_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     def leave(self: Any) -> None:
         raise SystemExit(0)
 
@@ -374,7 +374,7 @@ def test_replay_may_take_longer_than_a_step(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(host, "PATIENCE_S", 0.2)
     monkeypatch.setattr(bodies_of_others.Slider, "_seen", slowly(bodies_of_others.Slider._seen))
     second = Bodies(robot, [(1,), (2,)])
-    assert second.stand(first.standing)
+    assert second.restore(first.snapshot)
 
 
 def slowly(call: Any) -> Any:
@@ -398,10 +398,10 @@ def test_the_alarm_of_others_and_bodies_that_catch_everything(monkeypatch: pytes
     before = signal.signal(signal.SIGALRM, lambda *_: None)
     try:
         signal.setitimer(signal.ITIMER_REAL, 100.0)
-        assert host.tried(robot, "step", lambda: 3) == 3
+        assert host.call_body(robot, "step", lambda: 3) == 3
         assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 100.0
         with pytest.raises(BodyFailed, match="it hangs"):
-            host.tried(robot, "step", lambda: (swallows(), time.sleep(5)))
+            host.call_body(robot, "step", lambda: (swallows(), time.sleep(5)))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -426,12 +426,12 @@ def test_a_body_that_cuts_itself_off_early_does_not_end_the_return(monkeypatch: 
     assert (np.asarray(learners.episodes.robot.iterations) < 5).all()
 
 
-def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_told() -> None:
+def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_reported() -> None:
     with pytest.raises(InvalidArgument, match="episode_limit: expected from 1 to"):
         named("Slider", episode_limit=0)
     robot = named("Slider", episode_limit=host.LONGEST_KEPT + 1)
     (caveat,) = robot.caveats()
-    assert "20,001 iterations" in caveat and not Standing.of_none(robot, 2).commands.size
+    assert "20,001 iterations" in caveat and not Snapshot.initial(robot, 2).commands.size
 
 
 def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:
@@ -442,7 +442,7 @@ def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:
 
 
 def test_an_episode_of_two_commands_is_kept_whole() -> None:
-    """What a study keeps of an episode: a number a command, and where the body came by them."""
+    """What a study keeps of an episode: one number per command, and the body's resulting path."""
     robot = named("Pair")
     environment = WithoutNeurons(robot, None)
     kept = record_paths(environment, None, Uniform(), 2, seed=3)

@@ -16,7 +16,7 @@ NO_NOISE = np.array([0.5])
 
 
 def euler_step(state, force_n, *, pole_mass_kg):
-    """One step by the equations as the method prints them, float64, independent of the code under test."""
+    """One step by the equations as printed in the method, float64, independent of the code under test."""
     x, v, a, w = state
     g, cart_mass, half_length, dt = 9.8, 0.31, 0.2, 0.02
     total = cart_mass + pole_mass_kg
@@ -181,7 +181,7 @@ def test_the_printed_variants_are_selectable_and_say_what_they_mean() -> None:
 
 
 def test_a_pole_left_alone_falls_and_a_simple_rule_keeps_it_up() -> None:
-    """A heuristic policy holds for all 120 iterations, so the task's best return of 120 can be had."""
+    """A heuristic policy lasts for all 120 iterations, so the optimal return of 120 can be achieved."""
     robot = Cartpole()
 
     def episode(key, rule):

@@ -1,4 +1,4 @@
-"""Detour, against straight ways walked in small steps, drives straight to the goal, and what its body is in wheels."""
+"""Detour, against straight paths walked in small steps and drives straight to the goal, with the body of `wheels`."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ ROBOT = Detour()
 
 
 def goals_of(robot: Wheels | Detour, n: int = 4000) -> np.ndarray:
-    """As they are drawn, each once, as whole parts of the lattice's spacing from the start."""
+    """The distinct goals that are drawn, in lattice steps from the start."""
     states = jax.jit(jax.vmap(robot.reset))(jax.random.split(jax.random.key(0), n))
     return np.unique(np.round((np.stack([states.goal_x_m, states.goal_y_m], axis=1) - 0.5) / 0.014), axis=0)
 
 
 def is_blocked(robot: Detour, goals: np.ndarray) -> np.ndarray:
-    """Whether a body that is moved to a goal in steps of 2 mm touches anything."""
+    """Whether a body moved to a goal in steps of 2 mm touches anything."""
     around = Surroundings(robot.walls, robot.obstacles)
     along = np.arange(0, 1, 0.002 / 0.8)[:, None]
     return np.asarray((around.clearance_m(*(0.5 + along * 0.014 * of for of in goals.T)) < 0.035).any(axis=0))
@@ -42,7 +42,7 @@ def test_goals_are_all_the_places_of_wheels_that_cannot_be_driven_straight_to() 
     assert 0.3 * len(anywhere) < len(drawn) < 0.8 * len(anywhere)
 
 
-def test_who_drives_straight_to_the_goal_bumps_and_never_gets_there() -> None:
+def test_driving_straight_to_the_goal_bumps_and_never_arrives() -> None:
     @jax.jit
     @jax.vmap
     def drive(key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -103,13 +103,13 @@ def test_the_heuristic_goes_along_what_is_on_the_goals_side_and_else_to_the_goal
 
 
 def test_surroundings_that_block_no_way_are_refused() -> None:
-    with pytest.raises(InvalidArgument, match="walls, obstacles: expected some that block the straight way"):
+    with pytest.raises(InvalidArgument, match="walls, obstacles: expected some that block the straight path"):
         Detour(walls=Detour().walls[:4], obstacles=())
-    with pytest.raises(InvalidArgument, match="start_x_m, start_y_m: expected a place between the walls"):
+    with pytest.raises(InvalidArgument, match="start_x_m, start_y_m: expected a place within the walls"):
         Detour(start_x_m=3.0)
 
 
-def test_it_travels_as_data() -> None:
+def test_it_converts_to_data() -> None:
     robot = Detour(obstacles=((0.3, 0.5, 0.05),))
     assert robot_from_dict(json.loads(json.dumps(robot_to_dict(robot)))) == robot
 

@@ -1,4 +1,4 @@
-"""The page on goals: its commands are known, its example runs, and its goals are of the robots that it names."""
+"""The page on goals: its commands are known, its example runs, and its goals fit the robots that it names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of robots: what is where in them, by the colours that the drawing names."""
+"""Pictures of robots: the places of their parts, by the colours of the drawing."""
 
 from __future__ import annotations
 

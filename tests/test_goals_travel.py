@@ -1,4 +1,4 @@
-"""A goal from the command line to what a policy's episodes came to: training, files, evaluation, studies, the loop."""
+"""A goal from the command line to the outcome of episodes: training, files, evaluation, studies, the loop."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_what_is_learned_from_is_shaped_and_what_is_reported_is_not() -> None:
     assert np.all(np.abs(learned_from + TINY.reward_scale) > 1e-3)
 
 
-def test_trainings_are_told_with_their_goal() -> None:
+def test_trainings_are_described_with_their_goal() -> None:
     plain = Training(Cartpole(), None)
     assert "goal" not in plain.to_dict() and plain.to_dict()["robot"]["name"] == "cartpole"
     told = Training(with_goal("cartpole", GOAL), None).to_dict()
@@ -88,7 +88,7 @@ def test_policies_carry_their_goal_and_are_evaluated_with_it(tmp_path: Path) -> 
     assert "success" not in plain.to_text() and "objectives" not in plain.to_dict()
 
 
-def test_a_fingerprint_is_of_the_goal_too() -> None:
+def test_a_fingerprint_includes_the_goal() -> None:
     trainings = [Training(robot, None) for robot in (Cartpole(), with_goal("cartpole", GOAL))]
     assert len({describe(each, None)["fingerprint"] for each in trainings}) == 2
     studies = [Study(robots=(RobotSpec("cartpole", goal=goal),)) for goal in (None, GOAL)]
@@ -145,7 +145,7 @@ def test_a_study_tabulates_how_far_each_objective_was_met(tmp_path: Path) -> Non
     assert "succeeded" not in read_episodes(parts[1:])
 
 
-def test_a_closed_loop_tells_it_of_whole_episodes_by_what_was_observed() -> None:
+def test_a_closed_loop_reports_outcomes_of_whole_episodes_by_observations() -> None:
     robot = with_goal(Navigation(episode_limit=3), "reach x above 0.5 m")
     starts = [(0.0, 0.0, 0.0)] * 3
     paths = [[0.2, 0.6], [0.2, 0.3, 0.4], [0.2]]
@@ -171,7 +171,7 @@ def test_the_log_of_a_session_has_the_goal() -> None:
     assert loops[1]["goal"] == GOAL and loops[1]["robot"] == loops[0]["robot"] and "goal" not in loops[0]
 
 
-def test_a_goal_in_a_damaged_file_is_told(tmp_path: Path) -> None:
+def test_a_goal_in_a_damaged_file_is_reported(tmp_path: Path) -> None:
     from animat.goals.robot import robot_of
 
     with pytest.raises(InvalidArgument, match="did you mean avoid"):

@@ -107,7 +107,7 @@ def test_the_culture_is_recorded_every_interval(ran: tuple[LiveRun, Path, int]) 
 def test_recordings_are_watched_as_they_are_made(ran: tuple[LiveRun, Path, int], seen: Seen) -> None:
     found, folder = ran[0], ran[1] / "recordings"
     assert {state for state, *_ in seen} == {"running"}
-    assert {shown for *_, shown, _ in seen} == {"the one under way, as far as it is"}
+    assert {shown for *_, shown, _ in seen} == {"the one in progress, as far as it has come"}
     for number, file in enumerate(found.recordings):
         until_s = [end_s for _, whole, _, end_s in seen if whole == number]
         assert len(until_s) > 1 and until_s == sorted(set(until_s))

@@ -1,6 +1,6 @@
-"""Robots and mappings of one's own: what cannot be trained or loaded again is refused before the first iteration.
+"""Users' robots and mappings: those that cannot be trained or loaded again are refused before the first iteration.
 
-How a robot is registered, and what is done with it then, is in `test_registered_robots.py`.
+How a robot is registered, and used afterwards, is in `test_registered_robots.py`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from animat.evaluation.heuristic import HeuristicPolicy
 from animat.execution.training import train
 from animat.robots import ROBOTS, Cartpole, Navigation, Quantity, Robot
 from animat.robots.checking import check_robot
-from animat.robots.grid import no_grid
+from animat.robots.grid import why_no_grid
 from animat.robots.registry import REGISTRY, register_robot, robot_named
 from animat.training.policy import load_policies
 from animat.training.specification import Training
@@ -34,14 +34,14 @@ from test_training import SMALL, Kept, timeline_of
 
 
 class At(NamedTuple):
-    """Where a slider is."""
+    """The position of a slider."""
 
     x_m: Any
 
 
 @dataclasses.dataclass(frozen=True)
 class Slider(Robot[At]):
-    """Moves by the command; the best is to stay in the middle."""
+    """Moves by the command; staying in the middle is best."""
 
     gain_m: float = 0.1
     episode_limit: int = 20
@@ -69,7 +69,7 @@ KEPT: list[Any] = []
 
 
 def keeping(self: Any, uniforms: Any, state: At, u: Any) -> tuple[At, Any, Any]:
-    """An iteration that begins where the first that was ever traced began."""
+    """An iteration that starts from the state of the first trace."""
     KEPT.append(state.x_m)
     return At(KEPT[0] + u), u, u > 2
 
@@ -79,12 +79,12 @@ def raising(*_: Any) -> Any:
 
 
 def slider(**changed: Any) -> Robot[Any]:
-    """A slider with other methods or attributes."""
+    """A slider with changed methods or attributes."""
     return type("Changed", (Slider,), changed)()  # type: ignore[no-any-return]
 
 
 class Push(Mapping):
-    """One command, whatever is answered."""
+    """The same command for every response."""
 
     def __init__(self, command: Callable[[Any], Any] = lambda x: 0 * x + 0.5) -> None:
         self._command = command
@@ -161,7 +161,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"observe": lambda self, state: jnp.stack([state.y])}, "observe: expected it to run .* AttributeError"),
         ({"reset": lambda self, key: At(jnp.float32(jnp.nan))}, "NaN or infinite ones in a state"),
         ({"reset": lambda self: At(0.0)}, "reset: expected it to run under jax.jit, got TypeError"),
-        ({"reset": lambda self, key: At(0)}, "advance: expected a state as reset gives it"),
+        ({"reset": lambda self, key: At(0)}, "advance: expected the state's structure from reset"),
         ({"advance": lambda self, uniforms, state, u: (state, u)}, r"advance: expected \(state, reward, whether"),
         ({"advance": lambda self, uniforms, state, u: (At(u[None]), u, u > 2)}, r"float32\[\]\), got another .*\[1\]"),
         ({"advance": lambda self, uniforms, state, u: (state, jnp.stack([u]), u > 2)}, r"reward: .*got shape \(1,\)"),
@@ -171,8 +171,8 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"advance": lambda self, uniforms, state, u: (state, float(u), u > 2)}, "advance: expected it to run"),
         ({"heuristic": lambda self, seen: seen}, r"heuristic: expected a command, shape \(\), got shape \(1,\)"),
         ({"heuristic": lambda self, seen: seen.x}, "heuristic: expected it to run .* AttributeError"),
-        ({"observe": lambda self, state: [state.x_m]}, "observe: expected an array, as jnp.stack makes, got a list"),
-        ({"advance": keeping}, "Changed: expected methods that keep nothing of a call for a later one"),
+        ({"observe": lambda self, state: [state.x_m]}, "observe: expected an array, as from jnp.stack, got a list"),
+        ({"advance": keeping}, "Changed: expected methods that keep nothing from one call to the next"),
         ({"succeeded": lambda self, state: state.x_m}, "succeeded: expected true or false, got float32"),
         ({"succeeded": raising}, "succeeded: expected it to run under jax.jit, got ZeroDivisionError"),
         ({"potential": lambda self, state: jnp.stack([state.x_m])}, r"potential: expected a number, .*shape \(1,\)"),
@@ -185,7 +185,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"noise_size": None}, "noise_size: expected a whole number"),
         ({"noise_size": -1}, "noise_size: expected a whole number"),
         ({"episode_limit": 0}, "episode_limit: expected a whole number"),
-        ({"name": None}, "name: expected a text"),
+        ({"name": None}, "name: expected a string"),
         ({"observation_spec": ()}, "observation_spec: expected a tuple of Quantity"),
         ({"observation_spec": (Quantity("x", "m", 0.0),)}, "x: expected a scale from 1e-12 to 1e.12, got 0"),
         ({"observation_spec": (Quantity("x", "m", 1e13),)}, "x: expected a scale from 1e-12 to 1e.12, got 1e.13"),
@@ -225,8 +225,8 @@ def test_what_breaks_the_contract_is_named(changed: dict[str, Any], words: str) 
         (("x", "m", 1.0, 1.0, -1.0), "x: expected low < high of a Quantity, got 1 and -1"),
         (("x", "m", 1.0, 1.0, np.float32(1)), "x: expected low < high of a Quantity, got 1 and 1"),
         (("x", "m", 1.0, np.nan), "x: expected low < high of a Quantity, got nan and inf"),
-        ((1.0, "m", 1.0), "name of a Quantity: expected a text, got 1.0"),
-        (("x", 1.0, 1.0), "unit of a Quantity: expected a text, got 1.0"),
+        ((1.0, "m", 1.0), "name of a Quantity: expected a string, got 1.0"),
+        (("x", 1.0, 1.0), "unit of a Quantity: expected a string, got 1.0"),
     ],
 )
 def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
@@ -235,7 +235,7 @@ def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
 
 
 def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
-    """The first step leads out of the bounds: it may where it begins after the end, and not as the end itself."""
+    """The first step leaves the bounds, which is allowed after the end of an episode, but not at the end itself."""
     bounded = {"observation_spec": (Quantity("x", "m", 1.0, -1.0, 1.0),), "reset": lambda self, key: At(jnp.float32(1))}
     after_the_end = lambda self, uniforms, state, u: (At(state.x_m + (u > -1)), u, u < 2)  # noqa: E731
     check_robot(slider(**bounded, advance=after_the_end))
@@ -247,18 +247,18 @@ def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
     check_robot(slider(**just_below))
 
 
-def test_a_robot_that_has_no_grid_with_its_parameters_says_so_itself() -> None:
+def test_a_robot_without_a_grid_for_its_parameters_says_why() -> None:
     def without(self: Any) -> Any:
         raise InvalidArgument("gain_m: expected 0.1 or less for an optimal return")
 
     robot = slider(value_grid=without)
     check_robot(robot)
-    assert no_grid(robot) == "gain_m: expected 0.1 or less for an optimal return"
+    assert why_no_grid(robot) == "gain_m: expected 0.1 or less for an optimal return"
 
 
 @pytest.mark.oracle
 @pytest.mark.parametrize("scale", [1e-12, 1e-7, 1e7, 1e12])
-def test_what_is_trained_on_any_scale_that_is_taken_acts(scale: float) -> None:
+def test_policies_trained_on_any_accepted_scale_act(scale: float) -> None:
     # In the unit that the robot is observed in, it moves as far as the scale says.
     robot = slider(
         observation_spec=(Quantity("x", "m", scale),), observe=lambda self, state: jnp.stack([state.x_m * scale])
@@ -304,13 +304,13 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
         (lambda x: x.command, "expected commands, got AttributeError"),
     ],
 )
-def test_mappings_that_give_no_commands_are_named(command: Callable[[Any], Any], words: str) -> None:
+def test_mappings_without_valid_commands_are_named(command: Callable[[Any], Any], words: str) -> None:
     with pytest.raises(InvalidArgument, match=f"^Push.command: {words}"):
         train(training("cartpole", Push(command)), timeline_of(), None)
 
 
 @pytest.mark.parametrize("wanted", [float("nan"), 1.5])
-def test_a_heuristic_s_command_is_one(wanted: float) -> None:
+def test_the_command_of_a_heuristic_is_valid(wanted: float) -> None:
     robot = slider(heuristic=lambda self, observation: 0 * observation[0] + wanted)
     with pytest.raises(InvalidArgument, match=f"Changed.heuristic: expected commands from -1 to 1, got {wanted:g}"):
         check_robot(robot)
@@ -327,17 +327,17 @@ def test_the_rule_takes_the_condition_whose_mean_command_is_the_nearest(wanted: 
     assert rule.act(environment, jnp.zeros((1, 1)), jnp.zeros((1, 1))).tolist() == [nearest]
 
 
-def test_a_grid_that_fails_is_none_with_a_reason() -> None:
+def test_a_grid_that_fails_gives_the_reason() -> None:
     def broken(self: Any) -> Any:
         return 1 / 0
 
     said = "slider.value_grid: expected a Grid, got ZeroDivisionError: division by zero"
-    assert no_grid(slider(value_grid=broken)) == said
+    assert why_no_grid(slider(value_grid=broken)) == said
 
 
 @dataclasses.dataclass(frozen=True)
 class LaterNaN(Slider):
-    """Pays by the root of what is left of ten steps: after these, nothing that is a number."""
+    """Rewards the square root of the remainder of ten steps: NaN after these."""
 
     name: ClassVar[str] = "later"
 
@@ -346,7 +346,7 @@ class LaterNaN(Slider):
 
 
 @pytest.mark.oracle
-def test_a_reward_that_is_no_number_later_is_named() -> None:
+def test_a_reward_that_becomes_nan_later_is_named() -> None:
     with pytest.raises(UnusableData, match="later: expected finite rewards and observations, got NaN or infinite ones"):
         train(training(LaterNaN(), None), None, None)
 

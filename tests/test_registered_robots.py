@@ -54,7 +54,7 @@ ROVER = "my_package.robots:Rover"
 
 @pytest.fixture(autouse=True)
 def forgetting() -> Iterator[None]:
-    """What a test registers and imports is forgotten after it."""
+    """Forget what a test registers and imports."""
     known, loaded = dict(ROBOTS), set(sys.modules)
     forget()
     yield
@@ -65,7 +65,7 @@ def forgetting() -> Iterator[None]:
 
 
 def forget(known: dict[str, type[Robot[Any]]] | None = None) -> None:
-    """As in a process that has imported nothing of the user's."""
+    """Restore the state of a process that has imported nothing of the user's."""
     ours = {kind.name: kind for kind in (TwoLinkArm, Cartpole, Detour, Navigation, Shuttle, SwingUp, Wheels)}
     registry.REGISTRY._registered.clear()
     registry.REGISTRY._registered.update(known or ours)
@@ -75,7 +75,7 @@ def forget(known: dict[str, type[Robot[Any]]] | None = None) -> None:
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A user's package with the robot of the page on robots, in the folder that is worked in."""
+    """A user's package with the robot of the page on robots, in the working folder."""
     (page,) = re.findall(r"```python\n(import .*?class Rover.*?)```", DOCS.read_text(), re.DOTALL)
     (tmp_path / "my_package").mkdir()
     (tmp_path / "my_package" / "__init__.py").touch()
@@ -86,7 +86,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def written(folder: Path, *changes: tuple[str, str]) -> str:
-    """Another module with the rover changed; returns where it is imported from."""
+    """Write another module with the rover changed; returns its import path."""
     text = (folder / "my_package" / "robots.py").read_text()
     for before, after in changes:
         assert before in text
@@ -165,7 +165,7 @@ def test_a_study_leaves_out_what_it_cannot_do_and_says_so(package: Path) -> None
 
 @pytest.mark.oracle
 def test_what_is_registered_in_a_script_is_found_by_its_workers(package: Path) -> None:
-    """A script's own robot, which is `__main__`'s; what it prints is not taken for what a worker tells."""
+    """A script's own robot, in `__main__`; its output is not mistaken for a worker's report."""
     script = """
 from dataclasses import dataclass
 import animat

@@ -42,13 +42,13 @@ def robot(request: pytest.FixtureRequest) -> Robot:
 
 
 def commands_of(robot: Robot, u):
-    """Commands for every readout: of several, the same one or turned round in turns."""
+    """Commands for every readout: for several readouts, alternately u and -u."""
     u = jnp.asarray(u, jnp.float32)
     return u if robot.n_commands == 1 else jnp.stack([u, -u] * robot.n_commands, -1)[..., : robot.n_commands]
 
 
 def play(robot: Robot, policy: str, episodes: int, iterations: int, seed: int = 0):
-    """Observations, rewards and endings of many episodes, (iterations, episodes, ...), going on after an ending."""
+    """Observations, rewards and endings of many episodes, (iterations, episodes, ...), continuing after an ending."""
     rng = np.random.default_rng(seed)
     shape = (iterations, episodes) if robot.n_commands == 1 else (iterations, episodes, robot.n_commands)
     u = {
@@ -132,7 +132,7 @@ def test_no_observation_of_an_episode_passes_the_bounds(robot: Robot, policy: st
 
 @pytest.mark.oracle
 def test_the_episode_limit_is_never_a_termination(robot: Robot) -> None:
-    """The same robot with a limit of one iteration steps as before: the limit is the business of whoever counts."""
+    """The same robot with a limit of one iteration steps as before: the program that counts applies the limit."""
     short = dataclasses.replace(robot, episode_limit=1)
     for policy in ("random", "right"):
         for a, b in zip(play(robot, policy, 20, 50), play(short, policy, 20, 50), strict=True):

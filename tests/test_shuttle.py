@@ -1,4 +1,4 @@
-"""The shuttle, against scipy's solution of its equation, and what can be had with and without its cue."""
+"""The shuttle, against scipy's solution of its equation, and returns with and without its cue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Swing-up, against scipy's solution of its equation, Gymnasium's pendulum, its energy, and what can be had at all."""
+"""Swing-up, against scipy's solution of its equation, Gymnasium's pendulum, its energy, and the optimal return."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_it_starts_hanging_at_rest() -> None:
 
 
 def test_a_swing_is_the_solution_of_its_equation() -> None:
-    """Two seconds of random commands; the largest speed is not reached, which would be another equation."""
+    """Two seconds of random commands, without reaching the speed limit, where another equation applies."""
     u = np.random.default_rng(1).uniform(-1, 1, 40)
     states, _, _ = path(SwingUp(), (2.5, 1.0), u)
     expected = solved((2.5, 1.0), u, 0.05)
@@ -131,7 +131,7 @@ def test_it_never_turns_faster_than_its_limit() -> None:
     np.testing.assert_allclose(np.linalg.norm([np.cos(states[:, 0]), np.sin(states[:, 0])], axis=0), 1)
 
 
-def test_a_motor_that_needs_no_swing_is_told_and_too_long_a_step_refused() -> None:
+def test_a_motor_that_needs_no_swing_is_reported_and_too_long_a_step_refused() -> None:
     assert SwingUp().caveats() == () and SwingUp(torque_n_m=4.9).caveats() == ()
     (message,) = SwingUp(torque_n_m=5.0).caveats()
     assert message.startswith("swing-up: with torque_n_m = 5 the motor lifts the pendulum directly (from 5 N m on)")
@@ -165,7 +165,7 @@ def test_a_state_is_where_its_coordinates_are() -> None:
 
 
 @pytest.mark.oracle
-def test_the_optimum_is_no_less_than_the_heuristic_and_can_be_had() -> None:
+def test_the_optimum_is_at_least_the_heuristic_and_is_achieved() -> None:
     environment = WithoutNeurons(SwingUp(), (-1.0, 1.0))
     found = best_return(environment, None, resolution=0.5, episodes=2)
     by_rule = roll_out(environment, None, heuristic_policy(environment, None), 1, episodes=2, seed=1).returns.mean()

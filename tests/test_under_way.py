@@ -94,9 +94,9 @@ def test_the_page_shows_a_recording_as_far_as_it_is(tmp_path: Path, monkeypatch:
     # After the second block of each, when there is a file of the first.
     begun, of_the_next = looking.seen
     assert begun["state"] == "running"
-    assert facts(begun, "Recordings")["shown"] == "the one under way, as far as it is"
+    assert facts(begun, "Recordings")["shown"] == "the one in progress, as far as it has come"
     assert facts(begun, "Recordings")["stimuli"] == 30
-    assert str(begun["message"]).endswith("s of the one under way are shown")
+    assert str(begun["message"]).endswith("s of the one in progress are shown")
     assert 0 < begun["end_s"] < series[0].duration_s
     assert facts(of_the_next, "Recordings")["complete"] == 1
     # Beside what is known of the next is the one before.

@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def whole(view: SessionView, **asked: Any) -> dict[str, Any]:
-    """A view once everything is counted."""
+    """The view when everything is counted."""
     while True:
         found = view.view(asked.get("to_s"), asked.get("span_s", 60.0))
         if found["summed"] == 1 and found["is_found"]:
@@ -62,7 +62,7 @@ def test_the_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
     assert found["state"] == "ended"
 
 
-def test_what_it_came_to_is_what_the_session_says(folder: Path) -> None:
+def test_totals_are_those_of_the_session(folder: Path) -> None:
     found, session = whole(SessionView(folder)), read_session(folder)
     outline = session.outline
     assert (found["pulses"], found["bursts"], found["late"]) == (outline.pulses, outline.bursts, outline.late)
@@ -81,7 +81,7 @@ def test_what_it_came_to_is_what_the_session_says(folder: Path) -> None:
     assert on.count(int(found["fullest"][0])) == found["fullest"][1]
 
 
-def test_spikes_are_where_the_log_has_them(folder: Path) -> None:
+def test_spikes_are_those_of_the_log(folder: Path) -> None:
     recording = read_session(folder).recording()
     to_s = 0.6 * recording.duration_s
     found = SessionView(folder).view(to_s, 1.0)
@@ -142,14 +142,14 @@ def test_a_record_that_is_just_being_written_is_waited_for(folder: Path, tmp_pat
     assert view.tail.generation == 0
 
 
-def test_a_killed_session_is_said_to_be_one(folder: Path, tmp_path: Path) -> None:
+def test_a_killed_session_is_reported(folder: Path, tmp_path: Path) -> None:
     (tmp_path / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes()[:-400])
     old_s = time.time() - 100
     os.utime(tmp_path / LOG_FILE, (old_s, old_s))
     found = whole(SessionView(tmp_path))
     assert found["state"] == "silent"
     assert "it was killed, or it hangs" in found["message"]
-    assert "cut off" in found["damage"]
+    assert "of a truncated one" in found["damage"]
 
 
 def test_what_follows_damage_is_not_shown(folder: Path, tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_what_follows_damage_is_not_shown(folder: Path, tmp_path: Path) -> None:
     assert "damaged" in found["damage"]
 
 
-def test_another_log_in_its_place_is_begun_anew(folder: Path, tmp_path: Path) -> None:
+def test_a_replaced_log_is_read_from_the_start(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / LOG_FILE
     path.write_bytes((folder / LOG_FILE).read_bytes())
     view = SessionView(tmp_path)
@@ -178,7 +178,7 @@ def test_another_log_in_its_place_is_begun_anew(folder: Path, tmp_path: Path) ->
     assert "another" in view.about()["title"]
 
 
-def test_returns_that_were_predicted_stand_beside(folder: Path, tmp_path: Path) -> None:
+def test_predicted_returns_are_shown_with_the_measured_ones(folder: Path, tmp_path: Path) -> None:
     log = read_log(folder / LOG_FILE)
 
     def shown(predicted: Any) -> dict[str, Any]:
@@ -212,7 +212,7 @@ def test_stop_makes_the_file_that_the_loop_looks_for(folder: Path, tmp_path: Pat
 def test_stop_does_not_follow_a_link(folder: Path, tmp_path: Path) -> None:
     LogWriter(tmp_path / "in" / LOG_FILE, read_log(folder / LOG_FILE).header).close()
     (tmp_path / "in" / STOP_FILE).symlink_to(tmp_path / "outside")
-    with pytest.raises(InvalidFile, match="STOP: cannot be made"):
+    with pytest.raises(InvalidFile, match="STOP: cannot be created"):
         stop_session(tmp_path / "in")
     assert not (tmp_path / "outside").exists()
 
@@ -223,7 +223,7 @@ def test_a_log_that_is_a_link_is_not_followed(folder: Path, tmp_path: Path) -> N
         SessionView(tmp_path).about()
 
 
-def test_what_is_there_is_found_a_slice_at_a_time(folder: Path, tmp_path: Path) -> None:
+def test_records_are_found_a_slice_at_a_time(folder: Path, tmp_path: Path) -> None:
     log = read_log(folder / LOG_FILE)
     writer = LogWriter(tmp_path / LOG_FILE, log.header)
     for _ in range(3000):
@@ -246,7 +246,7 @@ def test_a_view_is_plain_finite_json(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 400, 401, 5_000])
-def test_of_thousands_of_thresholds_those_of_the_span_come_all(n: int) -> None:
+def test_thousands_of_thresholds_are_thinned_except_in_the_span(n: int) -> None:
     rows: list[tuple[float, list[float | None]]] = [(float(at), [1.0]) for at in range(n)]
     thinned = _in_force(rows, [])
     steps = {later[0] - earlier[0] for earlier, later in itertools.pairwise(thinned[:-1])}

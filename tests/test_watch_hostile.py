@@ -1,4 +1,4 @@
-"""Whatever a log or a folder holds, the page shows it as plain text or says in a line why it cannot."""
+"""Whatever a log or a folder contains, the page shows it as plain text or reports in one line why it cannot."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ HOSTILE = (
 
 
 def anything(draw: Random) -> Any:
-    """What a damaged file may say in place of anything."""
+    """A value that a damaged file may contain in place of any other."""
     number = draw.choice([0, -1, 3, 10**30, -(10**30), 1e300, 1e-320, 0.5, math.nan, math.inf, -math.inf])
     return draw.choice(
         [None, True, False, number, draw.choice(HOSTILE), [], {}, [number, None], {"a": number}, [[number]]]
@@ -43,7 +43,7 @@ def anything(draw: Random) -> Any:
 
 
 def seeds(n: int) -> Any:
-    """As many cases, each from its own random numbers."""
+    """This many cases, each with its own random numbers."""
     checks = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 
     def with_seeds(test: Any) -> Any:
@@ -81,7 +81,7 @@ def written(path: Path, records: list[Any]) -> None:
 
 
 def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Where something else could stand."""
+    """Places where something else could be."""
     inner = value.items() if isinstance(value, dict) else enumerate(value[:3]) if isinstance(value, list) else ()
     return [at, *(place for name, each in inner for place in places(each, (*at, name)))]
 
@@ -98,9 +98,9 @@ def looked_at(folder: Path) -> None:
     """Every view of a session gives plain finite text, or a line that names the file."""
     view = SessionView(folder)
     try:
-        told = [view.about(), *(view.view(to_s, 30.0) for to_s in (None, 0.5, -1.0))]
-        json.dumps(told, allow_nan=False).encode()
-        picture = told[1]["picture"]
+        contents = [view.about(), *(view.view(to_s, 30.0) for to_s in (None, 0.5, -1.0))]
+        json.dumps(contents, allow_nan=False).encode()
+        picture = contents[1]["picture"]
         if picture is not None and (tick := view.tick_at(picture)) is not None:
             drawn = picture_of(view.robot_data, *tick)
             assert drawn is None or drawn.startswith(b"\x89PNG")
@@ -112,7 +112,7 @@ def looked_at(folder: Path) -> None:
 
 @pytest.mark.oracle
 @seeds(120)
-def test_records_that_say_anything(records: list[Any], tmp_path: Path, seed: int) -> None:
+def test_records_with_anything_in_them(records: list[Any], tmp_path: Path, seed: int) -> None:
     draw = Random(seed)
     number = draw.choice([0, draw.randrange(len(records))])
     words, spikes, n = records[number]
@@ -134,7 +134,7 @@ def test_logs_with_damaged_bytes(folder: Path, tmp_path: Path, seed: int) -> Non
 
 
 @seeds(40)
-def test_spikes_that_cannot_be(records: list[Any], tmp_path: Path, seed: int) -> None:
+def test_impossible_spikes(records: list[Any], tmp_path: Path, seed: int) -> None:
     draw = Random(seed)
     number, n = draw.randrange(1, len(records)), draw.randint(0, 5)
     spikes = draw.randbytes(12 * n)
@@ -155,7 +155,7 @@ TRIAL = {"trial": 0, "settings": {"discount": 0.9}, "state": "complete", "chunks
 
 
 @seeds(60)
-def test_folders_that_say_anything(tmp_path: Path, seed: int) -> None:
+def test_folders_with_anything_in_them(tmp_path: Path, seed: int) -> None:
     draw = Random(seed)
     kind, name, words = draw.choice(
         [(TrainingView, "training.json", TRAINING), (StudyView, "study.json", STUDY), (TuningView, "tune.json", TUNING)]
@@ -163,9 +163,9 @@ def test_folders_that_say_anything(tmp_path: Path, seed: int) -> None:
     (tmp_path / name).write_text(json.dumps(changed(words, draw.choice(places(words)), anything(draw))))
     trial = changed(TRIAL, draw.choice(places(TRIAL)), anything(draw))
     (tmp_path / "journal.jsonl").write_text(json.dumps(trial) + "\nno JSON\n")
-    told = tmp_path / ".unfinished" / ".told"
-    told.mkdir(parents=True, exist_ok=True)
-    (told / "p0 to p1.json").write_text(json.dumps([anything(draw), anything(draw)]))
+    notices = tmp_path / ".unfinished" / ".told"
+    notices.mkdir(parents=True, exist_ok=True)
+    (notices / "p0 to p1.json").write_text(json.dumps([anything(draw), anything(draw)]))
     for file in (".unfinished/from-p0.npz", "p0.safetensors", "jobs/x.json"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_bytes(draw.randbytes(draw.choice([0, 9, 60])))

@@ -1,4 +1,4 @@
-"""The page beside what runs: Stop ends a session, and a server of its own shows it in a browser."""
+"""The page next to a running command: Stop ends a session, and a separate server shows it in a browser."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from animat.watch.session import SessionView
 
 @contextlib.contextmanager
 def running(folder: Path) -> Iterator[list[Session]]:
-    """A session in real time in another thread; what it came to is in the list in the end."""
+    """Run a session in real time in another thread; the list receives its result."""
     ended: list[Session] = []
     loop = threading.Thread(target=lambda: ended.append(session_in(folder, episodes=500, real_time=True)))
     loop.start()
@@ -47,7 +47,7 @@ def running(folder: Path) -> Iterator[list[Session]]:
 
 
 def wait_for(what: Any) -> Any:
-    """What is true at last."""
+    """Wait until a condition is true; returns it."""
     for _ in range(600):
         if found := what():
             return found
@@ -89,7 +89,7 @@ def test_a_command_that_is_refused_leaves_no_server(tmp_path: Path) -> None:
     assert not servers()
 
 
-def test_a_server_that_does_not_start_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_does_not_start_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", shutil.which("false"))
     with pytest.raises(AnimatError, match="the page's server did not start"), watching(tmp_path):
         pass
@@ -102,7 +102,7 @@ def http(address: str) -> Any:
 
 
 def servers() -> list[int]:
-    """The page's servers that this process started, by their numbers."""
+    """Process ids of the page's servers that this process started."""
     found = []
     for each in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
@@ -164,11 +164,11 @@ def test_a_session_is_watched_and_stopped_in_a_browser(tmp_path: Path, browser: 
         with (folder / "ticks.csv").open(newline="") as file:
             *_, row = csv.DictReader(file)
         wait_for(lambda: said("#now dd").replace(",", "") == row["tick"])
-        told = browser.execute_script(
+        values = browser.execute_script(
             "return [...document.querySelectorAll('#now dd')].map((each) => each.textContent)"
         )
         numbers = [
-            float(each.replace("\u2212", "-").replace(",", "")) for each in (told[1][:-2], told[5].split(" ")[0])
+            float(each.replace("\u2212", "-").replace(",", "")) for each in (values[1][:-2], values[5].split(" ")[0])
         ]
         assert numbers == pytest.approx([float(row["time_s"]), float(row["rate_hz"])], rel=1e-5)
         assert not [line for line in browser.get_log("browser") if "favicon" not in line["message"]]
@@ -195,7 +195,7 @@ def test_with_the_server_killed_the_page_says_how_to_stop_a_session(tmp_path: Pa
 
 
 def assert_no_more_pulses(folder: Path, ended: list[Session]) -> None:
-    """From the next tick on, of a session in whose folder STOP is being made."""
+    """Assert that only ticks under way follow once STOP is in the session's folder."""
     wait_for(lambda: ended or (folder / STOP_FILE).exists())
     before = SessionView(folder).view(None, 60.0)["n_ticks"]
     wait_for(lambda: ended)

@@ -1,4 +1,4 @@
-"""The page's server answers this machine alone, by the address with the token, and nothing outside of the folder."""
+"""The page's server answers only this machine, at the address with the token, and serves nothing outside the folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
 from animat.training.folder import MANIFEST as TRAINING
 from animat.tuning.run import MANIFEST as TUNING
-from animat.watch.found import _MARKS, find
+from animat.watch.discovery import _MARKS, find
 from watching import OWN, PORT, TOKEN, asked, session_in
 
 pytest.importorskip("starlette", reason="the extra [watch] is not installed")
@@ -38,7 +38,7 @@ def app(folder: Path) -> Any:
     return app_for(folder / "in", TOKEN, PORT)
 
 
-def test_the_page_and_its_files_come_from_here(app: Any) -> None:
+def test_the_page_and_its_files_are_served(app: Any) -> None:
     page = asked(app, "")
     assert page.status == 200
     assert page.headers["content-type"].startswith("text/html")
@@ -65,7 +65,7 @@ def test_every_answer_has_the_strict_policy(app: Any) -> None:
         assert "access-control-allow-origin" not in answer.headers
 
 
-def test_a_session_is_seen(app: Any) -> None:
+def test_a_session_is_shown(app: Any) -> None:
     (thing,) = asked(app, "things").json["things"]
     assert (thing["kind"], thing["place"]) == ("session", "session")
     about = asked(app, "about", kind="session", **{"in": "session"}).json
@@ -101,7 +101,7 @@ def test_a_session_is_seen(app: Any) -> None:
     ],
     ids=str,
 )
-def test_whoever_else_asks_is_refused(app: Any, folder: Path, wrong: dict[str, Any]) -> None:
+def test_requests_from_elsewhere_are_refused(app: Any, folder: Path, wrong: dict[str, Any]) -> None:
     for path, method in (("", "GET"), ("things", "GET"), ("stop?in=session", "POST")):
         answer = asked(app, path, method=method, **{"origin": OWN if method == "POST" else None, **wrong})
         assert answer.status == 403
@@ -131,7 +131,7 @@ def test_a_path_outside_of_the_folder_is_refused(app: Any, folder: Path, place: 
     for path in ("about", "view"):
         answer = asked(app, path, kind="session", **{"in": place})
         assert answer.status == 409
-        assert "expected a folder below the one that is watched" in answer.json["error"]
+        assert "expected a folder inside the watched one" in answer.json["error"]
     assert asked(app, "stop", method="POST", origin=OWN, **{"in": place}).status == 409
     assert not (folder / "outside" / STOP_FILE).exists()
     assert [each.place for each in find(folder / "in")] == ["session"]
@@ -165,7 +165,7 @@ def test_nothing_but_stop_changes_anything(app: Any, folder: Path) -> None:
     assert state() == before
 
 
-def test_what_is_asked_for_wrongly_is_said(app: Any) -> None:
+def test_wrong_requests_are_reported(app: Any) -> None:
     for query in ({"span": "x"}, {"span": "nan"}, {"span": "1e9"}, {"to": "1e99"}, {"kind": "other"}):
         answer = asked(app, "view", **{"kind": "session", "in": "session", **query})
         assert answer.status == 409
@@ -173,7 +173,7 @@ def test_what_is_asked_for_wrongly_is_said(app: Any) -> None:
     assert asked(app, "robot.png", at="-5", **{"in": "session"}).status == 409
 
 
-def test_the_folder_that_one_stands_in_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_working_folder_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").mkdir()
     monkeypatch.chdir(tmp_path / "mine")
     assert asked(app_for(Path(), TOKEN, PORT), "things").json["folder"] == "mine"
@@ -186,7 +186,7 @@ def test_an_empty_folder_says_so_and_is_looked_at_again(tmp_path: Path) -> None:
     assert [each["place"] for each in asked(app, "things").json["things"]] == [""]
 
 
-def test_folders_are_known_by_the_files_that_are_written() -> None:
+def test_folders_are_identified_by_the_files_that_are_written() -> None:
     assert dict(_MARKS) == {
         "session": LOG_FILE,
         "training": TRAINING,
@@ -217,7 +217,7 @@ def test_the_command_says_what_is_wrong(
     assert main(["watch", str(tmp_path / "none")]) == 1
     assert "expected a folder to watch, got none" in capsys.readouterr().err
     assert main(["watch", str(tmp_path), "--port", "70000"]) == 1
-    assert "--port: expected one from 1 to 65,535 that is free" in capsys.readouterr().err
+    assert "--port: expected a free port from 1 to 65,535" in capsys.readouterr().err
     monkeypatch.setattr("animat.watch.serving.find_spec", lambda name: None)
     assert main(["watch", str(tmp_path)]) == 1
     assert "pip install 'animat[watch]'" in capsys.readouterr().err

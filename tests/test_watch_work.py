@@ -1,4 +1,4 @@
-"""What the page shows of trainings, studies, tunings and recordings is what their folders hold."""
+"""The page shows trainings, studies, tunings and recordings as they are in their folders."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
 from animat.watch.cultures import CulturesView
-from animat.watch.held import is_held
 from animat.watch.recording import RecordingView
+from animat.watch.state import is_locked
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
@@ -50,8 +50,8 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     }  # fmt: skip
     manifest = {"training": training, "simulators": {"recorded_at_min": [0.0, 10.0, 15.0]}}
     (tmp_path / "training.json").write_text(json.dumps(manifest))
-    told = tmp_path / ".unfinished" / ".told"
-    told.mkdir(parents=True)
+    notices = tmp_path / ".unfinished" / ".told"
+    notices.mkdir(parents=True)
     curve = np.zeros((30, 2, 6))
     curve[:, :, 0] = 100.0 * np.arange(1, 31)[:, None]
     curve[:, :, 2] = np.arange(30)[:, None] + [0.0, 10.0]
@@ -59,7 +59,7 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     curve[:, :, 3] = 1.0 + np.arange(30)[:, None] + [0.0, 1.0]
     curve[:, :, 4:] = [0.25, 0.5]
     np.savez(tmp_path / ".unfinished" / "from-p0.npz", curve=curve, members=np.arange(2), done=np.array(30))
-    (told / "p0 to p1.json").write_text(json.dumps([0.55, "return 31.0"]))
+    (notices / "p0 to p1.json").write_text(json.dumps([0.55, "return 31.0"]))
     with exclusive_lock(tmp_path):
         found = TrainingView(tmp_path).view(None, 8.0)
         assert found["state"] == "running"
@@ -74,8 +74,12 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     assert (
         "Not known: random actions, best coupling, optimal return. To show them, run animat evaluate" in chart["words"]
     )
-    told = {"rows": [{"name": "random", "mean_return": -2.5}], "optimum": {"value": 50.0}, "recorded_at_min": 15.0}
-    (tmp_path / "evaluation.json").write_text(json.dumps(told))
+    evaluation = {
+        "rows": [{"name": "random", "mean_return": -2.5}],
+        "optimum": {"value": 50.0},
+        "recorded_at_min": 15.0,
+    }
+    (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
     with_lines = block(TrainingView(tmp_path).view(None, 8.0), "Learning curves")
     assert [(each["name"], each["x"], each["y"]) for each in with_lines["series"] if each["style"] == "dashed"] == [
         ("random actions", [0.0, 6000.0], [-2.5, -2.5]),
@@ -116,26 +120,26 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
 
 
 def planned_in(folder: Path, jobs: Sequence[Job]) -> None:
-    """As jobs leave it that are run."""
+    """Write the plan of the jobs, as a running study does."""
     (folder / ".unfinished").mkdir(exist_ok=True)
     (folder / ".unfinished" / PLANNED).write_text(json.dumps({job.name: job.cost_s for job in jobs}))
 
 
-def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
+def test_a_study_shows_jobs_done_running_and_waiting(tmp_path: Path) -> None:
     (tmp_path / "study.json").write_text(json.dumps({"study": {"robots": [{"name": "navigation"}]}}))
     planned = plan_study(read_study(TINY), tmp_path)
     jobs = [job.name for job in planned]
     for job in jobs[:2]:
         Receipt(job, "x", {}, {"a": "b", "c": "d"}).save(tmp_path / "jobs")
-    told = tmp_path / ".unfinished" / ".told"
-    told.mkdir(parents=True)
+    notices = tmp_path / ".unfinished" / ".told"
+    notices.mkdir(parents=True)
     # As a version before this one left it.
     before = StudyView(tmp_path).view(None, 8.0)
     assert (before["state"], facts(before, "Jobs")["waiting"]) == ("silent", "not known")
     planned_in(tmp_path, planned)
-    (told / f"{jobs[2].replace('/', '+')}.json").write_text('[0.25, "a remark"]')
+    (notices / f"{jobs[2].replace('/', '+')}.json").write_text('[0.25, "a remark"]')
     # Of a job that is done by now.
-    (told / f"{jobs[0].replace('/', '+')}.json").write_text('[1.0, ""]')
+    (notices / f"{jobs[0].replace('/', '+')}.json").write_text('[1.0, ""]')
     with exclusive_lock(tmp_path):
         found = StudyView(tmp_path).view(None, 8.0)
     rows = facts(found, "Jobs")
@@ -157,7 +161,7 @@ def test_a_study_says_what_is_done_runs_and_waits(tmp_path: Path) -> None:
     assert (ended["state"], facts(ended, "Jobs")["waiting"]) == ("ended", 0)
 
 
-def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_path: Path) -> None:
+def test_a_study_over_cultures_shows_progress_and_comparisons_so_far(tmp_path: Path) -> None:
     names = [f"culture-{seed}" for seed in range(1, 6)]
     (tmp_path / "cultures.json").write_text(json.dumps({"cultures": [*names, "../elsewhere", 3]}))
     for name, means in zip(names[:3], ((1.0, 4.0), (2.0, 3.0), (6.0, 5.0)), strict=True):
@@ -183,12 +187,12 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (tmp_path / "culture-9").symlink_to(elsewhere)
-    told = {"cultures": [*names, "culture-9"], "failed": {names[4]: "no responses", "../x": "y"}}
-    (tmp_path / "cultures.json").write_text(json.dumps(told))
+    manifest = {"cultures": [*names, "culture-9"], "failed": {names[4]: "no responses", "../x": "y"}}
+    (tmp_path / "cultures.json").write_text(json.dumps(manifest))
     assert view.about()["title"] == "study over 5 cultures"
     failed = view.view(None, 8.0)
     assert (failed["state"], facts(failed, "Cultures")["failed"]) == ("ended", 1)
-    assert failed["message"] == "1 of the cultures failed; start it again and it continues"
+    assert failed["message"] == "1 of the cultures failed; start the study again and it continues"
     assert block(failed, "Failed")["rows"] == [[names[4], "no responses"]]
     for damage in (b"comparison,robot,mean_first,mean_second\na and b,arm,nan,4", b"\xff\x00", b"comparison\nx"):
         (tmp_path / names[0] / "tables" / "comparisons.csv").write_bytes(damage)
@@ -200,7 +204,7 @@ def test_a_study_over_cultures_says_how_far_each_is_and_what_holds_so_far(tmp_pa
         view.view(None, 8.0)
 
 
-def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -> None:
+def test_the_context_study_shows_progress_and_results(tmp_path: Path) -> None:
     study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
     words = {"context study": asdict(study), "versions": {}, "fingerprint": "x"}
     (tmp_path / "study.json").write_text(json.dumps(words))
@@ -219,15 +223,15 @@ def test_the_context_study_says_what_is_done_and_what_it_found(tmp_path: Path) -
     assert block(found, "Results")["rows"] == [["shuttle", "policies, culture-2", 61.5, 4, 400]]
 
 
-def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
+def test_a_tuning_shows_its_journal(tmp_path: Path) -> None:
     tune = {"trials": 5, "together": 3, "rungs": 3}
     (tmp_path / "tune.json").write_text(json.dumps({"tune": tune, "study": {"robots": [{"name": "arm"}]}}))
-    told = [
+    trials = [
         {"trial": 0, "settings": {"discount": 0.98765}, "state": "complete", "returns": [[1.0, 2.0], [3.0, 5.0]]},
         {"trial": 1, "settings": {"discount": 0.9}, "state": "stopped", "returns": [[50.0, 60.0]]},
         {"trial": 2, "settings": {"discount": 0.8}, "state": "diverged", "returns": []},
     ]
-    (tmp_path / "journal.jsonl").write_text("".join(json.dumps(each) + "\n" for each in told))
+    (tmp_path / "journal.jsonl").write_text("".join(json.dumps(each) + "\n" for each in trials))
     found = TuningView(tmp_path).view(None, 8.0)
     rows = facts(found, "Trials")
     assert rows["trials done"] == "3 of 5"
@@ -266,7 +270,7 @@ def test_a_tuning_is_its_journal(tmp_path: Path) -> None:
     assert "Running" not in [each["title"] for each in found["blocks"]]
 
 
-def test_recordings_are_inspected_one_after_the_other(tmp_path: Path) -> None:
+def test_recordings_are_inspected_one_after_another(tmp_path: Path) -> None:
     view = RecordingView(tmp_path)
     with pytest.raises(InvalidFile, match="expected recordings"):
         view.view(None, 8.0)
@@ -289,8 +293,8 @@ def test_recordings_are_inspected_one_after_the_other(tmp_path: Path) -> None:
     assert [row[1] for row in block(found, "Findings")["rows"]] == [each.message for each in inspected[1].findings]
 
 
-def test_a_folder_is_held_while_a_run_has_locked_it(tmp_path: Path) -> None:
-    assert not is_held(tmp_path)
+def test_a_folder_is_locked_during_a_run(tmp_path: Path) -> None:
+    assert not is_locked(tmp_path)
     with exclusive_lock(tmp_path):
-        assert is_held(tmp_path)
-    assert not is_held(tmp_path)
+        assert is_locked(tmp_path)
+    assert not is_locked(tmp_path)

@@ -53,7 +53,7 @@ def observed(robot: Wheels, x: float, y: float, heading: float, goal=(0.9, 0.9))
 observe = jax.jit(Wheels.observe, static_argnums=0)
 
 
-def test_alike_wheels_drive_straight_and_opposite_ones_turn_on_the_spot() -> None:
+def test_equal_wheels_drive_straight_and_opposite_ones_turn_on_the_spot() -> None:
     states, _, _ = path(ROOM, (0, 0, 0.3), np.ones((10, 2)))
     ahead = 0.026 * np.arange(1, 11)
     np.testing.assert_allclose(states[:, 0] + 1j * states[:, 1], ahead * np.exp(0.3j), atol=1e-12)
@@ -90,7 +90,7 @@ def test_a_drive_is_that_of_wheels_that_roll_in_small_steps() -> None:
 
 
 def marched(robot: Wheels, x: float, y: float, angle: float) -> float:
-    """What a sensor shows, by going along its ray in steps of 0.05 mm until something is crossed or entered."""
+    """A sensor's reading, by following its ray in steps of 0.05 mm until something is crossed or entered."""
     step = 5e-5
     t = np.arange(0, robot.body_radius_m + robot.sensor_range_m + step, step)
     points = np.stack([x + t * math.cos(angle), y + t * math.sin(angle)], axis=1)
@@ -181,7 +181,7 @@ def test_the_reward_is_the_goal_or_the_cost_of_the_distance() -> None:
 
 
 def test_goals_are_drawn_from_all_places_that_can_be_reached_and_from_no_other() -> None:
-    """The right part of the room is shut off by a wall; of the left one a flood by hand finds every place."""
+    """A wall shuts off the right part of the room; a flood fill finds every place in the left part."""
     robot = Wheels(walls=(*Wheels().walls, (0.6, 0.0, 0.6, 1.0)))
     states = jax.jit(jax.vmap(robot.reset))(jax.random.split(jax.random.key(0), 5000))
     around = Surroundings(robot.walls, robot.obstacles)
@@ -207,12 +207,12 @@ def test_goals_are_drawn_from_all_places_that_can_be_reached_and_from_no_other()
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"start_x_m": 0.3, "start_y_m": 0.3}, "start_x_m, start_y_m: expected a place between the walls"),
-        ({"start_x_m": 3.0}, "start_x_m, start_y_m: expected a place between the walls"),
-        ({"obstacles": (), "walls": ()}, "start_x_m, start_y_m: expected a place between the walls"),
+        ({"start_x_m": 0.3, "start_y_m": 0.3}, "start_x_m, start_y_m: expected a place within the walls"),
+        ({"start_x_m": 3.0}, "start_x_m, start_y_m: expected a place within the walls"),
+        ({"obstacles": (), "walls": ()}, "start_x_m, start_y_m: expected a place within the walls"),
         ({"walls": FAR}, r"in at most 196 m\^2"),
-        ({"walls": Wheels().walls[:3]}, "walls: expected them all around the robot, got a gap"),
-        ({"walls": (*Wheels().walls[:3], (0.0, 1.0, 0.0, 0.1))}, "walls: expected them all around the robot"),
+        ({"walls": Wheels().walls[:3]}, "walls: expected walls all around the robot, got a gap"),
+        ({"walls": (*Wheels().walls[:3], (0.0, 1.0, 0.0, 0.1))}, "walls: expected walls all around the robot"),
         ({"step_s": 0.3}, "step_s: expected at most 0.269 at this speed, got 0.3"),
         ({"walls": ((0.0, 0.0, 1.0),)}, "walls: expected to be given, got nothing|walls: expected at least 4"),
         ({"obstacles": ((0.0, 0.0, -1.0),)}, "obstacles: expected at least 1e-09, got -1"),

@@ -1,4 +1,4 @@
-"""What tests of the page share: sessions, and requests to it without a server."""
+"""Helpers of the page's tests: sessions, and requests without a server."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OWN = f"http://127.0.0.1:{PORT}"
 
 
 def session_in(folder: Path, *, episodes: int = 2, **settings: Any) -> Session:
-    """A session of some seconds, of six iterations an episode."""
+    """A session of some seconds, with six iterations per episode."""
     loop = Loop(
         robot=Navigation(episode_limit=6),
         mapping=Thresholds(9),
@@ -38,7 +38,7 @@ def session_in(folder: Path, *, episodes: int = 2, **settings: Any) -> Session:
 
 
 class Answer(NamedTuple):
-    """What came back."""
+    """A response."""
 
     status: int
     headers: dict[str, str]
@@ -60,7 +60,7 @@ def asked(
     raw: str | None = None,
     **query: Any,
 ) -> Answer:
-    """Ask an application for something, as a server would."""
+    """Send a request to an application, as a server would."""
     headers = [(b"host", host.encode())] if host is not None else []
     headers += [(b"origin", origin.encode())] if origin is not None else []
     full = f"/{token}/{path}" if raw is None else raw

@@ -118,7 +118,7 @@ class HostRunner:
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
         """As in `Runner`."""
-        self._bodies.take_seeds([(self._entropy, number)])
+        self._bodies.reseed([(self._entropy, number)])
         return np.asarray(self._bodies.begin()[0], np.float64)
 
     def step(self, u: ArrayLike) -> Moved:

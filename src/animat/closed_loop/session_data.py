@@ -15,8 +15,8 @@ from animat.closed_loop.outline import Outline
 from animat.closed_loop.tick import Ending
 from animat.errors import AnimatError, InvalidFile
 from animat.recordings.formats.nwb_spikes import SpikeCounts
-from animat.recordings.recording import Recording
 from animat.recordings.metadata import from_metadata
+from animat.recordings.recording import Recording
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
 

@@ -155,7 +155,7 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
     bodies: Bodies | None = getattr(_LAST, "bodies", None)
     if bodies is None or not robot.keeps_state or (bodies.robot, len(bodies)) != (robot, len(seeds)):
         bodies = _LAST.bodies = Bodies(robot, seeds)
-    bodies.take_seeds(seeds)
+    bodies.reseed(seeds)
     return bodies
 
 

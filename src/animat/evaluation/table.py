@@ -22,7 +22,7 @@ from animat.evaluation.row import Row
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
 from animat.goals.robot import objectives_of
-from animat.goals.tally import MEANS, cells_of, told_satisfaction
+from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
@@ -163,7 +163,7 @@ class Evaluation:
         if cost:
             lines.append(f"  electrode pulses: per episode; net return: mean return - {cost:g} x electrode pulses")
         if self.objectives:
-            lines.append(f"  {told_satisfaction(self.objectives, self.rows[0].met)}")
+            lines.append(f"  {satisfaction_line(self.objectives, self.rows[0].met)}")
         if self.verdict is not None:
             lines.append(f"  {self.verdict}")
         if self.not_met:

@@ -1,1 +1,1 @@
-"""What is wanted of a robot, as data: regions of its quantities, and the reward and the ends that follow from them."""
+"""Goals of a robot as data: regions of its quantities, and the rewards and ends of episodes that follow from them."""

@@ -1,4 +1,4 @@
-"""What is wanted of a robot: objectives over its quantities, weighted."""
+"""A goal: weighted objectives over a robot's quantities."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ KINDS: tuple[str, ...] = get_args(Kind)
 
 @record
 class Objective:
-    """One thing that is wanted, or not.
+    """One thing to achieve or to avoid.
 
     Attributes:
         kind: `"avoid"`: entering the region ends an episode as failed. `"reach"`: entering it ends one as succeeded,
             the sooner the better. `"drive"`: get there and stay. `"minimize"`, `"maximize"`: push a quantity below or
-            above a threshold, and on.
-        region: where: all of its parts at once.
-        weight: beside the other objectives; only the ratios of weights matter.
-        within: of `"drive"`: with more than so many iterations outside in a row, the start included, an episode ends as
-            failed; None: it does not.
+            above a threshold, and further.
+        region: the intersection of its parts.
+        weight: relative to the other objectives; only the ratios of weights matter.
+        within: for `"drive"`: more consecutive iterations outside than this, the start included, end an episode as
+            failed; None: they do not.
 
     Raises:
-        InvalidArgument: naming what was expected and what came.
+        InvalidArgument: naming what was expected and what was given.
     """
 
     kind: Kind
@@ -39,11 +39,11 @@ class Objective:
 
     def __post_init__(self) -> None:
         if self.within is not None and self.kind != "drive":
-            raise InvalidArgument(f"within: expected it of drive only, got it of {self.kind}")
+            raise InvalidArgument(f"within: expected it for drive only, got it for {self.kind}")
         relation = {"minimize": "below", "maximize": "above"}.get(self.kind)
         if relation and [getattr(part, "relation", "around") for part in self.region] != [relation]:
-            told = " and ".join(map(str, self.region))
-            raise InvalidArgument(f"{self.kind}: expected one quantity {relation} a threshold, got {told}")
+            region = " and ".join(map(str, self.region))
+            raise InvalidArgument(f"{self.kind}: expected one quantity {relation} a threshold, got {region}")
 
     def __str__(self) -> str:
         text = f"{self.kind} {' and '.join(map(str, self.region))}"
@@ -58,11 +58,7 @@ class Objective:
 
 @record
 class Goal:
-    """Objectives that hold together.
-
-    Attributes:
-        objectives: at least one.
-    """
+    """At least one objective; they all apply together."""
 
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1, max_length=50)]
 

@@ -1,4 +1,4 @@
-"""A goal as text, as the command line and files have it: `avoid pole_angle outside -12..12 deg`.
+"""A goal as text, as on the command line and in files: `avoid pole_angle outside -12..12 deg`.
 
 goal      = objective { (";" | newline) objective }
 objective = kind part { "and" part } [ "within" iterations ] [ "weight" number ]
@@ -25,21 +25,21 @@ _UNIT = r"(?: (?!(?:and|within|weight)$)(\S+))?"
 _BETWEEN = re.compile(rf"({_QUANTITY}) (in|outside) ({_N}) \.\. ({_N}){_UNIT}")
 _BEYOND = re.compile(rf"({_QUANTITY}) (above|below) ({_N}){_UNIT}")
 _AROUND = re.compile(rf"({_QUANTITY}(?: , {_QUANTITY})*) around ({_N}(?: , {_N})*) radius ({_N}){_UNIT}")
-"""The forms of a region's part, in words, numbers and signs with a space between each."""
+"""The forms of a region's part, in which spaces separate words, numbers and signs."""
 _EXAMPLE = "avoid pole_angle outside -12..12 deg"
 
 
 def read_goal(text: Any) -> Goal:
-    """The goal of a text; `str` of a goal gives such a text back.
+    """Parse a goal; `str` is the inverse.
 
     Raises:
-        InvalidArgument: naming the objective, what was expected and what came.
+        InvalidArgument: naming the objective, what was expected and what was given.
     """
     if not isinstance(text, str):
-        raise InvalidArgument(f"goal: expected a text such as {_EXAMPLE!r}, got {shown(text)}")
+        raise InvalidArgument(f"goal: expected a string such as {_EXAMPLE!r}, got {shown(text)}")
     clauses = [clause.strip() for clause in re.split("[;\n]", text) if clause.strip()]
     if not clauses:
-        raise InvalidArgument(f"goal: expected something to strive for, such as {_EXAMPLE!r}, got nothing")
+        raise InvalidArgument(f"goal: expected an objective, such as {_EXAMPLE!r}, got nothing")
     objectives = []
     for clause in clauses:
         try:
@@ -56,13 +56,13 @@ def _objective(text: str) -> Objective:
     kind, _, rest = text.partition(" ")
     if kind not in KINDS:
         raise InvalidArgument(f"expected {' or '.join(KINDS)}, got {shown(kind)}{did_you_mean(kind, KINDS)}")
-    region, *after = re.split(" (within|weight) ", rest)
+    region, *pairs = re.split(" (within|weight) ", rest)
     parts = tuple(map(_part, region.split(" and ")))
     options: dict[str, Any] = {}
-    for name, value in zip(after[::2], after[1::2], strict=True):
+    for name, value in zip(pairs[::2], pairs[1::2], strict=True):
         if name in options or not re.fullmatch(_N, value):
             raise InvalidArgument(
-                f"expected within and weight once, each with a number, got {shown(f'{name} {value}')}"
+                f"expected within and weight at most once, each with a number, got {shown(f'{name} {value}')}"
             )
         number = float(value)
         options[name] = int(number) if name == "within" and number.is_integer() else number
@@ -70,20 +70,20 @@ def _objective(text: str) -> Objective:
 
 
 def _part(text: str) -> Range | Ball:
-    if found := _BETWEEN.fullmatch(text):
-        name, relation, low, high, unit = found.groups("")
+    if match := _BETWEEN.fullmatch(text):
+        name, relation, low, high, unit = match.groups("")
         return Range(name, float(low), float(high), unit, relation == "outside")
-    if found := _BEYOND.fullmatch(text):
-        name, relation, end, unit = found.groups("")
+    if match := _BEYOND.fullmatch(text):
+        name, relation, end, unit = match.groups("")
         is_above = relation == "above"
         return Range(name, float(end) if is_above else None, None if is_above else float(end), unit)
-    if found := _AROUND.fullmatch(text):
-        names, centre, radius, unit = found.groups("")
+    if match := _AROUND.fullmatch(text):
+        names, centre, radius, unit = match.groups("")
         return Ball(tuple(names.split(" , ")), tuple(map(float, centre.split(" , "))), float(radius), unit)
     misspelt = re.match(rf"{_QUANTITY}(?: , {_QUANTITY})* (?!(?:{'|'.join(_RELATIONS)})\b)([^\W\d]\S*)", text)
     meant = did_you_mean(misspelt[1], _RELATIONS) if misspelt else ""
     raise InvalidArgument(
-        f"expected a region: QUANTITY in LOW..HIGH UNIT, or outside; QUANTITY above NUMBER UNIT, or below; QUANTITY, "
+        f"expected a region: QUANTITY in|outside LOW..HIGH UNIT; QUANTITY above|below NUMBER UNIT; or QUANTITY, "
         f"QUANTITY around NUMBER, NUMBER radius NUMBER UNIT; several joined by and, then within NUMBER, weight NUMBER; "
         f"got {shown(text)}{meant}"
     )

@@ -101,7 +101,7 @@ def predict(
         return roll_out(*within, control.actor, control.n_actors, episodes=episodes_each, seed=drawn)
 
     predictions: dict[str, Prediction] = {}
-    # A hanging body on the host is only noticed in the main thread (`animat.robots.host.within`).
+    # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
     on_host = isinstance(environment.robot, HostRobot)
     with nullcontext() if on_host else ThreadPoolExecutor(len(os.sched_getaffinity(0))) as executor:
         side_by_side = map if executor is None else executor.map

@@ -45,7 +45,7 @@ from animat.reality_gap.session_responses import outcomes, read_responses
 from animat.reality_gap.table import RealityGap
 from animat.recordings.findings import Finding, warnings_once
 from animat.robots.base import lacking
-from animat.robots.grid import no_grid
+from animat.robots.grid import why_no_grid
 from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
@@ -276,7 +276,7 @@ def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
 
 def _why_no_optimum(loop: Loop, calibration: Calibration) -> str | None:
     """Why the optimal return cannot be computed; None if it can."""
-    reason = no_grid(loop.robot)
+    reason = why_no_grid(loop.robot)
     if few := too_few(loop.conditions, [len(responses) for responses in calibration.responses_hz]):
         reason = f"these conditions have too few responses: {', '.join(few)}"
     return None if reason is None else lacking(loop.robot).get("value_grid", f"no optimal return: {reason}")

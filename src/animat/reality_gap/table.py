@@ -12,7 +12,7 @@ from animat.cultures.budget import Account
 from animat.errors import in_min
 from animat.evaluation.verdict import Verdict
 from animat.goals.robot import objectives_of
-from animat.goals.tally import MEANS, cells_of, told_satisfaction
+from animat.goals.tally import MEANS, cells_of, satisfaction_line
 from animat.lined_up import lined_up
 from animat.reality_gap.interventions import Intervention, intervention_lines
 from animat.reality_gap.outlook import Outlook
@@ -143,7 +143,7 @@ class RealityGap:
             *lined_up(head, cells),
         ]
         if self.rows[0].met:
-            lines.append(f"  {told_satisfaction(objectives, self.rows[0].met)}")
+            lines.append(f"  {satisfaction_line(objectives, self.rows[0].met)}")
         if self.optimum is not None:
             share = ""
             if self.gap_share is not None:

@@ -1,4 +1,4 @@
-"""Bodies with a task: the contract (`base`), and one file a robot."""
+"""Bodies with a task: the contract (`base`), and one file per robot."""
 
 from animat.robots.arm import ArmState, TwoLinkArm
 from animat.robots.base import Quantity, Robot

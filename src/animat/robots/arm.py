@@ -1,4 +1,4 @@
-"""Arm: bring the tip of two links to a target that is somewhere else in each episode."""
+"""Arm: bring the tip of two links to a target that differs in each episode."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from animat.robots.motion import cost_of_distance, runge_kutta
 from animat.robots.registry import register_robot
 
 SUBSTEPS = 4
-"""Steps of the equations of motion in an iteration: damping settles a light link within a part of one."""
+"""Integration steps per iteration: damping settles a light link within a fraction of one."""
 
 STIFFEST = 2.5
-"""Rate times step, at most: the Runge-Kutta method of fourth order is stable up to 2.78."""
+"""Largest product of rate and step: the Runge-Kutta method of fourth order is stable up to 2.78."""
 
 PULL, BRAKE_S = 40.0, 1.0
-"""Of the heuristic: commands for a way as long as the arm, and for a joint's speed of 1 rad/s."""
+"""The heuristic's commands for a distance of one arm's length, and for a joint velocity of 1 rad/s."""
 
 NEAREST, FARTHEST = 0.3, 0.95
-"""How far from the shoulder targets are drawn, as parts of the arm's length, within what the tip can reach."""
+"""Range of the targets' distance from the shoulder, in arm's lengths, within what the tip can reach."""
 
 
 class ArmState(NamedTuple):
-    """How the links stand and move, and where the target is: seen from above, x to the right, y down.
+    """Angles and velocities of the joints, and the target, seen from above: x to the right, y down.
 
-    The shoulder is at (0, 0). Angles grow clockwise, as y points down, and go on past a turn: the shoulder's is 0 to
+    The shoulder is at (0, 0). Angles increase clockwise, as y points down, and are not wrapped: the shoulder's is 0 to
     the right, the elbow's is 0 for a straight arm.
     """
 
@@ -49,7 +49,7 @@ class ArmState(NamedTuple):
 @register_robot
 @record
 class TwoLinkArm(Robot[ArmState]):
-    """Two links on a table, a motor in each joint; 0 an iteration with the tip at the target, else towards -1.
+    """Two links on a table, a motor in each joint; 0 for an iteration with the tip at the target, else towards -1.
 
         M(q) q'' = torque_n_m u - damping_n_m_s q' - c(q, q')
         M11 = m1 l1^2 / 3 + m2 (l1^2 + l2^2 / 3 + l1 l2 cos q2)
@@ -58,10 +58,10 @@ class TwoLinkArm(Robot[ArmState]):
         reward = R / max(d, R) - 1
 
     with q1 the shoulder's and q2 the elbow's angle, m and l the masses and lengths of uniform rods, d the distance
-    from tip to target after the movement and R the target's radius. Gravity has no part. An iteration is four steps of
-    the classical Runge-Kutta method, during which u does not change. An episode starts at rest with the elbow at a
-    right angle, and never ends by itself. Its target is drawn evenly over the area that is 0.3 to 0.95 of the arm's
-    length away from the shoulder, as far as the tip can come.
+    from tip to target after the movement and R the target's radius. Gravity plays no part. An iteration is four steps
+    of the classical Runge-Kutta method, during which u is constant. An episode starts at rest with the elbow at a right
+    angle, and is never terminated. Its target is drawn uniformly from the area between 0.3 and 0.95 of the arm's length
+    from the shoulder, limited to what the tip can reach.
 
     Attributes:
         torque_n_m: of each motor at u = 1.
@@ -69,10 +69,10 @@ class TwoLinkArm(Robot[ArmState]):
         target_radius_m: R.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or has no meaning, links too different in length to reach
+        InvalidArgument: for a parameter that is not finite or makes no sense, links too different in length to reach
             a target, or a step too long for the equations.
 
-    Source: any textbook of robotics, the manipulator with two revolute joints; the task is that of Gymnasium's
+    Source: any robotics textbook, the manipulator with two revolute joints; the task is that of Gymnasium's
     `Reacher-v5`, and of the drawing arm Meart (Bakkum et al. 2007).
     """
 
@@ -94,7 +94,7 @@ class TwoLinkArm(Robot[ArmState]):
         nearest_m, farthest_m = self._target_distances_m
         if nearest_m >= farthest_m:
             raise InvalidArgument(
-                f"lower_length_m: expected links alike enough to reach a target, got {self.lower_length_m:g} m "
+                f"lower_length_m: expected links similar enough to reach a target, got {self.lower_length_m:g} m "
                 f"with an upper link of {self.upper_length_m:g} m"
             )
         least, _ = self._inertias_kg_m2
@@ -106,21 +106,21 @@ class TwoLinkArm(Robot[ArmState]):
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """Of an episode as far from the target as can be, or always at it."""
+        """From being as far from the target as possible to always being at it."""
         arm_m = self.upper_length_m + self.lower_length_m
         farthest_m = arm_m + self._target_distances_m[1]
         return self.episode_limit * (min(1.0, self.target_radius_m / farthest_m) - 1), 0.0
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
-        """Cosines and sines of the joints, their velocities, the target, and the way to it; as in `Reacher-v5`."""
+        """Cosines and sines of the joint angles, joint velocities, target, and vector to it, as in `Reacher-v5`."""
         arm_m, target_m = self.upper_length_m + self.lower_length_m, self._target_distances_m[1]
         fastest = self._fastest_rad_per_s
-        # As fast as the weakest of what limits it lets both joints turn together.
+        # The velocity at which damping balances full torque, if an episode is long enough to reach it.
         usual = min(self.torque_n_m / max(self.damping_n_m_s, 1e-9), fastest) or 1.0
-        parts = ("shoulder_cosine", "shoulder_sine", "elbow_cosine", "elbow_sine")
+        names = ("shoulder_cosine", "shoulder_sine", "elbow_cosine", "elbow_sine")
         return (
-            *(Quantity(part, "1", 1.0, -1.0, 1.0) for part in parts),
+            *(Quantity(name, "1", 1.0, -1.0, 1.0) for name in names),
             Quantity("shoulder_velocity", "rad/s", usual, -fastest, fastest),
             Quantity("elbow_velocity", "rad/s", usual, -fastest, fastest),
             Quantity("target_x", "m", arm_m, -target_m, target_m, of_goal=True),
@@ -130,7 +130,7 @@ class TwoLinkArm(Robot[ArmState]):
         )
 
     def reset(self, key: Array) -> ArmState:
-        """At rest, the upper link to the right and the elbow bent downwards; the target drawn."""
+        """At rest, the upper link to the right and the elbow bent downwards; the target is drawn."""
         outwards, around = jax.random.uniform(key, (2,))
         nearest_m, farthest_m = self._target_distances_m
         distance_m = jnp.sqrt(nearest_m**2 + outwards * (farthest_m**2 - nearest_m**2))
@@ -169,13 +169,13 @@ class TwoLinkArm(Robot[ArmState]):
         return jnp.stack([*joints, w1, w2, target_x_m, target_y_m, *self._to_target(state)])
 
     def with_goal_of(self, state: ArmState, other: ArmState) -> ArmState:
-        """As one stands and moves, with the other's target."""
+        """The arm of one state, with the target of the other."""
         return state._replace(target_x_m=other.target_x_m, target_y_m=other.target_y_m)
 
     def heuristic(self, observation: Any) -> Any:
-        """The torques that a spring from tip to target would make, less a brake: J(q)^T e / l^2 stiffness - brake q'.
+        """The torques of a spring from tip to target, less a brake: stiffness J(q)^T e / l^2 - brake q'.
 
-        J is how the tip moves with the joints, e the way from tip to target, l the arm's length.
+        J is the Jacobian of the tip's position, e the vector from tip to target, l the arm's length.
         """
         xp = observation.__array_namespace__()
         cos1, sin1, cos2, sin2, w1, w2, _, _, x_m, y_m = observation
@@ -184,13 +184,13 @@ class TwoLinkArm(Robot[ArmState]):
         tip_x_m, tip_y_m = self.upper_length_m * cos1 + lower_x_m, self.upper_length_m * sin1 + lower_y_m
         stiffness_per_m2 = PULL / (self.upper_length_m + self.lower_length_m) ** 2
         pull = (tip_x_m * y_m - tip_y_m * x_m, lower_x_m * y_m - lower_y_m * x_m)
-        wanted = [stiffness_per_m2 * each - BRAKE_S * w for each, w in zip(pull, (w1, w2), strict=True)]
-        return xp.clip(xp.stack(wanted), -1.0, 1.0)
+        commands = [stiffness_per_m2 * torque - BRAKE_S * w for torque, w in zip(pull, (w1, w2), strict=True)]
+        return xp.clip(xp.stack(commands), -1.0, 1.0)
 
     def draw(
         self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
     ) -> Picture:
-        """The links, the target and the way of the tip, seen from above (see `animat.robots.drawing`)."""
+        """The links, the target and the path of the tip, seen from above (see `animat.robots.drawing`)."""
         arm_m = self.upper_length_m + self.lower_length_m
         half_m = 1.1 * arm_m
         canvas = Canvas(height_px, height_px, (height_px / 2, height_px / 2), height_px / 2 / half_m)
@@ -206,11 +206,11 @@ class TwoLinkArm(Robot[ArmState]):
         return canvas.picture()
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
-        """How far the tip was from the target in each episode, over time."""
+        """The distance from tip to target over time in each episode."""
         distances_m, radius_m = [np.hypot(path[:, 8], path[:, 9]) for path in paths], self.target_radius_m
-        arrived = [bool(each[-1] <= radius_m) for each in distances_m]
-        told, ylabel = "end at the target", "tip to target (m)"
-        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], told=told, ylabel=ylabel)
+        arrived = [bool(distance_m[-1] <= radius_m) for distance_m in distances_m]
+        success, ylabel = "end at the target", "tip to target (m)"
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success=success, ylabel=ylabel)
         axes.set_ylim(bottom=0)
 
     def _to_target(self, state: ArmState) -> tuple[Array, Array]:
@@ -221,22 +221,22 @@ class TwoLinkArm(Robot[ArmState]):
 
     @property
     def _target_distances_m(self) -> tuple[float, float]:
-        """The nearest and the farthest that a target is from the shoulder."""
+        """The smallest and the largest distance of a target from the shoulder."""
         arm_m, hole_m = self.upper_length_m + self.lower_length_m, abs(self.upper_length_m - self.lower_length_m)
         return max(NEAREST * arm_m, hole_m), FARTHEST * arm_m
 
     @property
     def _inertia(self) -> tuple[float, float, float, float]:
-        """M11, M12 and M22 of an elbow at a right angle (kg m^2), and the factor of cos q2 in M12, half that in M11."""
+        """M11, M12 and M22 for a right-angled elbow (kg m^2), and the factor of cos q2 in M12, half that in M11."""
         m1, m2, l1, l2 = self.upper_mass_kg, self.lower_mass_kg, self.upper_length_m, self.lower_length_m
-        alone = m2 * l2**2 / 3
-        return m1 * l1**2 / 3 + m2 * l1**2 + alone, alone, alone, m2 * l1 * l2 / 2
+        lower = m2 * l2**2 / 3
+        return m1 * l1**2 / 3 + m2 * l1**2 + lower, lower, lower, m2 * l1 * l2 / 2
 
     @property
     def _inertias_kg_m2(self) -> tuple[float, float]:
-        """The least and the largest eigenvalue of M in any position: those of a straight arm.
+        """The smallest and the largest eigenvalue of M in any position.
 
-        Its trace is the largest there and its determinant the smallest.
+        They are those of a straight arm, where the trace is largest and the determinant smallest.
         """
         m11, m12, m22, coupling = self._inertia
         trace, determinant = m11 + 2 * coupling + m22, (m11 + 2 * coupling) * m22 - (m12 + coupling) ** 2
@@ -245,12 +245,12 @@ class TwoLinkArm(Robot[ArmState]):
 
     @property
     def _fastest_rad_per_s(self) -> float:
-        """What no joint's speed passes in an episode, whatever the commands; wide, but true.
+        """A bound that no joint velocity exceeds in an episode, for any commands; wide, but true.
 
-        With T the torque of a motor, b the damping and k < K the least and largest eigenvalue of M: both motors
-        together give at most sqrt(2) T |q'|, damping takes b |q'|^2, so the energy falls where |q'| > sqrt(2) T / b,
-        and is at most K T^2 / b^2. From rest, sqrt(energy) grows by at most T / sqrt(k) in a second. Either way
-        |q'|^2 <= 2 energy / k. 5 % more is for steps that are not infinitely small.
+        With T the torque of a motor, b the damping and k < K the smallest and largest eigenvalue of M: both motors
+        together supply at most sqrt(2) T |q'|, damping takes b |q'|^2, so the energy falls where |q'| > sqrt(2) T / b,
+        and is at most K T^2 / b^2. From rest, sqrt(energy) grows by at most T / sqrt(k) per second. Either way
+        |q'|^2 <= 2 energy / k. A margin of 5 % allows for finite steps.
         """
         least, largest = self._inertias_kg_m2
         by_time = math.sqrt(2) * self.torque_n_m * self.episode_limit * self.step_s / least

@@ -1,4 +1,4 @@
-"""What a robot is: a body with a task, as pure functions of its state and as data."""
+"""The contract of a robot: a body with a task, as pure functions of its state and as data."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from animat.late import Array, jax
 from animat.records import Number, Whole
 
 State = TypeVar("State")
-"""A robot's state: a NamedTuple of float32 scalars; batches of robots are `jax.vmap` outside."""
+"""A robot's state: a NamedTuple of float32 scalars; `jax.vmap` makes batches of robots."""
 
 LONGEST_EPISODE = 1_000_000
-"""Iterations of an episode at most: each has a random key of its own, drawn before the first."""
+"""Most iterations of an episode: each has its own random key, drawn before the first."""
 
 
-def _whole(given: Any) -> Any:
+def _to_whole(value: Any) -> Any:
     # The command line and files have 120.0 for 120.
-    return int(given) if isinstance(given, float) and given.is_integer() else given
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_whole)]
+Iterations = Annotated[Whole, Field(ge=1, le=LONGEST_EPISODE), BeforeValidator(_to_whole)]
 Size = Annotated[Number, Field(ge=1e-9, le=1e9)]
 Amount = Annotated[Number, Field(ge=0, le=1e9)]
-"""Parameters of a robot: a size is never 0."""
+"""Types of a robot's parameters: a size is never 0."""
 
 MOST_AT_ONCE = 5_000_000
-"""Episodes side by side at most: each takes some 300 bytes."""
+"""Most episodes side by side: each takes some 300 bytes."""
 
 LEAST_SCALE, LARGEST_SCALE = 1e-12, 1e12
-"""Of an observed quantity: within them a network of float32 computes with what it is divided by."""
+"""Limits of a quantity's scale, within which a float32 network can compute with the scaled quantity."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,16 +45,16 @@ class Quantity:
     """One number of an observation.
 
     Attributes:
-        name: what it is, `cart_position`.
-        unit: what it is measured in, `m`.
-        scale: how large it usually is, in that unit; a learner divides by it.
-        low, high: bounds in that unit that no observation of an episode passes, the last one included.
-        of_goal: whether it tells of the goal, and not of the body and its surroundings: a reflex does not know it
+        name: such as `cart_position`.
+        unit: such as `m`.
+        scale: its usual size, in that unit; a learner divides by it.
+        low, high: bounds in that unit that no observation of an episode exceeds, including the last.
+        of_goal: whether it describes the goal rather than the body and its surroundings; a reflex does not know it
             (`animat.evaluation.coupling`).
 
     Raises:
-        InvalidArgument: for a name or a unit that is no text, for a scale or a bound that is no number, and for bounds
-            that do not rise.
+        InvalidArgument: for a name or a unit that is not a string, for a scale or a bound that is not a number, and for
+            bounds that do not rise.
     """
 
     name: str
@@ -67,10 +67,10 @@ class Quantity:
     def __post_init__(self) -> None:
         for name in ("name", "unit"):
             if not isinstance(text := getattr(self, name), str):
-                raise InvalidArgument(f"{name} of a Quantity: expected a text, got {shown(text)}")
+                raise InvalidArgument(f"{name} of a Quantity: expected a string, got {shown(text)}")
         for name in ("scale", "low", "high"):
             number: Any = getattr(self, name)
-            # Also what JAX traces, of a robot whose parameters are drawn.
+            # JAX traces these for a robot whose parameters are drawn.
             if not hasattr(number, "__float__") or getattr(number, "ndim", 0) != 0:
                 raise InvalidArgument(f"{self.name}: {name} of a Quantity: expected a number, got {shown(number)}")
         if all(isinstance(bound, Real) for bound in (self.low, self.high)) and not self.low < self.high:
@@ -78,28 +78,28 @@ class Quantity:
 
 
 class Robot(abc.ABC, Generic[State]):
-    """A body with a task, driven by a motor command u in [-1, 1] an iteration, or by several.
+    """A body with a task, driven by one or several motor commands u in [-1, 1] per iteration.
 
-    Implementations are frozen dataclasses whose fields are all parameters, with units in their names: they compare,
-    hash (so they are static under `jax.jit`) and go to JSON. JAX is imported when the robot first moves, not before:
-    a robot can be named, compared and stored without it.
+    Implementations are frozen dataclasses whose fields are all parameters, with units in their names. They compare,
+    hash (so they are static under `jax.jit`) and convert to JSON. JAX is imported only when a robot first moves:
+    robots can be named, compared and stored without it.
 
-    `terminated` says that the task ended (fell, arrived). That an episode reached `episode_limit` is truncation;
-    whoever runs the episode counts, and a robot never says so.
+    `terminated` means that the task ended (fell, arrived). Reaching `episode_limit` is truncation: the program that
+    runs the episode counts iterations, the robot never does.
 
-    Methods that may be missing, and what needs them says so (`lacking`):
+    These methods are optional, and a feature that needs a missing one reports it (`lacking`):
 
-        succeeded(state) -> Bool[Array, ""]                            of the last state of an episode, in JAX
-        heuristic(observation) -> command                              a heuristic policy, in JAX, of one observation
+        succeeded(state) -> Bool[Array, ""]                            for the last state of an episode, in JAX
+        heuristic(observation) -> command                              a heuristic policy, in JAX, for one observation
         draw(observation, command, earlier, height_px) -> picture      uint8, shape (height, width, 3)
-        draw_paths(axes, paths)                                        whole episodes on Matplotlib's axes
+        draw_paths(axes, paths)                                        whole episodes on Matplotlib axes
         value_grid() -> animat.robots.grid.Grid                        for the optimal return
-        potential(state) -> float                                      shapes what is learned from, not what is best
+        potential(state) -> float                                      shapes the rewards, not the best policy
         with_goal_of(state, other) -> State                            the body of one state with the goal of another
     """
 
     name: ClassVar[str]
-    """What `animat.robots.robot_named` knows it by."""
+    """Its name for `animat.robots.robot_named`."""
 
     n_commands: ClassVar[int] = 1
     """How many motor commands it takes at once, each the command of a readout (`animat.coding.decoder`)."""
@@ -108,10 +108,10 @@ class Robot(abc.ABC, Generic[State]):
     """How many uniform random numbers in [0, 1) one iteration consumes."""
 
     paper_iterations: ClassVar[int] = 500_000
-    """Iterations that the paper trained a policy for on this task; of others, how many are trained by default."""
+    """Iterations for which the paper trained a policy on this task; on other tasks, the default number."""
 
     baseline_commands: ClassVar[tuple[float, ...] | None] = None
-    """What the baseline without neurons picks from; None: any command in [-1, 1]."""
+    """Commands from which the baseline without neurons chooses; None: any command in [-1, 1]."""
 
     episode_limit: int
     """Iterations after which an episode is cut off."""
@@ -119,11 +119,11 @@ class Robot(abc.ABC, Generic[State]):
     @property
     @abc.abstractmethod
     def observation_spec(self) -> tuple[Quantity, ...]:
-        """What the numbers of an observation are, in order."""
+        """The quantities that make up an observation, in order."""
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """What the return of an episode can be at least and at most; infinite where that is not known."""
+        """The lowest and the highest possible return of an episode; infinite if unknown."""
         return -math.inf, math.inf
 
     @abc.abstractmethod
@@ -134,12 +134,12 @@ class Robot(abc.ABC, Generic[State]):
     def advance(
         self, uniforms: Float[Array, " noise_size"], state: State, u: Float[Array, "*commands"]
     ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
-        """One iteration, with its random numbers given: no random generator runs inside.
+        """One iteration from given random numbers: no random generator runs inside.
 
         Args:
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration.
-            u: the motor command, in [-1, 1]; of several, shape (n_commands,).
+            u: the motor command in [-1, 1]; several have shape (n_commands,).
 
         Returns:
             the state after the iteration, the reward in the task's own units, and whether the task ended.
@@ -147,21 +147,21 @@ class Robot(abc.ABC, Generic[State]):
 
     @abc.abstractmethod
     def observe(self, state: State) -> Float[Array, " observations"]:
-        """What a controller sees of `state`, in the units of `observation_spec`, float32, shape (observations,)."""
+        """The observation of `state`, in the units of `observation_spec`, float32, shape (observations,)."""
 
     @final
     def step(
         self, key: Array, state: State, u: Float[Array, "*commands"]
     ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
-        """One iteration, its random numbers drawn from `key`; arguments and results as in `advance`."""
+        """One iteration with random numbers drawn from `key`; arguments and results as in `advance`."""
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, u)
 
     def caveats(self) -> tuple[str, ...]:
-        """What a user should know before trusting results with these parameters, a sentence each; mostly nothing."""
+        """Warnings to consider before trusting results with these parameters, one sentence each; usually none."""
         return ()
 
     def departures(self) -> tuple[tuple[str, str], ...]:
-        """Where it departs from a paper's print: each with a title, for the report of a study; mostly nothing."""
+        """Departures from the printed paper, each a title and a text for a study's report; usually none."""
         return ()
 
 
@@ -171,11 +171,11 @@ WITHOUT = {
     "draw": "no pictures of the robot",
     "draw_paths": "no figure of paths",
 }
-"""What is left out for a robot without a method of this name (see `animat.Robot`)."""
+"""What is left out for a robot without the optional method of this name."""
 
 
 def lacking(robot: Robot[Any]) -> dict[str, str]:
-    """What is left out for this robot: a sentence for each method that it has not, by the method's name."""
+    """What is left out for this robot: a sentence for each missing method, by the method's name."""
     return {
         name: f"{without}: {robot.name} has no method `{name}`"
         for name, without in WITHOUT.items()
@@ -184,11 +184,7 @@ def lacking(robot: Robot[Any]) -> dict[str, str]:
 
 
 def capability(robot: Robot[Any], name: str) -> Callable[..., Any]:
-    """The method of this name.
-
-    Raises:
-        InvalidArgument: for a robot without it.
-    """
+    """The method of this name; raises InvalidArgument if the robot has none."""
     if not hasattr(robot, name):
         raise InvalidArgument(f"robot: {robot.name} has no method `{name}`")
     return getattr(robot, name)  # type: ignore[no-any-return]

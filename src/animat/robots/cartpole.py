@@ -18,11 +18,11 @@ from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
 
 FORESIGHT_S = 0.1
-"""The heuristic goes by where the pole will lean so much later, at the speed it falls with now."""
+"""The heuristic extrapolates the pole's angle over this time, at its current angular velocity."""
 
 
 class CartpoleState(NamedTuple):
-    """Where the cart and its pole are; positive is to the right, and the pole leaning to the right."""
+    """State of cart and pole; positive is to the right, and the pole leaning to the right."""
 
     position_m: Float[Array, ""]
     velocity_m_per_s: Float[Array, ""]
@@ -34,28 +34,28 @@ class CartpoleState(NamedTuple):
 @register_robot
 @record
 class Cartpole(Robot[CartpoleState]):
-    """A pole hinged on a cart, pushed left or right; +1 an iteration, -100 when it falls or leaves the track.
+    """A pole hinged on a cart, pushed left or right; +1 per iteration, -100 when it falls or leaves the track.
 
         f    = force_n (u + uniform(-force_noise, force_noise))
         tmp  = (f + m l w^2 sin a) / M
         a''  = (g sin a - cos a tmp) / (l (4/3 - m cos^2 a / M))
         x''  = tmp - m l a'' cos a / M
 
-    with m the pole's mass, M pole and cart together, l half the pole's length, a the pole's angle from upright and
-    w its rate. Explicit Euler: positions move with the velocities from before the iteration. An episode starts at
-    rest, upright, in the middle of the track.
+    with m the pole's mass, M that of pole and cart together, l half the pole's length, a the pole's angle from upright
+    and w its angular velocity. Integration is explicit Euler: positions move with the velocities from before the
+    iteration. An episode starts at rest, upright, in the middle of the track.
 
     The paper's table prints a pole of 0.55 kg and an end at 12 "rad"; the open simulator that it used has 0.055 kg and
-    12 degrees, the defaults here. `Cartpole.as_printed()` is the table taken at its word.
+    12 degrees, the defaults here. `Cartpole.as_printed()` takes the table literally.
 
     Attributes:
-        force_noise: largest error of a push, as a part of `force_n`.
-        track_length_m: the cart's centre fails beyond half of it, to either side.
-        angle_limit_rad: the pole fails beyond it, to either side.
-        reward_failed: the reward of the iteration in which it fails, in place of `reward_upright`.
+        force_noise: largest error of a push, as a fraction of `force_n`.
+        track_length_m: the episode fails if the cart's centre is more than half of it from the middle.
+        angle_limit_rad: the episode fails if the pole leans further, to either side.
+        reward_failed: the reward of the iteration that fails, in place of `reward_upright`.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or has no meaning.
+        InvalidArgument: for a parameter that is not finite or makes no sense.
 
     Source: Sawada et al. 2022, the cartpole task and its table of constants.
     """
@@ -80,14 +80,14 @@ class Cartpole(Robot[CartpoleState]):
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """Of an episode that fails in its first or its last iteration, or never."""
+        """From the returns of failing in the first iteration, in the last, or never."""
         up, last = self.reward_upright, self.episode_limit - 1
         returns = (self.reward_failed, last * up + self.reward_failed, last * up + up)
         return min(returns), max(returns)
 
     @classmethod
     def as_printed(cls) -> Cartpole:
-        """The paper's table to the letter: a pole of 0.55 kg that fails at 12 rad."""
+        """The paper's table taken literally: a pole of 0.55 kg that fails at 12 rad."""
         return cls(pole_mass_kg=0.55, angle_limit_rad=12.0)
 
     @property
@@ -137,22 +137,22 @@ class Cartpole(Robot[CartpoleState]):
         return jnp.stack(state)
 
     def caveats(self) -> tuple[str, ...]:
-        """Says so where the pole may swing round before the angle ends an episode."""
+        """A warning if the pole may swing round before its angle ends an episode."""
         if self.angle_limit_rad < math.pi / 2:
             return ()
         return (
             f"cartpole: with angle_limit_rad = {self.angle_limit_rad:g} the pole may hang or swing round without "
-            f"failing, so the task is to keep the cart on its track, not to balance",
+            f"failing, so the task is to keep the cart on its track, not to balance the pole",
         )
 
     def departures(self) -> tuple[tuple[str, str], ...]:
         """The pole's mass, and the angle that ends an episode."""
-        chosen = "the simulator's" if math.isclose(self.pole_mass_kg, 0.055) else "chosen for this study"
+        source = "the simulator's" if math.isclose(self.pole_mass_kg, 0.055) else "chosen for this study"
         return (
             (
                 "Pole mass",
                 "The paper's table prints 0.55 kg; the open simulator whose other numbers it repeats has 0.055 kg. "
-                f"Here it is {self.pole_mass_kg:g} kg, {chosen} (pole_mass_kg).",
+                f"Here it is {self.pole_mass_kg:g} kg, {source} (pole_mass_kg).",
             ),
             (
                 "12 degrees",
@@ -163,27 +163,26 @@ class Cartpole(Robot[CartpoleState]):
         )
 
     def heuristic(self, observation: Any) -> Any:
-        """Lean right, push right, with full power: by theta + 0.1 s * theta', the pole's angle 0.1 s from now."""
+        """Full power to the side of theta + 0.1 s * theta', the pole's angle 0.1 s from now."""
         return 2.0 * (observation[2] + FORESIGHT_S * observation[3] > 0) - 1.0
 
     def value_grid(self) -> Grid:
-        """The grid that was measured to suit it (see docs/evidence/optimal-return.md).
+        """The grid found by measurement to suit the task (see docs/evidence/optimal-return.md).
 
         Position and angle are those after the next iteration, which are already decided: a state in which one of them
-        lies beyond its limit is lost, and the ends of the axes are where that begins. With l half the pole's length, a
-        push changes the cart's velocity v and the pole's angular velocity w such that v + 4/3 l w stays nearly the
-        same: it moves with gravity only, slowly, and takes the place of v. The angular velocities end, with 10 % more,
-        where the pole cannot be caught any more: r (angle limit + F / (M g)), with r the rate at which it falls, 1/s;
-        the velocities at sqrt(g angle limit track length), from which the cart can hardly be stopped on its track by
-        leaning the pole.
+        exceeds its limit is lost, and the axes end there. With l half the pole's length, a push changes the cart's
+        velocity v and the pole's angular velocity w so that v + 4/3 l w stays nearly the same. This sum changes only
+        by gravity, slowly, and takes the place of v. The axis of angular velocities ends 10 % beyond where the pole can
+        no longer be caught: r (angle limit + F / (M g)), with r the rate at which it falls, 1/s. That of velocities
+        ends at sqrt(g angle limit track length), from which leaning the pole can hardly stop the cart on its track.
 
         Raises:
-            InvalidArgument: for a pole that may swing far.
+            InvalidArgument: for a large angle limit.
         """
         if self.angle_limit_rad > 0.75:
             raise InvalidArgument(
                 f"angle_limit_rad: expected at most 0.75 for the cartpole's own grid, got {self.angle_limit_rad:g}; "
-                "hand in a Grid"
+                "pass a Grid"
             )
         half_length_m = self.pole_length_m / 2
         total_kg = self.cart_mass_kg + self.pole_mass_kg
@@ -224,7 +223,7 @@ class Cartpole(Robot[CartpoleState]):
         half_track, pole = self.track_length_m / 2, self.pole_length_m
         margin = 0.25 * pole
         x, angle = float(observation[0]), float(observation[2])
-        # Room for a pole that hangs as well as for one that stands, once the limits allow it to hang.
+        # Room for the pole to hang, if the limits allow it.
         below = pole if self.angle_limit_rad > math.pi / 2 else 0.1 * pole
         scale = height_px / (pole + below + 2 * margin)
         width_px = round(scale * 2 * (half_track + pole / 2 + margin))
@@ -247,18 +246,18 @@ class Cartpole(Robot[CartpoleState]):
         return canvas.picture()
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
-        """How far the pole leaned in each episode, over time."""
+        """The pole's angle over time in each episode."""
         limit_deg, angles_deg = math.degrees(self.angle_limit_rad), [np.degrees(path[:, 2]) for path in paths]
         stayed, limits = [len(path) > self.episode_limit for path in paths], (-limit_deg, limit_deg)
-        draw_over_time(axes, self, angles_deg, stayed, limits=limits, told="to the end", ylabel="pole angle (deg)")
+        draw_over_time(axes, self, angles_deg, stayed, limits=limits, success="to the end", ylabel="pole angle (deg)")
         axes.set_ylim(-1.25 * limit_deg, 1.25 * limit_deg)
 
     def _bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Bounds of (position, velocity) of the cart and of the pole over whole episodes that start at rest.
 
-        Positions move with the old velocities, so a velocity that crosses all of the track (or the angles allowed) in
-        one iteration ends the episode in the next; before that it grows by at most one more iteration's acceleration,
-        twice. Wide, but true whatever the commands.
+        Positions move with the old velocities, so a velocity that crosses the whole track (or range of angles) in one
+        iteration ends the episode in the next. Until then it grows by at most two iterations' acceleration. The bounds
+        are wide, but hold for any commands.
         """
         total_mass = self.cart_mass_kg + self.pole_mass_kg
         half_length = self.pole_length_m / 2

@@ -1,4 +1,4 @@
-"""Pictures of a robot, one an iteration: shapes with soft edges, drawn by Pillow fast enough to film episodes."""
+"""Pictures of a robot, one per iteration: anti-aliased shapes, drawn by Pillow fast enough to film episodes."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ GOAL_FILL: Colour = (214, 236, 219)
 TRAIL: Colour = (150, 178, 214)
 
 _FINER = 4
-"""How many times larger a picture is drawn than it is given out."""
+"""How many times larger than its final size a picture is drawn."""
 
 DONE, FAILED, AIM, EDGE = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
-"""Of figures of paths: episodes that ended well or not, where they should end, and limits (Okabe and Ito's palette)."""
+"""Colours in figures of paths (Okabe-Ito): episodes that ended well or not, where they should end, and limits."""
 
 
 def draw_robot(
@@ -46,15 +46,15 @@ def draw_robot(
     Args:
         robot: one with a method `draw`.
         observation: in the robot's own units.
-        command: the motor command u in [-1, 1] that led here; of several, all or the one that they all were.
-        earlier: the observations of the episode before this one.
+        command: the motor command u in [-1, 1] that led to it; for several commands, an array or one value for all.
+        earlier: the earlier observations of the episode.
         height_px: height of the picture; its width follows.
 
     Returns:
         red, green, blue from 0 to 255.
 
     Raises:
-        InvalidArgument: for a robot that has no such method, or one that gives no picture.
+        InvalidArgument: for a robot without such a method, or if it does not return a picture.
     """
     if robot.n_commands > 1:
         command = np.broadcast_to(command, robot.n_commands)
@@ -73,17 +73,17 @@ def draw_over_time(
     ended_well: Sequence[bool],
     *,
     limits: Sequence[float],
-    told: str,
+    success: str,
     ylabel: str,
 ) -> None:
-    """One number of each episode over time, in the colour of how the episode ended.
+    """Draw one number of each episode over time, coloured by how the episode ended.
 
     Args:
-        robot: whose iterations last `step_s`.
-        values: of each episode, a number an iteration.
-        limits: of the number, drawn across.
-        told: what those that ended well did, in words: `end upright`.
-        ylabel: what the number is, with its unit.
+        robot: one whose iterations last `step_s`.
+        values: for each episode, one number per iteration.
+        limits: drawn as horizontal lines.
+        success: what the episodes that ended well did: `end upright`.
+        ylabel: the number's name and unit.
     """
     for course, is_good in zip(values, ended_well, strict=True):
         time_s = np.arange(len(course)) * robot.step_s
@@ -91,44 +91,43 @@ def draw_over_time(
     for limit in limits:
         axes.axhline(limit, color=EDGE, linewidth=0.8, linestyle="--")
     axes.set_xlim(0, robot.episode_limit * robot.step_s)
-    axes.set(xlabel=f"time (s); {sum(ended_well)} of {len(values)} {told}", ylabel=ylabel)
+    axes.set(xlabel=f"time (s); {sum(ended_well)} of {len(values)} {success}", ylabel=ylabel)
 
 
 class Canvas:
-    """A picture in the making; coordinates are in the task's units, turned into pixels here.
+    """A picture being drawn, with coordinates in the task's units.
 
-    It is drawn several times as large and made smaller at the end, so that edges are soft.
+    It is drawn several times larger and reduced at the end, for smooth edges.
     """
 
     def __init__(self, width_px: int, height_px: int, origin_px: Point, px_per_unit: float) -> None:
         """An empty picture with the task's (0, 0) at `origin_px` (x right, y down)."""
         self._image = Image.new("RGB", (_FINER * width_px, _FINER * height_px), PAPER)
         self._draw = ImageDraw.Draw(self._image)
-        # Pillow counts from the middle of a pixel.
+        # Pillow's coordinates start at the middle of a pixel.
         self._origin_px, self._scale = _FINER * np.array(origin_px) - 0.5, _FINER * px_per_unit
 
     def stroke(self, points: Sequence[Point], width: float, colour: Colour) -> None:
-        """A line through the points with round ends, `width` wide; a single point is a disc."""
-        self._draw.line([self._placed(point) for point in points], colour, round(width * self._scale))
+        """A line through the points with round ends; a single point is a disc."""
+        self._draw.line([self._to_px(point) for point in points], colour, round(width * self._scale))
         for point in points:
             self.disc(point, width / 2, colour)
 
     def disc(self, centre: Point, radius: float, colour: Colour) -> None:
         """A filled circle; one too small to be seen is left out."""
-        if radius * self._scale <= 0.5:
-            return
-        self._draw.circle(self._placed(centre), radius * self._scale - 0.5, colour)
+        if radius * self._scale > 0.5:
+            self._draw.circle(self._to_px(centre), radius * self._scale - 0.5, colour)
 
     def box(self, low: Point, high: Point, corner: float, colour: Colour) -> None:
         """A filled rectangle from corner to corner, its corners rounded by the radius `corner`."""
-        (left, top), (right, bottom) = self._placed(low), self._placed(high)
+        (left, top), (right, bottom) = self._to_px(low), self._to_px(high)
         if left <= right and top <= bottom:
             self._draw.rounded_rectangle((left, top, right, bottom), max(0.0, corner) * self._scale, colour)
 
     def picture(self) -> Picture:
-        """What was drawn so far."""
+        """The picture so far."""
         return np.array(self._image.reduce(_FINER))
 
-    def _placed(self, point: Point) -> Point:
+    def _to_px(self, point: Point) -> Point:
         x, y = self._origin_px + self._scale * np.array(point)
         return float(x), float(y)

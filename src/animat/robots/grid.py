@@ -1,4 +1,4 @@
-"""Grids over a robot's states, and where an iteration leads on them: what dynamic programming computes on."""
+"""Grids over a robot's states, on which dynamic programming computes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from animat.robots.base import Robot, capability
 _FINEST = 8192.0
 
 TAPS = 4
-"""Nodes along an axis that an interpolated value is taken from: cubic polynomials."""
+"""Nodes along an axis used to interpolate a value: cubic polynomials."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class Axis:
     """Evenly spaced values of one coordinate.
 
     Attributes:
-        name, unit: what it is, and what it is measured in.
-        low, high: its ends; what lies beyond them has the value of the end.
-        nodes: how many values, at least 4, both ends among them (of a periodic axis, only the lower one).
-        periodic: whether `high` is `low` again.
+        name, unit: of the coordinate.
+        low, high: its ends; a state beyond them has the value of the end.
+        nodes: number of values, at least 4, including both ends (for a periodic axis, only the lower one).
+        periodic: whether `high` is the same as `low`.
 
     Raises:
-        InvalidArgument: for ends that do not rise, or fewer nodes than four.
+        InvalidArgument: for ends that do not rise, or fewer than four nodes.
     """
 
     name: str
@@ -55,18 +55,18 @@ class Axis:
 
     @property
     def stored(self) -> int:
-        """How many nodes are stored: a periodic axis goes on by one before its start and two after its end."""
+        """Number of stored nodes: a periodic axis is extended by one before its start and two after its end."""
         return self.nodes + 3 if self.periodic else self.nodes
 
     def values(self, index: Array) -> Array:
-        """The coordinate of stored nodes."""
+        """The coordinates of stored nodes."""
         steps = index - (1 if self.periodic else 0)
         return jnp.asarray(jnp.float32(self.low) + steps * jnp.float32(self.step))
 
     def locate(self, value: Array) -> tuple[Array, Array]:
         """The first of the four stored nodes around a value, and the value's distance from it in steps."""
         place = (value - jnp.float32(self.low)) / jnp.float32(self.step)
-        # A robot often lands on a node exactly; the last bits must not decide on which side of it.
+        # A robot often lands exactly on a node; the last bits must not decide on which side.
         place = jnp.round(place * _FINEST) / _FINEST
         place = jnp.mod(place, self.nodes) + 1 if self.periodic else jnp.clip(place, 0, self.nodes - 1)
         first = jnp.clip(jnp.floor(place) - 1, 0, self.stored - TAPS)
@@ -74,14 +74,14 @@ class Axis:
 
 
 class Located(NamedTuple):
-    """Where a state lies between the nodes of a grid.
+    """A state's place between the nodes of a grid.
 
     Attributes:
         row: first of the 4^axes rows around it.
-        row_places: distances from it in steps, shape (axes,).
-        positions: places among all of an axis's stored nodes, in steps, shape (axes,).
+        row_places: distances from that row in steps, shape (axes,).
+        positions: places among all stored nodes of each axis, in steps, shape (axes,).
         node: first of the four nodes around it along a row.
-        place: distance from it in steps.
+        place: distance from that node in steps.
     """
 
     row: Array
@@ -95,20 +95,20 @@ class Located(NamedTuple):
 class Grid:
     """Nodes over a robot's states, in coordinates that suit its motion.
 
-    The first coordinate is one that has no part in how the others move, such as the place of a cart on its track; the
-    others are its *rows*. Nodes are stored row by row.
+    The first coordinate must not affect how the others move, such as the position of a cart on its track; the others
+    span the *rows*. Nodes are stored row by row.
 
     Attributes:
         along: the first coordinate.
-        rows: the other coordinates; there may be none.
-        to_coordinates: from a robot's state to its coordinates, `along` first.
-        to_state: back.
-        smooth_commands: how many commands tell where an iteration leads well enough for a polynomial through them;
-            None: a command can decide whether an episode ends, and every level is computed by itself.
-        end_is_known: whether a state alone decides if the next iteration ends the task; what lies beyond the ends of
-            the axes is then never taken for what lies just inside.
-        noise_in_command: the largest change of the command that the robot's noise amounts to, either way, evenly
-            distributed; None: its noise is another.
+        rows: the other coordinates, possibly none.
+        to_coordinates: converts a robot's state to its coordinates, `along` first.
+        to_state: the inverse.
+        smooth_commands: number of commands through which a polynomial describes well enough where an iteration leads;
+            None: a command can decide whether an episode ends, and every level is computed separately.
+        end_is_known: whether a state alone decides if the next iteration ends the task; states beyond the ends of
+            the axes are then never treated as those just inside.
+        noise_in_command: the robot's noise as the largest change of the command, either way, uniformly distributed;
+            None: its noise has another form.
     """
 
     along: Axis
@@ -121,17 +121,17 @@ class Grid:
 
     @property
     def n_rows(self) -> int:
-        """Stored rows."""
+        """Number of stored rows."""
         return math.prod(axis.stored for axis in self.rows)
 
     @property
     def size(self) -> int:
-        """Stored nodes in all."""
+        """Total number of stored nodes."""
         return self.n_rows * self.along.stored
 
     @property
     def row_offsets(self) -> Int32[np.ndarray, " taps"]:
-        """Where the 4^axes rows around a state lie, counted from the first of them."""
+        """The 4^axes rows around a state, counted from the first of them."""
         offsets = np.zeros(1, np.int32)
         for stride in self._strides():
             offsets = (offsets[:, None] + np.arange(TAPS, dtype=np.int32) * np.int32(stride)).ravel()
@@ -144,21 +144,20 @@ class Grid:
 
         Args:
             factor: positive.
-            periodic: also along periodic axes, which are left as they are else: their nodes are matched to the turns
-                that a robot makes.
+            periodic: also scale periodic axes, whose nodes match the turns that a robot makes.
         """
 
-        def of(axis: Axis) -> Axis:
+        def scaled_axis(axis: Axis) -> Axis:
             if axis.periodic:
                 return replace(axis, nodes=max(TAPS, round(factor * axis.nodes))) if periodic else axis
             half = max(2, round(factor * (axis.nodes - 1) / 2))
             nodes = 2 * half + 1 if axis.nodes % 2 else max(TAPS, round(factor * (axis.nodes - 1)) + 1)
             return replace(axis, nodes=nodes)
 
-        return replace(self, along=of(self.along), rows=tuple(of(axis) for axis in self.rows))
+        return replace(self, along=scaled_axis(self.along), rows=tuple(map(scaled_axis, self.rows)))
 
     def locate(self, state: Any) -> Located:
-        """Where a state lies between the nodes."""
+        """A state's place between the nodes."""
         along, *others = self.to_coordinates(state)
         row = jnp.int32(0)
         places, positions = [], []
@@ -167,11 +166,11 @@ class Grid:
             row += first * stride
             places.append(place)
             positions.append(first + place)
-        nothing = jnp.zeros(0, jnp.float32)
+        empty = jnp.zeros(0, jnp.float32)
         return Located(
             row,
-            jnp.stack(places) if places else nothing,
-            jnp.stack(positions) if positions else nothing,
+            jnp.stack(places) if places else empty,
+            jnp.stack(positions) if positions else empty,
             *self.along.locate(along),
         )
 
@@ -190,7 +189,7 @@ def grid_for(robot: Robot[Any]) -> Grid:
     """The robot's own grid, its `value_grid`.
 
     Raises:
-        InvalidArgument: for a robot that has none, has none with its parameters, or takes several commands.
+        InvalidArgument: for a robot without one, or without one for its parameters, or with several commands.
     """
     if robot.n_commands > 1:
         raise InvalidArgument(f"{robot.name}: expected one command for an optimal return, got {robot.n_commands}")
@@ -200,15 +199,15 @@ def grid_for(robot: Robot[Any]) -> Grid:
     except InvalidArgument:
         raise
     except Exception as error:
-        # Anything may go wrong in somebody else's robot.
+        # Anything may go wrong in a user's robot.
         raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {first_line(error)}") from error
     if not isinstance(grid, Grid):
         raise InvalidArgument(f"{robot.name}.value_grid: expected a Grid, got {shown(grid)}")
     return grid
 
 
-def no_grid(robot: Robot[Any]) -> str | None:
-    """Why there is no grid for this robot; None where there is one."""
+def why_no_grid(robot: Robot[Any]) -> str | None:
+    """Why there is no grid for this robot; None if there is one."""
     try:
         grid_for(robot)
     except InvalidArgument as error:

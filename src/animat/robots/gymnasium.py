@@ -17,17 +17,17 @@ from pydantic import Field
 from animat.errors import InvalidArgument, first_line, shown
 from animat.records import Flag, Number, Whole, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Iterations, Quantity
-from animat.robots.host import LONGEST_KEPT, Body, HostRobot, within
+from animat.robots.host import LONGEST_KEPT, Body, HostRobot, time_limit
 from animat.robots.measuring import is_repeatable, measured_scales
 from animat.robots.registry import REGISTRY
 
 FAMILY = "gymnasium"
 _ID = re.compile(r"(?:[A-Za-z_][\w.]{0,200}:)?[\w./:-]{1,200}")
 MOST_OBSERVED = 4_096
-"""Numbers of an observation at most: a policy is a small network."""
+"""Most numbers in an observation: a policy is a small network."""
 MOST_LEVELS = 1_024
 LARGEST_BOUND = 1e6
-"""Of an observation: a bound beyond says nothing on how large it usually is."""
+"""Of an observation: a larger bound says nothing about its usual size."""
 
 Scale = Annotated[Number, Field(ge=LEAST_SCALE, le=LARGEST_SCALE)]
 
@@ -35,19 +35,19 @@ Scale = Annotated[Number, Field(ge=LEAST_SCALE, le=LARGEST_SCALE)]
 @final
 @record
 class GymnasiumRobot(HostRobot):
-    """An environment of Gymnasium, with an action space of kind Box or Discrete; its reward and its ends are its own.
+    """A Gymnasium environment with a Box or Discrete action space, with its own rewards and ends of episodes.
 
-    A command in [-1, 1] becomes low + (u + 1) / 2 (high - low) of each dimension of a Box, or one of n equal levels of
-    a Discrete(n). `GymnasiumRobot.named` makes one by looking at the environment; all that was found is data, so a
-    policy is loaded where the environment is not installed.
+    A command in [-1, 1] becomes low + (u + 1) / 2 (high - low) for each dimension of a Box, or one of n equal levels of
+    a Discrete(n). `GymnasiumRobot.named` makes one by inspecting the environment. The result is plain data, so a policy
+    can be loaded where the environment is not installed.
 
     Attributes:
-        id: as `gymnasium.make` takes it, with `module:` before it where importing that registers it.
-        settings: arguments of `gymnasium.make`, each with its name.
+        id: as for `gymnasium.make`, prefixed by `module:` if importing that module registers it.
+        settings: arguments of `gymnasium.make`, by name.
         episode_limit: iterations after which an episode is cut off.
-        low, high: of each dimension of a Box; none of a Discrete.
+        low, high: for each dimension of a Box; empty for a Discrete.
         levels: n of a Discrete(n); 0: a Box.
-        scales: of each number that is observed, the observation flattened.
+        scales: of each number of the flattened observation.
         keeps_state: as in `HostRobot`.
 
     Raises:
@@ -65,7 +65,7 @@ class GymnasiumRobot(HostRobot):
 
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
-            raise InvalidArgument(f"id: expected one of Gymnasium's, got {shown(self.id)}")
+            raise InvalidArgument(f"id: expected the id of a Gymnasium environment, got {shown(self.id)}")
         if len(self.low) != len(self.high) or bool(self.low) == bool(self.levels):
             raise InvalidArgument("low, high, levels: expected the bounds of a Box, or the levels of a Discrete")
 
@@ -76,7 +76,7 @@ class GymnasiumRobot(HostRobot):
 
     @property
     def n_commands(self) -> int:  # type: ignore[override]
-        """One for each dimension of a Box; one for a Discrete."""
+        """One per dimension of a Box; one for a Discrete."""
         return len(self.low) or 1
 
     @property
@@ -91,8 +91,8 @@ class GymnasiumRobot(HostRobot):
     def actions(self, commands: Float[np.ndarray, "bodies commands"]) -> Sequence[Any]:
         shares = (np.asarray(commands, np.float64) + 1.0) / 2.0
         if self.levels:
-            level: list[int] = np.clip(shares[:, 0] * self.levels, 0, self.levels - 1).astype(int).tolist()
-            return level
+            levels: list[int] = np.clip(shares[:, 0] * self.levels, 0, self.levels - 1).astype(int).tolist()
+            return levels
         low, high = np.array(self.low), np.array(self.high)
         return np.clip(low + shares * (high - low), low, high)  # type: ignore[no-any-return]
 
@@ -104,23 +104,23 @@ class GymnasiumRobot(HostRobot):
         engines = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "Box2D"}
         engine = next((engine for made_in, engine in engines.items() if entry.startswith(made_in)), "")
         known = importlib.metadata.packages_distributions()
-        of = ["gymnasium", *known.get(engine, ()), *known.get(entry.partition(".")[0].partition(":")[0], ())]
-        return {name: importlib.metadata.version(name) for name in dict.fromkeys(of)}
+        names = ["gymnasium", *known.get(engine, ()), *known.get(entry.partition(".")[0].partition(":")[0], ())]
+        return {name: importlib.metadata.version(name) for name in dict.fromkeys(names)}
 
     def body(self, *, with_pictures: bool = False) -> Body:
         module = self.id.rpartition(":")[0]
         if module and module not in sys.modules:
             # A file could name any module.
             raise InvalidArgument(
-                f"{self.name}: expected {module} to be imported, got a policy alone: import it first (on the command "
+                f"{self.name}: expected {module} to be imported, got only a policy: import it first (on the command "
                 f"line: --robot {self.name})"
             )
         body = _Environment(self.id, self.settings, with_pictures=with_pictures)
         if (body.low, body.high, body.levels, body.observed) != (self.low, self.high, self.levels, len(self.scales)):
             raise InvalidArgument(
-                f"{self.name}: expected {len(self.scales)} observations and {self.levels or len(self.low)} "
-                f"{'levels' if self.levels else 'actions'}, with which the policy was made, got an environment with "
-                "others: it is of another version"
+                f"{self.name}: expected the spaces that the policy was made with, of {len(self.scales)} observations "
+                f"and {self.levels or len(self.low)} {'levels' if self.levels else 'actions'}, got different ones: the "
+                "environment's version differs"
             )
         return body
 
@@ -132,17 +132,17 @@ class GymnasiumRobot(HostRobot):
             return ()
         if self.keeps_state:
             return (
-                f"{self.name}: an episode of {self.episode_limit:,} iterations is longer than the {LONGEST_KEPT:,} of "
-                "which the commands are kept: at each checkpoint episodes begin anew",
+                f"{self.name}: an episode of {self.episode_limit:,} iterations is longer than the {LONGEST_KEPT:,} "
+                "whose commands are kept: episodes restart at each checkpoint",
             )
         return (
-            f"{self.name}: the same seed and commands do not give the same episode, so what a body does between two "
-            "checkpoints cannot be kept: at each of them episodes begin anew",
+            f"{self.name}: the same seed and commands do not give the same episode, so an episode cannot continue from "
+            "a checkpoint: episodes restart at each checkpoint",
         )
 
     @staticmethod
     def import_module(id: str) -> None:
-        """Import the module that an id names, if it names one; errors as those of `named`."""
+        """Import the module that an id names, if any; raises as `named`."""
         module = id.rpartition(":")[0]
         if not module:
             return
@@ -156,36 +156,34 @@ class GymnasiumRobot(HostRobot):
     @classmethod
     @lru_cache(maxsize=32)  # a study asks for its robots often
     def named(cls, id: str, /, *, episode_limit: int | None = None, **settings: float) -> GymnasiumRobot:
-        """The environment of this id; it is made, looked at, and moved at random for some steps.
+        """The environment with this id, which is made, inspected, and moved at random for some steps.
 
         Args:
-            id: as `gymnasium.make` takes it.
-            episode_limit: iterations after which an episode is cut off; None: as it is registered.
+            id: as for `gymnasium.make`.
+            episode_limit: iterations after which an episode is cut off; None: the registered limit.
             settings: arguments of `gymnasium.make`.
 
         Raises:
-            InvalidArgument: for one that does not exist or is not installed, with spaces that a culture cannot serve or
-                without a limit.
-            BodyFailed: for one that raises, hangs, or gives NaN.
+            InvalidArgument: if it does not exist or is not installed, has unsupported spaces, or has no limit.
+            BodyFailed: if it raises, hangs, or returns NaN.
         """
         if not _ID.fullmatch(id):
             raise InvalidArgument(f"robot: expected gymnasium: and an environment's id, got {shown(f'{FAMILY}:{id}')}")
         cls.import_module(id)
-        given = tuple(settings.items())
-        at_first = cls(id, given, 1, (0.0,), (1.0,), 0, (1.0,), False)
-        with within(at_first, "being made"):
-            body = _Environment(id, given)
+        items = tuple(settings.items())
+        with time_limit(cls(id, items, 1, (0.0,), (1.0,), 0, (1.0,), False), "being made"):
+            body = _Environment(id, items)
         limit = body.limit if episode_limit is None else episode_limit
         if limit is None:
             raise InvalidArgument(
-                f"{FAMILY}:{id}: expected a limit of an episode, got an environment without one: "
+                f"{FAMILY}:{id}: expected an episode limit, got an environment without one: "
                 "--parameters episode_limit=1000"
             )
         if not 1 <= limit <= LONGEST_EPISODE:
             raise InvalidArgument(f"episode_limit: expected from 1 to {LONGEST_EPISODE:,} iterations, got {limit:,}")
         action_space = body.low, body.high, body.levels
-        robot = cls(id, given, limit, *action_space, (1.0,) * body.observed, False)
-        return cls(id, given, limit, *action_space, measured_scales(robot, body.bounds), is_repeatable(robot))
+        robot = cls(id, items, limit, *action_space, (1.0,) * body.observed, False)
+        return cls(id, items, limit, *action_space, measured_scales(robot, body.bounds), is_repeatable(robot))
 
 
 REGISTRY.add_family(FAMILY, GymnasiumRobot)
@@ -199,13 +197,13 @@ class _Environment(Body):
         from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
         name = f"{FAMILY}:{id}"
-        given = dict[str, Any](settings) | ({"render_mode": "rgb_array"} if with_pictures else {})
+        arguments = dict[str, Any](settings) | ({"render_mode": "rgb_array"} if with_pictures else {})
         try:
-            env: Any = gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **given)
+            env: Any = gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **arguments)
             actions, observations = env.action_space, env.observation_space
         except (Exception, SystemExit) as error:
-            # Anything may go wrong in somebody else's environment.
-            raise InvalidArgument(f"{name}: expected an environment of Gymnasium, got {_why(error)}") from error
+            # Anything may go wrong in an external environment.
+            raise InvalidArgument(f"{name}: expected a Gymnasium environment, got {_reason(error)}") from error
         _expect_sound_mujoco(name, env)
         self.limit: int | None = gymnasium.spec(id.rpartition(":")[2]).max_episode_steps
         while isinstance(env, OrderEnforcing | PassiveEnvChecker):
@@ -222,13 +220,13 @@ class _Environment(Body):
         return self._flat(self._env.reset(seed=seed)[0])
 
     def step(self, action: Any) -> tuple[Float[np.ndarray, " observations"], float, bool, bool]:
-        given = action + self._start if self.levels else action.astype(self._dtype).reshape(self._shape)
-        observation, reward, terminated, truncated, _ = self._step(given)
+        raw = action + self._start if self.levels else action.astype(self._dtype).reshape(self._shape)
+        observation, reward, terminated, truncated, _ = self._step(raw)
         return self._flat(observation), reward, terminated, truncated
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        shown = np.asarray(self._env.render())
-        return shown if shown.ndim == 3 and shown.dtype == np.uint8 and shown.shape[2] == 3 else None
+        frame = np.asarray(self._env.render())
+        return frame if frame.ndim == 3 and frame.dtype == np.uint8 and frame.shape[2] == 3 else None
 
     def _flat(self, observation: Any) -> Float[np.ndarray, " observations"]:
         if not self._is_flat:
@@ -240,20 +238,20 @@ class _Environment(Body):
         return observation  # type: ignore[no-any-return]
 
 
-def _why(error: Exception | SystemExit) -> str:
-    """What Gymnasium says, with our extra for MuJoCo, which brings a version without faults."""
-    said = first_line(error)
+def _reason(error: Exception | SystemExit) -> str:
+    """Gymnasium's message, with our extra for MuJoCo, which installs a version without faults."""
+    message = first_line(error)
     is_missing = type(error).__name__ == "DependencyNotInstalled" or isinstance(error, ImportError)
-    if is_missing and "mujoco" in said.lower():
-        return f'{said.partition(",")[0]}: pip install "animat[mujoco]"'
-    return said
+    if is_missing and "mujoco" in message.lower():
+        return f'{message.partition(",")[0]}: pip install "animat[mujoco]"'
+    return message
 
 
 def _expect_sound_mujoco(name: str, env: Any) -> None:
     is_of_mujoco = hasattr(env.unwrapped, "model") and "mujoco" in sys.modules
     if is_of_mujoco and getattr(sys.modules["mujoco"], "__version__", "") == "4.0.0":
         raise InvalidArgument(
-            f"{name}: expected a MuJoCo that computes accelerations right, got 4.0.0, which does not: "
+            f"{name}: expected a MuJoCo that computes accelerations correctly, got 4.0.0, which does not: "
             'pip install "mujoco<4"'
         )
 
@@ -279,7 +277,7 @@ def _commands(name: str, space: Any) -> tuple[tuple[float, ...], tuple[float, ..
 
 
 def _observed(name: str, space: Any) -> list[float]:
-    """How large each number of the flattened observation can be; 0 where that is not known."""
+    """Largest size of each number of the flattened observation; 0 if not known."""
     from gymnasium.spaces import Box
 
     if not isinstance(space, Box):
@@ -289,4 +287,4 @@ def _observed(name: str, space: Any) -> list[float]:
         raise InvalidArgument(f"{name}: expected observations of 1 to {MOST_OBSERVED:,} numbers, got {len(bound):,}")
     known = np.where((bound >= LEAST_SCALE) & (bound <= LARGEST_BOUND), bound, 0.0)
     # Without the digits that float32 adds.
-    return [float(f"{each:.6g}") for each in known]
+    return [float(f"{size:.6g}") for size in known]

@@ -1,4 +1,4 @@
-"""Robots that are stepped on the host, outside of anything compiled: the bodies of others, many side by side."""
+"""Robots that are stepped on the host, outside compiled code: external bodies, many side by side."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from animat.robots.base import Robot
 Answer = TypeVar("Answer")
 
 PATIENCE_S = 120.0
-"""How long a step of all bodies side by side may take, or making or resetting one, before it counts as hung."""
+"""How long a step of all bodies may take, or making or resetting one, before it counts as hung."""
 
 LONGEST_KEPT = 20_000
-"""Iterations of an episode of which the commands are kept, so that a checkpoint can go on within it."""
+"""Longest episode, in iterations, whose commands are kept so that training can continue within it."""
 
 
 class Body(abc.ABC):
@@ -31,84 +31,84 @@ class Body(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, seed: int) -> Float[np.ndarray, " observations"]:
-        """Start an episode, all draws of which follow from the seed; returns what is observed."""
+        """Start an episode, all draws of which follow from the seed; returns the observation."""
 
     @abc.abstractmethod
     def step(self, action: Any) -> tuple[Float[np.ndarray, " observations"], float, bool, bool]:
         """One iteration by one of the robot's `actions`.
 
         Returns:
-            what is observed after it, the reward in the task's own units, whether the task ended by itself, and
-            whether it was cut off.
+            the observation after it, the reward in the task's own units, whether the task itself ended, and whether it
+            was cut off.
         """
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """The body as it is now; None where it gives none."""
+        """The body as it is now; None if it has no picture."""
         return None
 
 
 class HostRobot(Robot[Any]):
-    """A robot of which the bodies are stepped in Python, one call a step.
+    """A robot whose bodies are stepped in Python, one call per step.
 
-    What is compiled (the policy, the neurons, learning) sees of a body only its last observation, which is its state
-    there. What needs whole episodes in one compiled program refuses such a robot.
+    Compiled code (the policy, the neurons, learning) sees only the last observation of a body, which serves as its
+    state. Functions that need whole episodes in one compiled program refuse such a robot.
 
-    An episode is decided by its seed and its commands, where `keeps_state` says so: a checkpoint then goes on within it
-    by its commands so far.
+    If `keeps_state`, the seed and the commands of an episode determine it: training then continues within it by
+    replaying the commands so far.
     """
 
     @property
     def versions(self) -> dict[str, str]:
-        """Of the installed packages that decide what its bodies do, besides ours."""
+        """Versions of the installed packages that determine how its bodies behave, except ours."""
         return {}
 
     keeps_state: bool
-    """Whether the same seed and commands give the same episode, whatever was before it."""
+    """Whether the same seed and commands give the same episode, whatever came before it."""
 
     @property
     def keeps_episodes(self) -> bool:
-        """Whether a checkpoint can go on within an episode."""
+        """Whether training can continue within an episode after a checkpoint."""
         return self.keeps_state and self.episode_limit <= LONGEST_KEPT
 
     @abc.abstractmethod
     def body(self, *, with_pictures: bool = False) -> Body:
-        """A new body, that can be asked for its `picture` if it must.
+        """A new body, with a `picture` if requested.
 
         Raises:
-            InvalidArgument: if it cannot be made, or is not what the parameters say.
+            InvalidArgument: if it cannot be made, or does not match the parameters.
         """
 
     @abc.abstractmethod
     def actions(self, commands: Float[np.ndarray, "bodies commands"]) -> Sequence[Any]:
-        """What motor commands in [-1, 1] are as actions of the bodies, one a body."""
+        """Motor commands in [-1, 1] as actions of the bodies, one per body."""
 
     def prepare(self) -> None:
-        """Import what its bodies are made of; for a process that it came to from one where it was named."""
+        """Import what its bodies need, in a process other than the one that named the robot."""
 
     def reset(self, key: Array) -> Float[Array, " observations"]:
-        """Nothing was observed yet."""
+        """Zeros: nothing has been observed yet."""
         return jnp.zeros(len(self.observation_spec), jnp.float32)
 
     def advance(self, uniforms: Any, state: Any, u: Any) -> Any:
         """Refused: it is stepped on the host."""
         raise InvalidArgument(
-            f"robot: expected one that is stepped in JAX, got {self.name}, which is stepped on the host: train, "
-            "evaluate, run, live and studies take it, and nothing else does"
+            f"robot: expected one that is stepped in JAX, got {self.name}, which is stepped on the host: only train, "
+            "evaluate, run, live and studies take it"
         )
 
     def observe(self, state: Float[Array, " observations"]) -> Float[Array, " observations"]:
-        """What was observed last."""
+        """The last observation."""
         return state
 
 
-class Stepped(NamedTuple):
-    """What a step of several bodies did.
+class StepResult(NamedTuple):
+    """The result of a step of several bodies.
 
     Attributes:
-        observation: after it, before ended episodes start anew.
+        observation: after the step, before ended episodes restart.
         reward: in the task's own units.
-        terminated: the task ended by itself.
-        truncated: it was cut off, by the body or by the robot's `episode_limit`; never both.
+        terminated: whether the task itself ended.
+        truncated: whether the body or the robot's `episode_limit` cut it off; never both.
     """
 
     observation: Float32[np.ndarray, "bodies observations"]
@@ -118,18 +118,18 @@ class Stepped(NamedTuple):
 
     @property
     def ended(self) -> Bool[np.ndarray, " bodies"]:
-        """In either way."""
+        """Whether an episode ended in either way."""
         return np.asarray(self.terminated | self.truncated)
 
 
-class Standing(NamedTuple):
-    """Where bodies stand, as data: from the seeds of their episodes and the commands since, they are there again.
+class Snapshot(NamedTuple):
+    """The state of several bodies as data, which the seeds of their episodes and the commands since then restore.
 
     Attributes:
-        observation: their last.
-        episodes: how many each has begun.
-        iterations: of the episode that each is in.
-        commands: in that episode; empty where the robot's state cannot be kept.
+        observation: the last of each.
+        episodes: number of episodes that each has begun.
+        iterations: of each in its current episode.
+        commands: in that episode; empty if the robot's state cannot be kept.
     """
 
     observation: Float32[np.ndarray, "*some bodies observations"]
@@ -138,8 +138,8 @@ class Standing(NamedTuple):
     commands: Float32[np.ndarray, "*some bodies iterations commands"]
 
     @classmethod
-    def of_none(cls, robot: HostRobot, bodies: int) -> Standing:
-        """Of bodies that have not begun."""
+    def initial(cls, robot: HostRobot, bodies: int) -> Snapshot:
+        """The state of bodies that have not begun."""
         kept = robot.episode_limit if robot.keeps_episodes else 0
         return cls(
             np.zeros((bodies, len(robot.observation_spec)), np.float32),
@@ -150,52 +150,52 @@ class Standing(NamedTuple):
 
 
 class Bodies:
-    """Bodies of one robot side by side, each with episodes of its own, one after the other.
+    """Bodies of one robot side by side, each with its own sequence of episodes.
 
     Args:
-        robot: whose bodies they are.
+        robot: to which the bodies belong.
         seeds: of each body; the seed of an episode follows from it and the episode's number.
-        with_pictures: whether they can be asked for a picture.
+        with_pictures: whether the bodies have pictures.
     """
 
     def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]], *, with_pictures: bool = False) -> None:
         self.robot, self._seeds = robot, [tuple(seed) for seed in seeds]
         make = partial(robot.body, with_pictures=True) if with_pictures else robot.body
-        self._bodies = [tried(robot, "being made", make) for _ in seeds]
-        self._at = Standing.of_none(robot, len(self._bodies))
+        self._bodies = [call_body(robot, "being made", make) for _ in seeds]
+        self._now = Snapshot.initial(robot, len(self._bodies))
 
     def __len__(self) -> int:
         return len(self._bodies)
 
     @property
-    def standing(self) -> Standing:
-        """Where they stand; a copy."""
-        return Standing(*(part.copy() for part in self._at))
+    def snapshot(self) -> Snapshot:
+        """A copy of their current state."""
+        return Snapshot(*(part.copy() for part in self._now))
 
     @property
     def observation(self) -> Float32[np.ndarray, "bodies observations"]:
-        """Their last ones; a copy."""
-        return self._at.observation.copy()
+        """A copy of their last observations."""
+        return self._now.observation.copy()
 
-    def take_seeds(self, seeds: Sequence[Sequence[int]]) -> None:
-        """Have the seeds of new bodies from the next episodes on."""
+    def reseed(self, seeds: Sequence[Sequence[int]]) -> None:
+        """Use the seeds of new bodies from the next episodes on."""
         self._seeds = [tuple(seed) for seed in seeds]
-        self._at.episodes[:] = 0
+        self._now.episodes[:] = 0
 
     def begin(self, which: Sequence[int] | None = None) -> Float32[np.ndarray, "bodies observations"]:
-        """Start an episode of each, or of some; returns the last observations of all."""
+        """Start an episode of each body, or of some; returns the last observations of all."""
         for body in range(len(self._bodies)) if which is None else which:
             self._begin(body)
         self._expect_finite()
         return self.observation
 
-    def step(self, commands: Float[np.ndarray, "bodies commands"]) -> Stepped:
-        """One iteration of each; ended episodes wait for `begin`.
+    def step(self, commands: Float[np.ndarray, "bodies commands"]) -> StepResult:
+        """One iteration of each body; ended episodes wait for `begin`.
 
         Raises:
-            BodyFailed: naming the robot, if a body raised, hung, or gave what is no finite number.
+            BodyFailed: naming the robot, if a body raised, hung, or returned a number that is not finite.
         """
-        robot, (observation, _, iterations, kept), bodies = self.robot, self._at, self._bodies
+        robot, (observation, _, iterations, kept), bodies = self.robot, self._now, self._bodies
         actions = robot.actions(commands)
         reward = np.zeros(len(bodies))
         terminated, truncated = np.zeros(len(bodies), bool), np.zeros(len(bodies), bool)
@@ -204,7 +204,7 @@ class Bodies:
             for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
                 observation[i], reward[i], terminated[i], truncated[i] = body.step(action)
 
-        tried(robot, "step", step)
+        call_body(robot, "step", step)
         if kept.shape[1]:
             kept[np.arange(len(bodies)), iterations] = commands
         iterations += 1
@@ -212,76 +212,77 @@ class Bodies:
         if not np.isfinite(reward).all():
             raise BodyFailed(f"{robot.name}: expected finite rewards, got NaN or infinite ones")
         truncated |= iterations >= robot.episode_limit
-        return Stepped(observation.copy(), reward, terminated, truncated & ~terminated)
+        return StepResult(observation.copy(), reward, terminated, truncated & ~terminated)
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """The first body as it is now; None where it gives none."""
-        return tried(self.robot, "render", self._bodies[0].picture)
+        """The first body as it is now; None if it has no picture."""
+        return call_body(self.robot, "render", self._bodies[0].picture)
 
-    def stand(self, at: Standing) -> bool:
-        """Bring new bodies to where others stood; returns whether they came there.
+    def restore(self, snapshot: Snapshot) -> bool:
+        """Bring new bodies to the state of others; returns whether that succeeded.
 
-        Where they did not, as the robot's state is not kept or they answered otherwise than before, each has begun its
-        next episode.
+        If not, because the robot's state is not kept or the bodies behaved differently, each has begun its next
+        episode.
         """
-        for part, kept in zip(self._at, at, strict=True):
+        for part, kept in zip(self._now, snapshot, strict=True):
             part[...] = kept
-        if at.commands.shape[1] and at.episodes.all():
-            if all(self._came(body, at) for body in range(len(self._bodies))):
+        if snapshot.commands.shape[1] and snapshot.episodes.all():
+            if all(self._replay(body, snapshot) for body in range(len(self._bodies))):
                 return True
-            self._at.episodes[:] = at.episodes
+            self._now.episodes[:] = snapshot.episodes
         self.begin()
         return False
 
-    def _came(self, body: int, at: Standing) -> bool:
-        self._at.episodes[body] -= 1
+    def _replay(self, body: int, snapshot: Snapshot) -> bool:
+        self._now.episodes[body] -= 1
         self._begin(body)
-        seen: Any = self._at.observation[body]
-        for action in self.robot.actions(at.commands[body, : at.iterations[body]]):
-            seen = tried(self.robot, "step", self._bodies[body].step, action)[0]
-        self._at.observation[body], self._at.iterations[body] = seen, at.iterations[body]
-        return np.array_equal(self._at.observation[body], at.observation[body])
+        observation: Any = self._now.observation[body]
+        for action in self.robot.actions(snapshot.commands[body, : snapshot.iterations[body]]):
+            observation = call_body(self.robot, "step", self._bodies[body].step, action)[0]
+        self._now.observation[body], self._now.iterations[body] = observation, snapshot.iterations[body]
+        return np.array_equal(self._now.observation[body], snapshot.observation[body])
 
     def _begin(self, body: int) -> None:
-        seed = np.random.SeedSequence((*self._seeds[body], int(self._at.episodes[body]))).generate_state(1)[0]
+        seed = np.random.SeedSequence((*self._seeds[body], int(self._now.episodes[body]))).generate_state(1)[0]
 
         def reset() -> None:
-            # What it gives may be anything.
-            self._at.observation[body] = self._bodies[body].reset(int(seed))
+            # The assignment may raise too: a body may return anything.
+            self._now.observation[body] = self._bodies[body].reset(int(seed))
 
-        tried(self.robot, "reset", reset)
-        self._at.episodes[body] += 1
-        self._at.iterations[body] = 0
+        call_body(self.robot, "reset", reset)
+        self._now.episodes[body] += 1
+        self._now.iterations[body] = 0
 
     def _expect_finite(self) -> None:
-        if not np.isfinite(self._at.observation).all():
+        if not np.isfinite(self._now.observation).all():
             raise BodyFailed(f"{self.robot.name}: expected finite observations, got NaN or infinite ones")
 
 
-def tried(robot: HostRobot, what: str, call: Callable[..., Answer], *arguments: Any) -> Answer:
-    """Call what is somebody else's; whatever it raises becomes one line that names the robot (BodyFailed)."""
+def call_body(robot: HostRobot, what: str, function: Callable[..., Answer], *arguments: Any) -> Answer:
+    """Call external code; whatever it raises becomes a one-line BodyFailed that names the robot."""
     try:
-        with within(robot, what):
-            return call(*arguments)
+        with time_limit(robot, what):
+            return function(*arguments)
     except AnimatError:
-        # What the house has said in one line stays as it is.
+        # Ours already have a one-line message.
         raise
     except (Exception, SystemExit) as error:
         raise BodyFailed(f"{robot.name}: expected {what} to succeed, got {first_line(error)}") from error
 
 
 class _TooLongError(BaseException):
-    """Not an Exception: a body that catches those would catch this one."""
+    """Not an Exception, which a body might catch."""
 
 
 @contextmanager
-def within(robot: HostRobot, what: str) -> Iterator[None]:
-    """Give what is somebody else's `PATIENCE_S`.
+def time_limit(robot: HostRobot, what: str) -> Iterator[None]:
+    """Limit external code to `PATIENCE_S`.
 
-    Only in a process's first thread, which alone takes signals, and once the body's code comes back to Python.
+    This works only in a process's main thread, the only one to receive signals, and takes effect when the body's code
+    returns to Python.
 
     Raises:
-        BodyFailed: after that.
+        BodyFailed: after that time.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -291,12 +292,12 @@ def within(robot: HostRobot, what: str) -> Iterator[None]:
         raise _TooLongError
 
     before = signal.signal(signal.SIGALRM, interrupt)
-    # Again every second, as a bare `except:` would swallow it once.
+    # Repeated every second, as a bare `except:` might swallow it.
     others = signal.setitimer(signal.ITIMER_REAL, PATIENCE_S, 1.0)
     try:
         yield
     except _TooLongError:
-        raise BodyFailed(f"{robot.name}: expected {what} within {PATIENCE_S:g} s, got no answer: it hangs") from None
+        raise BodyFailed(f"{robot.name}: expected {what} within {PATIENCE_S:g} s, got no response: it hangs") from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL if before is None else before)

@@ -1,4 +1,4 @@
-"""What is found out on a body of others by moving it at random: how large its observations are, what decides it."""
+"""Measurements on an external body under random commands: the scale of its observations, and whether it repeats."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import numpy as np
 from animat.robots.host import Bodies, HostRobot
 
 _MEASURED_STEPS = 1_000
-"""Of random commands, in episodes one after the other."""
+"""Random commands, in consecutive episodes."""
 _REPEATED_STEPS = 50
 _SEED = 20_260_000
 
 
 def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, ...]:
-    """The scale of each observed number: its bound, or where none is known the root mean square over random commands.
+    """The scale of each observed number: its bound, or, if that is not known, its root mean square.
 
-    To two digits, so that it is the same where a processor rounds otherwise; 1 for what is always 0.
+    The root mean square is over random commands. It has two digits, so that it does not depend on how a processor
+    rounds, and is 1 for a number that is always 0.
 
     Args:
-        bounds: how large each number can be; 0 where that is not known.
+        bounds: largest size of each number; 0 if not known.
 
     Raises:
         BodyFailed: as `Bodies.step`.
@@ -43,7 +44,7 @@ def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, .
 
 
 def is_repeatable(robot: HostRobot) -> bool:
-    """Whether an episode is the same again in a new body, by its seed and commands, whatever was before it."""
+    """Whether its seed and commands determine an episode, in a new body as in one that was used before."""
     used, new = Bodies(robot, [(_SEED, 1)]), Bodies(robot, [(_SEED, 2)])
     rng = np.random.default_rng(_SEED)
     used.begin()
@@ -51,14 +52,14 @@ def is_repeatable(robot: HostRobot) -> bool:
         if used.step(_random_command(robot, rng)).ended[0]:
             break
     again = Bodies(robot, [(_SEED, 2)])
-    # The same episode, the one body fresh, the other after an episode of its own.
-    used.take_seeds([(_SEED, 2)])
-    starts = [each.begin() for each in (used, new, again)]
+    # The same episode in fresh bodies and in one that has run another.
+    used.reseed([(_SEED, 2)])
+    starts = [bodies.begin() for bodies in (used, new, again)]
     if any(not np.array_equal(start, starts[0]) for start in starts):
         return False
     for _ in range(_REPEATED_STEPS):
         command = _random_command(robot, rng)
-        one, *others = (each.step(command) for each in (used, new, again))
+        one, *others = (bodies.step(command) for bodies in (used, new, again))
         if any(not np.array_equal(a, b) for other in others for a, b in zip(one, other, strict=True)):
             return False
         if one.ended[0]:

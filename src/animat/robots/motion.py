@@ -1,4 +1,4 @@
-"""What several robots compute alike: angles, the equations of motion over a step, and what distance costs."""
+"""Computations that several robots share: angles, equations of motion over a step, and the cost of distance."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def within_half_a_turn(angle_rad: Float[Array, ""]) -> Float[Array, ""]:
 
 def cost_of_distance(distance_m: Float[Array, ""], radius_m: float) -> Float[Array, ""]:
     """R / d - 1 with R the radius of a goal and d the distance to its centre: 0 within it, towards -1 far away."""
-    # At the goal the distance may be zero; the larger of the two keeps R / d finite there.
+    # The distance may be zero at the goal; the maximum keeps R / d finite there.
     return radius_m / jnp.maximum(distance_m, radius_m) - 1
 
 
 def runge_kutta(rates: Callable[[Numbers], Numbers], state: Numbers, step_s: float) -> Numbers:
-    """The state a step later, by the classical Runge-Kutta method of fourth order.
+    """The state one step later, by the classical Runge-Kutta method of fourth order.
 
         y(t + h) = y + h/6 (k1 + 2 k2 + 2 k3 + k4),
         k1 = f(y), k2 = f(y + h/2 k1), k3 = f(y + h/2 k2), k4 = f(y + h k3)
 
     Args:
-        rates: f, how fast each number of a state changes, per second; commands do not change within a step.
+        rates: f, the derivative of each number of a state, per second; commands are constant within a step.
         state: y, a pytree.
         step_s: h.
     """

@@ -21,9 +21,9 @@ from animat.robots.registry import register_robot
 
 
 class NavigationState(NamedTuple):
-    """Where the robot is and where it looks, seen from above: x to the right, y down from the top-left corner.
+    """Position and heading of the robot, seen from above: x to the right, y down from the top-left corner.
 
-    The heading is 0 to the right and grows clockwise, as y points down; it lies in (-pi, pi].
+    The heading is 0 to the right and increases clockwise, as y points down; it lies in (-pi, pi].
     """
 
     x_m: Float[Array, ""]
@@ -35,7 +35,7 @@ class NavigationState(NamedTuple):
 @register_robot
 @record
 class Navigation(Robot[NavigationState]):
-    """A robot that turns by the command, then moves ahead; 50 at the goal, else a small cost that falls as it nears.
+    """A robot that turns by the command, then moves ahead; 50 at the goal, else a cost that falls as it approaches.
 
         heading += turn_rad u,    position += stride_m (cos heading, sin heading), clipped to the arena
         reward   = reward_goal if d <= R (and the episode ends), else R / d - 1
@@ -43,15 +43,15 @@ class Navigation(Robot[NavigationState]):
     with d the distance to the goal after the move and R the goal's radius. An episode starts in the top-left corner,
     facing right.
 
-    The paper prints 20 iterations an episode, in which the goal cannot be reached (`fewest_iterations_to_goal` is 36);
-    the default here is 100. `Navigation.as_printed()` is the paper taken at its word, and its `caveats` say so.
+    The paper prints 20 iterations per episode, too few to reach the goal (`fewest_iterations_to_goal` is 36); the
+    default here is 100. `Navigation.as_printed()` takes the paper literally, and its `caveats` say so.
 
     Attributes:
-        turn_rad: turn of one iteration at u = 1.
+        turn_rad: turn per iteration at u = 1.
         goal_x_m, goal_y_m: from the top-left corner, to the right and down.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or has no meaning, or a goal outside the arena.
+        InvalidArgument: for a parameter that is not finite or makes no sense, or a goal outside the arena.
 
     Source: Sawada et al. 2022, the navigation task.
     """
@@ -59,7 +59,7 @@ class Navigation(Robot[NavigationState]):
     arena_width_m: Size = 1.0
     arena_height_m: Size = 1.0
     stride_m: Size = 0.025
-    # One turn never passes half a circle, so one correction brings the heading back into (-pi, pi].
+    # A turn never exceeds half a circle, so one correction brings the heading back into (-pi, pi].
     turn_rad: Annotated[Number, Field(ge=0, le=math.pi)] = math.pi / 10
     goal_x_m: Amount = 0.7
     goal_y_m: Amount = 0.7
@@ -77,7 +77,7 @@ class Navigation(Robot[NavigationState]):
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """Of an episode far from the goal until its end, or one that reaches it at once."""
+        """From staying as far from the goal as possible to reaching it immediately."""
         farthest_m = math.hypot(
             max(self.goal_x_m, self.arena_width_m - self.goal_x_m),
             max(self.goal_y_m, self.arena_height_m - self.goal_y_m),
@@ -88,13 +88,12 @@ class Navigation(Robot[NavigationState]):
 
     @classmethod
     def as_printed(cls) -> Navigation:
-        """The paper to the letter: 20 iterations an episode, too few to reach the goal."""
+        """The paper taken literally: 20 iterations per episode, too few to reach the goal."""
         return cls(episode_limit=20)
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
         """Position from the top-left corner, and heading."""
-        # The scales are one metre and one radian for an arena of a metre; the heading is an angle and jumps at pi.
         return (
             Quantity("x", "m", self.arena_width_m, 0.0, self.arena_width_m),
             Quantity("y", "m", self.arena_height_m, 0.0, self.arena_height_m),
@@ -103,14 +102,14 @@ class Navigation(Robot[NavigationState]):
 
     @property
     def fewest_iterations_to_goal(self) -> int:
-        """Iterations of a straight run from the start to the goal's edge: no episode can reach it in fewer."""
+        """Iterations of a straight run from the start to the goal's edge: the fewest in which it can be reached."""
         distance_m = max(0.0, math.hypot(self.goal_x_m, self.goal_y_m) - self.goal_radius_m)
-        # Off by rounding must not add an iteration, nor take one away from a goal exactly n strides away.
+        # Rounding must not add an iteration to a goal exactly n strides away.
         return max(1, math.ceil(distance_m / self.stride_m - 1e-9))
 
     @property
     def goal_reachable(self) -> bool:
-        """Whether an episode is long enough for a straight run to the goal; if not, no policy can reach it."""
+        """Whether an episode is long enough for a straight run to the goal; otherwise no policy can reach it."""
         return self.fewest_iterations_to_goal <= self.episode_limit
 
     def reset(self, key: Array) -> NavigationState:
@@ -135,7 +134,7 @@ class Navigation(Robot[NavigationState]):
         return jnp.stack(state)
 
     def caveats(self) -> tuple[str, ...]:
-        """Says so where the goal cannot be reached within an episode."""
+        """A warning if the goal cannot be reached within an episode."""
         if self.goal_reachable:
             return ()
         reach_m = self.episode_limit * self.stride_m
@@ -145,32 +144,32 @@ class Navigation(Robot[NavigationState]):
         )
 
     def departures(self) -> tuple[tuple[str, str], ...]:
-        """The length of an episode, and what a wall does."""
-        told = ("; with 20 no" if self.episode_limit > 20 else ", with which no") + " policy can reach the goal."
+        """The length of an episode, and the effect of a wall."""
+        reachable = ("; with 20 no" if self.episode_limit > 20 else ", with which no") + " policy can reach the goal."
         return (
             (
                 "20 iterations",
                 "The paper prints at most 20 iterations for an episode of navigation: 0.5 m of path to a goal that is "
-                f"0.89 m away. Here there are {self.episode_limit} (episode_limit){told}",
+                f"0.89 m away. Here there are {self.episode_limit} (episode_limit){reachable}",
             ),
             (
                 "Walls",
-                "The paper does not say what a wall does. Here the robot stays inside: one that runs into a wall "
-                "slides along it, and is not punished for it.",
+                "The paper does not describe the effect of a wall. Here the robot stays inside: one that runs into a "
+                "wall slides along it, without a penalty.",
             ),
         )
 
     def heuristic(self, observation: Any) -> Any:
-        """A full turn to the side that the goal lies on: by d sin(a), with the goal d m away at an angle a."""
+        """A full turn to the side of the goal: by the sign of d sin(a), with the goal d m away at an angle a."""
         xp = observation.__array_namespace__()
         x_m, y_m, heading_rad = observation
         right = xp.cos(heading_rad) * (self.goal_y_m - y_m) - xp.sin(heading_rad) * (self.goal_x_m - x_m)
         return 2.0 * (right > 0) - 1.0
 
     def value_grid(self) -> Grid:
-        """The grid that was measured to suit it (see docs/evidence/optimal-return.md).
+        """The grid found by measurement to suit the task (see docs/evidence/optimal-return.md).
 
-        A hundred headings: turns of u pi/10 with u a multiple of 0.2 lead from one of them to another exactly.
+        With a hundred headings, turns of u pi/10 with u a multiple of 0.2 lead exactly from one to another.
         """
         return Grid(
             Axis("x", "m", 0.0, self.arena_width_m, 61),
@@ -183,7 +182,7 @@ class Navigation(Robot[NavigationState]):
         )
 
     def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
-        """The robot in its arena with the goal, and the way that it came (see `animat.robots.drawing`)."""
+        """The robot in its arena, with the goal and the robot's path (see `animat.robots.drawing`)."""
         x, y, heading = (float(value) for value in observation)
         width_m, height_m = self.arena_width_m, self.arena_height_m
         margin = 0.06 * height_m
@@ -202,7 +201,7 @@ class Navigation(Robot[NavigationState]):
         return canvas.picture()
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
-        """Where the robot went in each episode, seen from above."""
+        """The robot's path in each episode, seen from above."""
         from matplotlib.patches import Circle, Rectangle
 
         axes.add_patch(
@@ -211,8 +210,8 @@ class Navigation(Robot[NavigationState]):
         goal = (self.goal_x_m, self.goal_y_m)
         axes.add_patch(Circle(goal, self.goal_radius_m, color=AIM, alpha=0.35, linewidth=0))
         arrived = [math.hypot(*(path[-1, :2] - goal)) <= self.goal_radius_m for path in paths]
-        for path, there in zip(paths, arrived, strict=True):
-            axes.plot(path[:, 0], path[:, 1], color=DONE if there else FAILED, linewidth=0.7, alpha=0.8)
+        for path, has_arrived in zip(paths, arrived, strict=True):
+            axes.plot(path[:, 0], path[:, 1], color=DONE if has_arrived else FAILED, linewidth=0.7, alpha=0.8)
         axes.set_aspect("equal")
         axes.set_xlim(-0.03, self.arena_width_m + 0.03)
         axes.set_ylim(self.arena_height_m + 0.03, -0.03)

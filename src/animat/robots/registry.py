@@ -13,19 +13,19 @@ REGISTRY: Registry[Robot[Any]] = Registry("robot", Robot)  # type: ignore[type-a
 """An installed package announces its robots in the entry point group `animat.robots`."""
 
 ROBOTS = REGISTRY.kinds
-"""The robots registered so far, by their names."""
+"""The registered robots, by name."""
 
 robot_named, robot_to_dict, robot_from_dict = REGISTRY.named, REGISTRY.to_dict, REGISTRY.from_dict
 
 
 def register_robot(kind: Kind) -> Kind:
-    """Make a robot known by its name, so that its policies can be saved and loaded; a decorator of its class.
+    """Class decorator that registers a robot by its name, so that its policies can be saved and loaded.
 
     Args:
         kind: a frozen dataclass of all parameters, with the methods of `Robot`.
 
     Raises:
-        InvalidArgument: for another class, one that lacks a method, or a name that another robot has.
+        InvalidArgument: for any other class, a missing method, or a name that another robot has.
     """
     REGISTRY.register(kind)
     return kind

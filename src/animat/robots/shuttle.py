@@ -1,4 +1,4 @@
-"""Shuttle: a cart goes to one of two places on a track, the one that a cue names, and keeps off the other one."""
+"""Shuttle: a cart goes to the one of two places on a track that a cue indicates, and keeps off the other."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
 
 BRAKE_S = 0.2
-"""Of the heuristic: how far ahead of the cart it looks, in seconds of its present velocity."""
+"""How far ahead of the cart the heuristic looks, in seconds of its current velocity."""
 
 
 class ShuttleState(NamedTuple):
-    """Where the cart is, from the middle of the track to the right, and which place it is to go to."""
+    """The cart's position, from the middle of the track to the right, its velocity, and the cue."""
 
     position_m: Float[Array, ""]
     velocity_m_per_s: Float[Array, ""]
@@ -34,28 +34,28 @@ class ShuttleState(NamedTuple):
 @register_robot
 @record
 class Shuttle(Robot[ShuttleState]):
-    """A cart between two places; +1 an iteration that ends at the one that the cue names, -1 at the other one, else 0.
+    """A cart between two places; +1 for an iteration that ends at the cue's place, -1 at the other, else 0.
 
         time_constant_s v' = speed_m_per_s u - v,    x' = v
 
     with x the cart's position and v its velocity. An iteration is the exact solution for a constant u. A cart that
-    comes to an end of the track stops there. An episode starts at rest in the middle; its cue is drawn, right as often
-    as left, and it never ends by itself.
+    reaches an end of the track stops there. An episode starts at rest in the middle and is never terminated. Its cue is
+    drawn, right and left with equal probability.
 
-    What is right at one place is wrong at the other, and position and velocity do not tell which is which: without the
+    What is right at one place is wrong at the other, and position and velocity do not show which is which: without the
     cue, no rule has a mean return above 0.
 
     Attributes:
-        place_m: how far both places are from the middle.
-        place_radius_m: how near to a place the cart is there.
-        speed_m_per_s: of the cart, in the end, at u = 1.
-        time_constant_s: in which it comes up to speed.
+        place_m: distance of both places from the middle.
+        place_radius_m: within which the cart counts as being at a place.
+        speed_m_per_s: the cart's final speed at u = 1.
+        time_constant_s: of its approach to that speed.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or has no meaning, places that overlap, or places that
+        InvalidArgument: for a parameter that is not finite or makes no sense, places that overlap, or places that
             are not on the track.
 
-    Source: the two-way shuttle box, in which an animal goes to the other side on a cue (Warner 1932,
+    Source: the two-way shuttle box, in which an animal crosses to the other side on a cue (Warner 1932,
     Journal of Genetic Psychology 41:57-90).
     """
 
@@ -84,7 +84,7 @@ class Shuttle(Robot[ShuttleState]):
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """Of an episode that is all the time at the worse of the two places, or at the better one."""
+        """From always being at the worse of the two places to always at the better."""
         rewards = (0.0, self.reward_there, self.reward_elsewhere)
         return self.episode_limit * min(rewards), self.episode_limit * max(rewards)
 
@@ -107,13 +107,12 @@ class Shuttle(Robot[ShuttleState]):
         self, uniforms: Float[Array, " noise_size"], state: ShuttleState, u: Float[Array, ""]
     ) -> tuple[ShuttleState, Float[Array, ""], Bool[Array, ""]]:
         kept = math.exp(-self.step_s / self.time_constant_s)
-        wanted = self.speed_m_per_s * u
-        moved = wanted * self.step_s + (state.velocity_m_per_s - wanted) * self.time_constant_s * (1 - kept)
+        final = self.speed_m_per_s * u
+        moved = final * self.step_s + (state.velocity_m_per_s - final) * self.time_constant_s * (1 - kept)
         half_m = self.track_length_m / 2
         free_m = state.position_m + moved
         position = jnp.clip(free_m, -half_m, half_m)
-        velocity = jnp.where(position == free_m, wanted + (state.velocity_m_per_s - wanted) * kept, 0.0)
-        # From the cue's place: 0 there, and twice `place_m` at the other one.
+        velocity = jnp.where(position == free_m, final + (state.velocity_m_per_s - final) * kept, 0.0)
         off_m = jnp.abs(position - state.cue * self.place_m)
         off_other_m = jnp.abs(position + state.cue * self.place_m)
         other = jnp.where(off_other_m <= self.place_radius_m, self.reward_elsewhere, 0.0)
@@ -125,19 +124,19 @@ class Shuttle(Robot[ShuttleState]):
         return jnp.stack(state)
 
     def with_goal_of(self, state: ShuttleState, other: ShuttleState) -> ShuttleState:
-        """Where one is, with the cue of the other."""
+        """The cart of one state, with the cue of the other."""
         return state._replace(cue=other.cue)
 
     def heuristic(self, observation: Any) -> Any:
-        """To the cue's place, the more slowly the nearer it is, with the present velocity taken into account."""
+        """Towards the cue's place, more slowly the nearer it gets, allowing for the current velocity."""
         xp = observation.__array_namespace__()
         position, velocity, cue = observation
         return xp.clip((cue * self.place_m - position - BRAKE_S * velocity) / self.place_radius_m, -1.0, 1.0)
 
     def value_grid(self) -> Grid:
-        """Cue by position by velocity; of the cue's nodes, its two values alone are ever met.
+        """Cue by position by velocity; of the cue's nodes, only those of its two values are ever visited.
 
-        Every command of its own, as one may decide whether an iteration is rewarded.
+        Computed for every command, as a command may decide whether an iteration is rewarded.
         """
         half_m, fastest = self.track_length_m / 2, self.speed_m_per_s
         return Grid(
@@ -151,10 +150,7 @@ class Shuttle(Robot[ShuttleState]):
         )
 
     def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
-        """The cart on its track between the two places; the one that the cue names is filled.
-
-        The command is an arrow under the cart (see `animat.robots.drawing`).
-        """
+        """The cart on its track, with the cue's place filled and the command as a line under the cart."""
         position, _, cue = (float(value) for value in observation)
         half_m, radius_m = self.track_length_m / 2, self.place_radius_m
         margin = 0.1 * self.track_length_m
@@ -178,10 +174,10 @@ class Shuttle(Robot[ShuttleState]):
         return canvas.picture()
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
-        """How far the cart was on the cue's side of the middle in each episode, over time."""
+        """The cart's position towards the cue's side over time in each episode."""
         towards_m = [path[:, 0] * path[0, 2] for path in paths]
-        arrived = [bool(abs(each[-1] - self.place_m) <= self.place_radius_m) for each in towards_m]
+        arrived = [bool(abs(positions[-1] - self.place_m) <= self.place_radius_m) for positions in towards_m]
         edges_m = (self.place_m - self.place_radius_m, self.place_m + self.place_radius_m)
-        told, ylabel = "end at their place", "position on the cue's side (m)"
-        draw_over_time(axes, self, towards_m, arrived, limits=edges_m, told=told, ylabel=ylabel)
+        success, ylabel = "end at their place", "position on the cue's side (m)"
+        draw_over_time(axes, self, towards_m, arrived, limits=edges_m, success=success, ylabel=ylabel)
         axes.set_ylim(-0.55 * self.track_length_m, 0.55 * self.track_length_m)

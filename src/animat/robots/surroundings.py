@@ -1,4 +1,4 @@
-"""What stands around a robot that drives: straight walls and round obstacles, how far they are, and what is free."""
+"""Surroundings of a driving robot: straight walls and round obstacles, their distances, and free places."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from animat.records import Number
 from animat.robots.base import Size
 
 Wall = tuple[Number, Number, Number, Number]
-"""From (x, y) to (x, y), in metres; it has no thickness."""
+"""From (x, y) to (x, y), in metres, without thickness."""
 
 Obstacle = tuple[Number, Number, Size]
 """Centre x and y, and radius, in metres."""
@@ -34,29 +34,31 @@ class Surroundings(NamedTuple):
     obstacles: tuple[Obstacle, ...]
 
     def clearance_m(self, x_m: Float[Array, "*places"], y_m: Float[Array, "*places"]) -> Float[Array, "*places"]:
-        """How far the nearest wall or the edge of the nearest obstacle is; below 0 within one, infinite for nothing.
+        """Distance to the nearest wall or obstacle's edge; below 0 inside an obstacle, infinite if there is nothing.
 
         Args:
-            x_m, y_m: of places, of numpy or JAX.
+            x_m, y_m: of places, as NumPy or JAX arrays.
         """
         xp = x_m.__array_namespace__()
-        apart: Array = xp.full_like(x_m, math.inf)
+        distance_m: Array = xp.full_like(x_m, math.inf)
         for x1, y1, x2, y2 in self.walls:
             along = ((x_m - x1) * (x2 - x1) + (y_m - y1) * (y2 - y1)) / max((x2 - x1) ** 2 + (y2 - y1) ** 2, 1e-18)
             nearest = xp.clip(along, 0.0, 1.0)
-            apart = xp.minimum(apart, xp.hypot(x_m - x1 - nearest * (x2 - x1), y_m - y1 - nearest * (y2 - y1)))
+            to_wall_m = xp.hypot(x_m - x1 - nearest * (x2 - x1), y_m - y1 - nearest * (y2 - y1))
+            distance_m = xp.minimum(distance_m, to_wall_m)
         for x, y, radius in self.obstacles:
-            apart = xp.minimum(apart, xp.hypot(x_m - x, y_m - y) - radius)
-        return apart
+            distance_m = xp.minimum(distance_m, xp.hypot(x_m - x, y_m - y) - radius)
+        return distance_m
 
     def along_rays_m(
         self, x_m: Float[Array, ""], y_m: Float[Array, ""], directions_rad: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
-        """How far it is from a place to the first wall or obstacle in some directions; infinite for nothing.
+        """Distance from a place to the first wall or obstacle in given directions; infinite if there is nothing.
 
-        A ray from p along the unit vector d meets the wall from a to b at t = (a - p) x (b - a) / d x (b - a), where
-        that is at least 0 and s = (a - p) x d / d x (b - a) lies in [0, 1]; and the circle about c with radius r at
-        t = h - sqrt(h^2 - |c - p|^2 + r^2) with h = (c - p) . d, at 0 from within. All are of numpy, or all of JAX.
+        A ray from p along the unit vector d meets the wall from a to b at t = (a - p) x (b - a) / d x (b - a), if that
+        is at least 0 and s = (a - p) x d / d x (b - a) lies in [0, 1]. It meets the circle about c with radius r at
+        t = h - sqrt(h^2 - |c - p|^2 + r^2) with h = (c - p) . d, or at 0 from within. The arguments are all NumPy or
+        all JAX arrays.
         """
         xp = directions_rad.__array_namespace__()
         dx, dy = xp.cos(directions_rad), xp.sin(directions_rad)
@@ -82,7 +84,7 @@ class Surroundings(NamedTuple):
         return nearest
 
     def box_m(self) -> tuple[float, float, float, float]:
-        """The least rectangle around all walls and obstacles: its left, top, right and bottom."""
+        """The smallest rectangle around all walls and obstacles: left, top, right and bottom."""
         points = [(x, y) for wall in self.walls for x, y in (wall[:2], wall[2:])]
         points += [(x + sign * r, y + sign * r) for x, y, r in self.obstacles for sign in (-1, 1)]
         xs, ys = zip(*points, strict=True)
@@ -93,17 +95,17 @@ class Surroundings(NamedTuple):
 def places_within_reach(
     around: Surroundings, start_m: tuple[float, float], room_m: float, spacing_m: float
 ) -> Float[np.ndarray, "places 2"]:
-    """The places of a square lattice through the start to which a disc can be moved from there.
+    """The places of a square lattice through the start to which a disc can be moved from the start.
 
     Args:
-        start_m: where the disc's centre is at first.
-        room_m: how near its centre may come to a wall or an obstacle.
-        spacing_m: between neighbours in the lattice, less than twice `room_m`, or it passes through walls; a disc
-            moves between a place and its four neighbours.
+        start_m: initial position of the disc's centre.
+        room_m: smallest allowed distance of the centre from a wall or an obstacle.
+        spacing_m: between neighbours in the lattice, less than twice `room_m`, or the disc passes through walls; it
+            moves from a place to its four neighbours.
 
     Returns:
-        x and y (m) of each, the start among them; none where the disc has no room at the start, or where there are
-        more than a million places to look at.
+        x and y (m) of each, including the start; none if the disc has no room at the start, or if there are more than
+        a million places to check.
     """
     from scipy.ndimage import label
 

@@ -20,11 +20,11 @@ from animat.robots.motion import runge_kutta, within_half_a_turn
 from animat.robots.registry import register_robot
 
 SPARE = 0.07
-"""Of the heuristic: how much more energy than it takes to stand, as a part of the largest acceleration by gravity."""
+"""The heuristic's surplus over the energy needed to stand, as a fraction of the largest acceleration due to gravity."""
 
 
 class SwingUpState(NamedTuple):
-    """Where the pendulum is: 0 is upright and pi is hanging, positive is clockwise; the angle is in (-pi, pi]."""
+    """State of the pendulum: 0 is upright and pi is hanging, positive is clockwise; the angle is in (-pi, pi]."""
 
     angle_rad: Float[Array, ""]
     angular_velocity_rad_per_s: Float[Array, ""]
@@ -34,22 +34,22 @@ class SwingUpState(NamedTuple):
 @register_robot
 @record
 class SwingUp(Robot[SwingUpState]):
-    """A pendulum swung up by a motor too weak to lift it; +1 an iteration that ends near upright, else 0.
+    """A pendulum swung up by a motor too weak to lift it; +1 for an iteration that ends near upright, else 0.
 
         m l^2 / 3 a'' = m g l / 2 sin a + torque_n_m u
 
     with m the mass and l the length of a uniform rod that turns about its end, and a its angle from upright. With the
-    default numbers that is a'' = 15 sin a + 6 u: the motor alone lifts the rod to 24 degrees from hanging. One step of
-    the classical Runge-Kutta method an iteration; the angular velocity is then clipped to `speed_limit_rad_per_s`, as
-    by a brake. An episode starts at rest, hanging, and never ends by itself.
+    defaults, a'' = 15 sin a + 6 u: the motor alone lifts the rod to 24 degrees from hanging. An iteration is one step
+    of the classical Runge-Kutta method, after which the angular velocity is clipped to `speed_limit_rad_per_s`, as by
+    a brake. An episode starts at rest, hanging, and is never terminated.
 
     Attributes:
-        speed_limit_rad_per_s: the largest angular velocity, to either side.
-        upright_rad: the angle from upright up to which an iteration is rewarded, to either side.
+        speed_limit_rad_per_s: the largest angular velocity, in either direction.
+        upright_rad: the largest rewarded angle from upright, to either side.
         reward_upright: the reward of an iteration that ends there.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or has no meaning, or a step in which the rod could make
+        InvalidArgument: for a parameter that is not finite or makes no sense, or a step in which the rod could make
             a whole turn.
 
     Source: the pendulum of Gymnasium (`Pendulum-v1`) with another reward.
@@ -67,7 +67,7 @@ class SwingUp(Robot[SwingUpState]):
 
     name: ClassVar[str] = "swing-up"
     paper_iterations: ClassVar[int] = 1_000_000
-    # Full power either way swings highest, and is what random commands come near to swinging it up with.
+    # Full power either way swings highest, and gives random commands a chance of swinging it up.
     baseline_commands: ClassVar[tuple[float, ...] | None] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
@@ -79,13 +79,13 @@ class SwingUp(Robot[SwingUpState]):
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """Of an episode that is never near upright, or always."""
-        all_of_it = self.episode_limit * self.reward_upright
-        return min(0.0, all_of_it), max(0.0, all_of_it)
+        """From never being near upright to always."""
+        always = self.episode_limit * self.reward_upright
+        return min(0.0, always), max(0.0, always)
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
-        """Cosine and sine of the angle, which have no jump at the bottom, and the angular velocity."""
+        """Cosine and sine of the angle, which do not jump at the bottom, and the angular velocity."""
         fastest = self.speed_limit_rad_per_s
         return (
             Quantity("angle_cosine", "1", 1.0, -1.0, 1.0),
@@ -116,7 +116,7 @@ class SwingUp(Robot[SwingUpState]):
         return jnp.stack([jnp.cos(state.angle_rad), jnp.sin(state.angle_rad), state.angular_velocity_rad_per_s])
 
     def caveats(self) -> tuple[str, ...]:
-        """Says so where the motor can lift the pendulum without a swing."""
+        """A warning if the motor can lift the pendulum without swinging."""
         if self._push_per_s2 < self._gravity_per_s2:
             return ()
         weakest_n_m = self.mass_kg * self.gravity_m_per_s2 * self.length_m / 2
@@ -126,28 +126,28 @@ class SwingUp(Robot[SwingUpState]):
         )
 
     def heuristic(self, observation: Any) -> Any:
-        """Full power with the movement until the energy suffices to stand; near upright, against the fall.
+        """Full power in the direction of movement until the energy suffices to stand; near upright, against the fall.
 
-        The energy is w^2 / 2 + k (cos a - 1) with k the largest acceleration by gravity, 0 for a rod that stands. Near
-        upright the rod falls with a + w / sqrt(k); the motor catches it where that is less than what it can hold.
+        The energy is w^2 / 2 + k (cos a - 1) with k the largest acceleration due to gravity, 0 for a standing rod. Near
+        upright the rod falls with a + w / sqrt(k); the motor catches it if that is less than it can hold.
         """
         xp = observation.__array_namespace__()
         cosine, sine, angular_velocity = observation
         gravity = max(self._gravity_per_s2, 1e-9)
         energy = angular_velocity**2 / 2 + gravity * (cosine - 1)
-        with_it = xp.where(angular_velocity >= 0, 1.0, -1.0)
-        # A little more than it takes to stand, as the last bit of the way would take for ever.
-        pumping = xp.where(energy < SPARE * gravity, with_it, -with_it)
+        direction = xp.where(angular_velocity >= 0, 1.0, -1.0)
+        # With exactly the energy needed to stand, the last bit of the way would take for ever.
+        pumping = xp.where(energy < SPARE * gravity, direction, -direction)
         falling = sine + angular_velocity / math.sqrt(gravity)
         held = min(self._push_per_s2 / gravity, 1.0)
         catching = xp.clip(-4 * falling, -1.0, 1.0)
         return xp.where((cosine > 0) & (xp.abs(falling) < held), catching, pumping)
 
     def value_grid(self) -> Grid:
-        """Angle by angular velocity, at every command of its own, as one may decide whether a step is rewarded.
+        """Angle by angular velocity, computed for every command, as a command may decide whether a step is rewarded.
 
-        Each of the two has a part in how the other one moves, and a grid wants a first coordinate that has none: it is
-        one that means nothing, with the fewest nodes.
+        Each of the two affects how the other moves, but a grid needs a first coordinate that does not affect the
+        others: here it is a dummy with the fewest nodes.
         """
         fastest = self.speed_limit_rad_per_s
         return Grid(
@@ -161,7 +161,7 @@ class SwingUp(Robot[SwingUpState]):
         )
 
     def draw(self, observation: np.ndarray, command: float, earlier: Sequence[np.ndarray], height_px: int) -> Picture:
-        """The rod, where it is rewarded, and the command as an arc about the pivot (see `animat.robots.drawing`)."""
+        """The rod, the rewarded range, and the command as an arc about the pivot (see `animat.robots.drawing`)."""
         length = self.length_m
         scale = height_px / (2.5 * length)
         canvas = Canvas(height_px, height_px, (height_px / 2, height_px / 2), scale)
@@ -183,20 +183,20 @@ class SwingUp(Robot[SwingUpState]):
         return canvas.picture()
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
-        """How far from upright the pendulum was in each episode, over time."""
+        """The pendulum's angle from upright over time in each episode."""
         limit_deg = math.degrees(self.upright_rad)
         off_deg = [np.degrees(np.arccos(np.clip(path[:, 0], -1, 1))) for path in paths]
-        stood = [bool(each[-1] <= limit_deg) for each in off_deg]
+        stood = [bool(angles[-1] <= limit_deg) for angles in off_deg]
         ylabel = "angle from upright (deg)"
-        draw_over_time(axes, self, off_deg, stood, limits=[limit_deg], told="end upright", ylabel=ylabel)
+        draw_over_time(axes, self, off_deg, stood, limits=[limit_deg], success="end upright", ylabel=ylabel)
         axes.set_ylim(0, 185)
 
     @property
     def _gravity_per_s2(self) -> float:
-        """The largest angular acceleration by gravity: 3 g / (2 l)."""
+        """The largest angular acceleration due to gravity: 3 g / (2 l)."""
         return 1.5 * self.gravity_m_per_s2 / self.length_m
 
     @property
     def _push_per_s2(self) -> float:
-        """That by the motor: 3 torque / (m l^2)."""
+        """The largest angular acceleration due to the motor: 3 torque / (m l^2)."""
         return 3 * self.torque_n_m / (self.mass_kg * self.length_m**2)

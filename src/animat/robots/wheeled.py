@@ -1,4 +1,4 @@
-"""A small robot on two wheels among walls and obstacles: what tasks with its body share."""
+"""A small two-wheeled robot among walls and obstacles: what the tasks with this body share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Walls, places_within_reach
 
 SENSORS_DEG = (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0)
-"""Where the e-puck's proximity sensors look, IR0 to IR7, clockwise from straight ahead."""
+"""Directions of the e-puck's proximity sensors, IR0 to IR7, clockwise from straight ahead."""
 
 SENSORS = (
     "right_front",
@@ -32,12 +32,12 @@ SENSORS = (
 )
 
 APART, SLIPPING = 0.4, 0.21
-"""Parts of the body's radius: between neighbours of the square lattice through the start that goals are drawn from; and
-what room such a lattice shows where a robot could slip through.
+"""In body radii: the spacing of the square lattice, through the start, from which goals are drawn; and the clearance on
+such a lattice above which a robot could slip through a gap.
 
-One iteration moves at most a radius, and is checked at its end: half way there is room of at least half a radius, and
-at the nearest place of the lattice of 0.4 / sqrt(2) less, 0.217. A wall is not slipped through, as on one side of it a
-place has at most 0.2.
+An iteration moves the robot by at most a radius and is checked at its end. Half way there is a clearance of at least
+half a radius, so at the nearest lattice place at least 0.4 / sqrt(2) less, 0.217. No wall is mistaken for a gap, as
+the lattice has a place with a clearance of at most 0.2 on one side of it.
 """
 
 ARENA = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0))
@@ -45,9 +45,9 @@ ARENA = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0,
 
 
 class WheelsState(NamedTuple):
-    """Where the robot is and looks, and where its goal is: seen from above, x to the right, y down.
+    """Position and heading of the robot, and its goal, seen from above: x to the right, y down.
 
-    The heading is 0 to the right and grows clockwise, as y points down; it lies in (-pi, pi].
+    The heading is 0 to the right and increases clockwise, as y points down; it lies in (-pi, pi].
     """
 
     x_m: Float[Array, ""]
@@ -59,33 +59,33 @@ class WheelsState(NamedTuple):
 
 @record
 class Wheeled(Robot[WheelsState]):
-    """Two wheels and eight proximity sensors on the way to a goal, in an arena.
+    """A robot with two wheels and eight proximity sensors that drives to a goal in an arena.
 
         v = max_speed_m_per_s u,    forward = (v_left + v_right) / 2,    turning = (v_left - v_right) / wheel_distance_m
         reward = reward_goal if d <= R (and the episode ends), reward_bump where it bumped, else R / d - 1
         sensor = 1 - clip(distance / sensor_range_m, 0, 1)
 
-    The commands are those of the left and the right wheel. Without a bump the robot moves along the arc of a circle,
-    exactly. Where its body would touch a wall or an obstacle at the end of an iteration, it turns and stays where it
-    is. d is the distance from its centre to the goal and R the goal's radius. A sensor looks straight away from the
-    centre, and its distance is from the edge of the body to what it meets first. An episode starts at `start_x_m`,
-    `start_y_m`, looking anywhere; its goal is drawn from the places that the robot can reach from there with some
-    space around it, and is not yet at.
+    The commands are those of the left and the right wheel. The robot moves along an exact circular arc. If its body
+    would touch a wall or an obstacle at the end of an iteration, it turns but stays where it is. d is the distance from
+    its centre to the goal and R the goal's radius. A sensor points straight away from the centre and measures the
+    distance from the edge of the body to the first thing it meets. An episode starts at `start_x_m`, `start_y_m` with
+    a random heading. Its goal is drawn from the places that the robot can reach from there with some space around it,
+    excluding where it already is.
 
     Attributes:
         max_speed_m_per_s: of a wheel at u = 1.
         sensor_range_m: beyond it a sensor shows 0.
-        walls: each from x, y to x, y (m), of no thickness; of the default an arena of 1 m.
-        obstacles: each with the x and y of its centre and its radius (m).
+        walls: each from x, y to x, y (m), without thickness; by default an arena of 1 m.
+        obstacles: each by the x and y of its centre and its radius (m).
         goal_radius_m: R.
         reward_bump: of an iteration in which it could not move.
 
     Raises:
-        InvalidArgument: for a parameter that is not finite or has no meaning, a start without room or without goals
+        InvalidArgument: for a parameter that is not finite or makes no sense, a start without room or without goals
             within reach, walls that do not close, or a step so long that the robot could pass through a wall.
 
-    Source: Mondada et al. 2009, the e-puck (body, wheels and sensors). Its sensors show reflected infrared light, which
-    falls with distance less evenly, depends on what reflects it, and is noisy; here they show distance.
+    Source: Mondada et al. 2009, the e-puck (body, wheels and sensors). Its sensors measure reflected infrared light,
+    which falls with distance less evenly, depends on the reflecting surface, and is noisy; here they measure distance.
     """
 
     body_radius_m: Size = 0.035
@@ -111,28 +111,28 @@ class Wheeled(Robot[WheelsState]):
             raise InvalidArgument(f"step_s: expected at most {most_s:.3g} at this speed, got {self.step_s:g}")
         if not len(self._goals_m):
             raise InvalidArgument(
-                "start_x_m, start_y_m: expected a place between the walls, with room for the robot and for goals that "
+                "start_x_m, start_y_m: expected a place within the walls, with room for the robot and for goals that "
                 f"it can reach (in at most {MOST_PLACES * (APART * self.body_radius_m) ** 2:.3g} m^2), got "
                 f"{self.start_x_m:g}, {self.start_y_m:g}"
             )
         left, top, right, bottom = self._around.box_m()
         x_m, y_m = self._within_reach(SLIPPING).T
         if x_m.min() <= left or x_m.max() >= right or y_m.min() <= top or y_m.max() >= bottom:
-            raise InvalidArgument("walls: expected them all around the robot, got a gap through which it could leave")
+            raise InvalidArgument("walls: expected walls all around the robot, got a gap through which it could leave")
 
     @property
     def return_range(self) -> tuple[float, float]:
-        """Of an episode with the worst that an iteration can give, or one that reaches the goal at once."""
-        dearest = min(-1.0, self.reward_bump)
+        """From the worst reward in each iteration to reaching the goal immediately."""
+        worst = min(-1.0, self.reward_bump)
         best = max(0.0, self.reward_bump)
-        last = (self.episode_limit - 1) * dearest
-        return min(last + dearest, last + self.reward_goal, self.reward_goal), max(
+        last = (self.episode_limit - 1) * worst
+        return min(last + worst, last + self.reward_goal, self.reward_goal), max(
             self.episode_limit * best, (self.episode_limit - 1) * best + self.reward_goal
         )
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
-        """The sensors clockwise from the front right, then how far the goal is and in which direction."""
+        """The sensors clockwise from the front right, then the distance and bearing of the goal."""
         left, top, right, bottom = self._around.box_m()
         farthest_m = math.hypot(right - left, bottom - top)
         return (
@@ -142,7 +142,7 @@ class Wheeled(Robot[WheelsState]):
         )
 
     def reset(self, key: Array) -> WheelsState:
-        """At the start, looking anywhere; the goal drawn."""
+        """At the start, with a random heading and goal."""
         for_goal, for_heading = jax.random.split(key)
         goal = jnp.asarray(self._goals_m, jnp.float32)[jax.random.randint(for_goal, (), 0, len(self._goals_m))]
         heading = math.pi * (1 - 2 * jax.random.uniform(for_heading))
@@ -153,7 +153,7 @@ class Wheeled(Robot[WheelsState]):
     ) -> tuple[WheelsState, Float[Array, ""], Bool[Array, ""]]:
         left_m, right_m = self.max_speed_m_per_s * self.step_s * jnp.asarray(u)
         turn = (left_m - right_m) / self.wheel_distance_m
-        # The chord of the arc, which points half way between the headings at its ends; jnp.sinc has a factor pi.
+        # The arc's chord points half way between the headings at its ends; jnp.sinc includes a factor pi.
         chord_m = (left_m + right_m) / 2 * jnp.sinc(turn / (2 * math.pi))
         x_m = state.x_m + chord_m * jnp.cos(state.heading_rad + turn / 2)
         y_m = state.y_m + chord_m * jnp.sin(state.heading_rad + turn / 2)
@@ -181,13 +181,13 @@ class Wheeled(Robot[WheelsState]):
         return jnp.concatenate([proximity, jnp.stack([jnp.hypot(to_x_m, to_y_m), bearing])])
 
     def with_goal_of(self, state: WheelsState, other: WheelsState) -> WheelsState:
-        """Where one is, on the way to the other's goal."""
+        """The robot of one state, with the goal of the other."""
         return state._replace(goal_x_m=other.goal_x_m, goal_y_m=other.goal_y_m)
 
     def draw(
         self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
     ) -> Picture:
-        """What the robot senses, seen from itself and looking up: sensors, goal and wheels; its place is not observed.
+        """Sensors, goal and wheels, centred on the robot with its heading upwards, as its position is not observed.
 
         A sensor's line ends where it meets something, or at its range (see `animat.robots.drawing`).
         """
@@ -199,7 +199,7 @@ class Wheeled(Robot[WheelsState]):
             return distance_m * math.sin(bearing), -distance_m * math.cos(bearing)
 
         distance_m, bearing = float(observation[8]), float(observation[9])
-        # A goal out of the picture stands at its edge.
+        # A goal outside the picture is drawn at its edge.
         goal = at(bearing, min(distance_m, 1.25 * reach_m))
         canvas.disc(goal, self.goal_radius_m, GOAL)
         canvas.disc(goal, 0.85 * self.goal_radius_m, GOAL_FILL)
@@ -215,11 +215,11 @@ class Wheeled(Robot[WheelsState]):
         return canvas.picture()
 
     def draw_paths(self, axes: Axes, paths: Sequence[np.ndarray]) -> None:
-        """How far the goal was in each episode, over time."""
+        """The distance to the goal over time in each episode."""
         distances_m, radius_m = [path[:, 8] for path in paths], self.goal_radius_m
-        arrived = [bool(each[-1] <= radius_m) for each in distances_m]
+        arrived = [bool(distance_m[-1] <= radius_m) for distance_m in distances_m]
         ylabel = "distance to the goal (m)"
-        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], told="arrived", ylabel=ylabel)
+        draw_over_time(axes, self, distances_m, arrived, limits=[radius_m], success="arrived", ylabel=ylabel)
         axes.set_ylim(bottom=0)
 
     @property
@@ -228,12 +228,12 @@ class Wheeled(Robot[WheelsState]):
 
     @property
     def _goals_m(self) -> Float[np.ndarray, "goals 2"]:
-        """Where goals may be: with half a body's radius to spare, and so far that it is not there at the start."""
+        """Possible goals: with half a body radius to spare, and more than twice the goal's radius from the start."""
         places = self._within_reach(1.5)
         apart_m = np.hypot(places[:, 0] - self.start_x_m, places[:, 1] - self.start_y_m)
         return places[apart_m > 2 * self.goal_radius_m]
 
     def _within_reach(self, room: float) -> Float[np.ndarray, "places 2"]:
-        """Places to which a disc of so many body radii could be moved from the start."""
+        """Places to which a disc of `room` body radii could be moved from the start."""
         start_m, radius_m = (self.start_x_m, self.start_y_m), self.body_radius_m
         return places_within_reach(self._around, start_m, room * radius_m, APART * radius_m)

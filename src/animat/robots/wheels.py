@@ -1,4 +1,4 @@
-"""Wheels: a small robot on two wheels finds a goal between obstacles by what it senses, without knowing where it is."""
+"""Wheels: a small two-wheeled robot finds a goal among obstacles with its sensors, without knowing its position."""
 
 from __future__ import annotations
 
@@ -14,17 +14,14 @@ from animat.robots.wheeled import Wheeled
 @register_robot
 @record
 class Wheels(Wheeled):
-    """Wheels, four round obstacles around the start, and goals anywhere in the arena.
-
-    Sensors, commands and rewards are those of `Wheeled`.
-    """
+    """`Wheeled` with four round obstacles around the start, and goals anywhere in the arena."""
 
     obstacles: Obstacles = ((0.3, 0.3, 0.08), (0.72, 0.35, 0.06), (0.35, 0.72, 0.06), (0.7, 0.7, 0.08))
 
     name: ClassVar[str] = "wheels"
 
     def heuristic(self, observation: Any) -> Any:
-        """Turns to the goal and away from what its front sensors see, the more slowly ahead the more it turns."""
+        """Towards the goal and away from what the front sensors see, more slowly the more it turns."""
         xp = observation.__array_namespace__()
         bearing = observation[9]
         right = 2 * observation[0] + 2 * observation[1] + observation[2]

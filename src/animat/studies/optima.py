@@ -13,7 +13,7 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress
 from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
-from animat.robots.grid import no_grid
+from animat.robots.grid import why_no_grid
 from animat.studies.evaluating import as_recorded, setting_of, span_min
 from animat.studies.places import optima_file
 from animat.studies.results import read_typed, write_typed
@@ -53,7 +53,7 @@ def left_out(study: Study) -> list[str]:
     messages: list[str] = []
     for robot in dict.fromkeys(spec.robot() for spec in study.robots):
         lacks = lacking(robot)
-        if (why_not := no_grid(robot)) is not None:
+        if (why_not := why_no_grid(robot)) is not None:
             lacks.setdefault("value_grid", f"no optimal return: {why_not}")
         messages += lacks.values()
     return messages
@@ -78,7 +78,7 @@ class FindOptima(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         file = optima_file(folder, self.spec.name, "over-time" if self.over_time else "optima")
-        if no_grid(self.spec.robot()) is not None:
+        if why_no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
         study, timeline = as_recorded(self.study, folder)
         first, last = span_min(timeline)

@@ -20,7 +20,7 @@ from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.neurons.history import AT_FIRST
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.host import Bodies, HostRobot, Standing
+from animat.robots.host import Bodies, HostRobot, Snapshot
 from animat.training.exploration import ended_episodes
 from animat.training.replay import remember, transitions
 from animat.training.sac import (
@@ -55,7 +55,7 @@ class Acted(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """What the bodies did then (`animat.robots.host.Stepped`), and what is observed where ended episodes began anew."""
+    """A step of the bodies (`animat.robots.host.StepResult`), and what is observed where ended episodes began anew."""
 
     observation: Float[Array, "environments observations"]
     reward: Float[Array, " environments"]
@@ -154,7 +154,7 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
 def programs_on_host(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """What `animat.training.group.programs` gives, for a robot that is stepped on the host.
 
-    In the learners between chunks, bodies are data (`Standing`), so that checkpoints are as those of other robots. The
+    In the learners between chunks, bodies are data (`Snapshot`), so that checkpoints are as those of other robots. The
     bodies themselves are made when the first chunk is trained.
     """
     chunks = _Chunks(environment, algorithm)
@@ -175,7 +175,7 @@ class _Chunks:
         words = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
         self._seeds = [(*word, body) for word in words for body in range(self._n)]
         learners: Learner = self._beginning(keys)
-        none = Standing.of_none(self._robot, members * self._n)
+        none = Snapshot.initial(self._robot, members * self._n)
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
     def __call__(
@@ -200,18 +200,18 @@ class _Chunks:
             )
             if len(ended):
                 finished = Finished(*(a + np.asarray(b) for a, b in zip(finished, of_round, strict=True)))
-        standing = self._by_policy(bodies.standing)
+        standing = self._by_policy(bodies.snapshot)
         return learners._replace(episodes=learners.episodes._replace(robot=standing)), finished
 
     def _standing(self, learners: Learner) -> tuple[Learner, Bodies]:
         """The bodies where the learners have them, and learners that see of them the observation alone."""
-        flat = Standing(
+        flat = Snapshot(
             *(np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
         )
         is_there = True
         if self._bodies is None or not flat.commands.shape[1]:
             self._bodies = Bodies(self._robot, self._seeds)
-            is_there = self._bodies.stand(flat)
+            is_there = self._bodies.restore(flat)
         episodes = learners.episodes._replace(robot=self._by_policy(self._bodies.observation))
         if is_there:
             return learners._replace(episodes=episodes), self._bodies

@@ -1,1 +1,1 @@
-"""The live page: what a folder holds, shown in a browser on this machine while it grows, or afterwards."""
+"""The live page: shows the contents of a folder in a browser on this machine, while it grows or afterwards."""

@@ -1,4 +1,4 @@
-"""The server of a page beside a command: `python -m animat.watch FOLDER PROCESS`."""
+"""The page's server next to a command: `python -m animat.watch FOLDER PROCESS`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from pathlib import Path
 from animat.watch.serving import serve
 
 
-def _say(address: str) -> None:
+def _announce(address: str) -> None:
     print(address, flush=True)
-    # Whoever reads this may end before the page does.
+    # The reader of this pipe may end before the page does.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":
-    # What has a deadline comes first.
+    # Processes with a deadline come first.
     os.nice(10)
-    serve(Path(sys.argv[1]), 0, _say, beside=int(sys.argv[2]))
+    serve(Path(sys.argv[1]), 0, _announce, parent=int(sys.argv[2]))

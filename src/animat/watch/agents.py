@@ -1,4 +1,4 @@
-"""The returns of a session's agents so far, beside what was predicted."""
+"""The returns of a session's agents so far, with the predicted ones."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from animat.closed_loop.outline import Episode
 from animat.watch.plain import mapped, number, text
 
 _MOST_RETURNS = 200
-"""Of each agent that are drawn, the last ones."""
+"""Most returns drawn per agent: the last ones."""
 
 
 def by_agent(episodes: Sequence[Episode], header: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Of each agent: how many episodes came to their end, their returns and mean with its 95 % interval, as it narrows.
+    """For each agent: the number of whole episodes, their returns, and the mean with its 95 % interval.
 
-    The header is that of the session's log, with a prediction or without.
+    The header is that of the session's log, with or without a prediction.
     """
     predicted = _predicted(header)
-    returns: dict[str, list[float]] = {name: [] for name in predicted}
+    returns_of: dict[str, list[float]] = {name: [] for name in predicted}
     for episode in episodes:
-        of = returns.setdefault(text(episode.agent), [])
+        returns = returns_of.setdefault(text(episode.agent), [])
         if episode.is_whole and number(episode.total) is not None:
-            of.append(episode.total)
+            returns.append(episode.total)
     return [
         {
             "name": name,
-            "n": len(of),
-            "returns": of[-_MOST_RETURNS:],
-            "mean": number(fmean(of)) if of else None,
-            "half": number(_half_width(of)),
+            "n": len(returns),
+            "returns": returns[-_MOST_RETURNS:],
+            "mean": number(fmean(returns)) if returns else None,
+            "half": number(_half_width(returns)),
             "predicted": predicted.get(name),
         }
-        for name, of in returns.items()
+        for name, returns in returns_of.items()
     ]
 
 
 def _half_width(returns: Sequence[float]) -> float | None:
-    """Half of the 95 % interval of a mean, Student's; None of fewer than two."""
+    """Half the width of the 95 % interval of a mean, by Student's t; None for fewer than two returns."""
     if len(returns) < 2:
         return None
     from scipy.special import stdtrit
@@ -48,7 +48,7 @@ def _half_width(returns: Sequence[float]) -> float | None:
 
 
 def _predicted(header: Mapping[str, Any]) -> dict[str, list[float | None]]:
-    """Mean and interval; of what is no prediction nothing."""
-    read = {text(name): mapped(of) for name, of in mapped(header.get("predicted")).items()}
-    found = {name: [number(of.get(each)) for each in ("mean", "low", "high")] for name, of in read.items()}
-    return {name: of for name, of in found.items() if None not in of}
+    """Mean and interval of each agent; anything that is not a prediction is left out."""
+    rows = {text(name): mapped(row) for name, row in mapped(header.get("predicted")).items()}
+    predicted = {name: [number(row.get(key)) for key in ("mean", "low", "high")] for name, row in rows.items()}
+    return {name: values for name, values in predicted.items() if None not in values}

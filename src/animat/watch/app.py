@@ -1,4 +1,4 @@
-"""What the page asks for: its own files, what there is to watch, and each view of it."""
+"""The page's requests: its own files, the list of items to watch, and each view."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, STOP_FILE
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, first_line
 from animat.watch.cultures import CulturesView
-from animat.watch.found import Kind, find, place_within
+from animat.watch.discovery import Kind, find, place_within
 from animat.watch.picture import picture_of
 from animat.watch.plain import text
 from animat.watch.recording import RecordingView
@@ -34,9 +34,9 @@ _FILES = {
     "icon.svg": ("icon.svg", "image/svg+xml"),
     **{name: (name, "text/javascript") for name in ("page.js", "draw.js", "session.js", "blocks.js")},
 }
-"""Of the page, by their addresses."""
+"""The page's files, by address."""
 _MOST_VIEWS = 8
-"""That are kept open."""
+"""Most views kept open."""
 
 
 _VIEWS: dict[Kind, Callable[[Path], View]] = {
@@ -50,7 +50,7 @@ _VIEWS: dict[Kind, Callable[[Path], View]] = {
 
 
 class Watched:
-    """A folder, which may come to be later, and the views of what is in it; asked by one thread at a time."""
+    """A folder, which need not exist yet, and views of its contents; used by one thread at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -58,40 +58,36 @@ class Watched:
         self._lock = threading.Lock()
 
     def things(self) -> dict[str, Any]:
-        """What there is."""
-        found = [
-            {"kind": each.kind, "place": each.place}
-            for each in find(self.folder)
-            # A name that is no text cannot be asked for.
-            if text(each.place, 4096) == each.place
+        """The items in the folder."""
+        items = [
+            {"kind": item.kind, "place": item.place}
+            for item in find(self.folder)
+            # A name that is not valid text cannot be requested.
+            if text(item.place, 4096) == item.place
         ]
-        return {"folder": text(self.folder.resolve().name or str(self.folder)), "things": found}
+        return {"folder": text(self.folder.resolve().name or str(self.folder)), "things": items}
 
     def about(self, kind: str, place: str) -> dict[str, Any]:
-        """What something is."""
+        """The unchanging description of an item."""
         with self._lock:
             return self._view(kind, place).about()
 
     def view(self, kind: str, place: str, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How it is."""
+        """The current view of an item."""
         with self._lock:
             return self._view(kind, place).view(to_s, span_s)
 
     def picture(self, place: str, at: int) -> bytes | None:
         """The robot of a session at a record, as PNG."""
         with self._lock:
-            view = self._session(place)
+            view = self._view("session", place)
+            assert isinstance(view, SessionView)
             tick, robot = view.tick_at(at), view.robot_data
         return None if tick is None else picture_of(robot, *tick)
 
     def stop(self, place: str) -> None:
-        """End a session; nothing else is waited for."""
+        """End a session, without waiting for the lock."""
         stop_session(place_within(self.folder, place))
-
-    def _session(self, place: str) -> SessionView:
-        view = self._view("session", place)
-        assert isinstance(view, SessionView)
-        return view
 
     def _view(self, kind: str, place: str) -> View:
         key = kind, place
@@ -106,7 +102,7 @@ class Watched:
 
 
 def app_for(folder: Path, token: str, port: int) -> Starlette:
-    """The page of a folder as an ASGI application, guarded."""
+    """The page of a folder as a guarded ASGI application."""
     from starlette.applications import Starlette
     from starlette.concurrency import run_in_threadpool
     from starlette.middleware import Middleware
@@ -119,7 +115,7 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
     from animat.watch.guard import guard
 
     watched = Watched(folder)
-    own = importlib.resources.files("animat.watch") / "page"
+    files = importlib.resources.files("animat.watch") / "page"
 
     async def file(content: bytes, kind: str, request: Request) -> Response:
         return Response(content, media_type=kind)
@@ -127,39 +123,36 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
     def answering(answer: Callable[[Any], Any]) -> Callable[[Request], Any]:
         @functools.wraps(answer)
         async def endpoint(request: Request) -> Response:
-            status, kind, body = await run_in_threadpool(_answered, answer, request.query_params)
+            status, kind, body = await run_in_threadpool(_response, answer, request.query_params)
             return Response(body, status, media_type=kind)
 
         return endpoint
 
-    def picture(asked: Any) -> bytes:
-        found = watched.picture(asked.get("in", ""), int(_number(asked, "at") or 0))
-        if found is None:
-            raise InvalidArgument("at: no picture of the robot there")
-        return found
+    def view(query: Any) -> dict[str, Any]:
+        to_s, span_s = _number(query, "to"), _number(query, "span") or 8.0
+        return watched.view(query.get("kind", ""), query.get("in", ""), to_s, span_s)
 
-    def stop(asked: Any) -> dict[str, Any]:
-        watched.stop(asked.get("in", ""))
+    def picture(query: Any) -> bytes:
+        png = watched.picture(query.get("in", ""), int(_number(query, "at") or 0))
+        if png is None:
+            raise InvalidArgument("at: no picture of the robot there")
+        return png
+
+    def stop(query: Any) -> dict[str, Any]:
+        watched.stop(query.get("in", ""))
         return {"stopped": True}
 
     async def refuse(socket: WebSocket) -> None:
         await socket.send({"type": "websocket.close", "code": 1008})
 
     routes: list[BaseRoute] = [
-        Route(f"/{address}", functools.partial(file, (own / name).read_bytes(), kind))
+        Route(f"/{address}", functools.partial(file, (files / name).read_bytes(), kind))
         for address, (name, kind) in _FILES.items()
     ]
     routes += [
-        Route("/things", answering(lambda asked: watched.things())),
-        Route("/about", answering(lambda asked: watched.about(asked.get("kind", ""), asked.get("in", "")))),
-        Route(
-            "/view",
-            answering(
-                lambda asked: watched.view(
-                    asked.get("kind", ""), asked.get("in", ""), _number(asked, "to"), _number(asked, "span") or 8.0
-                )
-            ),
-        ),
+        Route("/things", answering(lambda query: watched.things())),
+        Route("/about", answering(lambda query: watched.about(query.get("kind", ""), query.get("in", "")))),
+        Route("/view", answering(view)),
         Route("/robot.png", answering(picture)),
         Route("/stop", answering(stop), methods=["POST"]),
         WebSocketRoute("/{path:path}", refuse),
@@ -168,50 +161,50 @@ def app_for(folder: Path, token: str, port: int) -> Starlette:
     return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[guarded])
 
 
-def _answered(answer: Callable[[Any], Any], asked: Any) -> tuple[int, str, bytes]:
-    """Status, kind and content of an answer."""
+def _response(answer: Callable[[Any], Any], query: Any) -> tuple[int, str, bytes]:
+    """Status, media type and content of a response."""
     try:
-        found = answer(asked)
-        if isinstance(found, bytes):
-            return 200, "image/png", found
-        return 200, "application/json", json.dumps(found, allow_nan=False).encode()
+        content = answer(query)
+        if isinstance(content, bytes):
+            return 200, "image/png", content
+        return 200, "application/json", json.dumps(content, allow_nan=False).encode()
     except AnimatError as error:
-        return 409, "application/json", _told(str(error))
+        return 409, "application/json", _error(str(error))
     except Exception as error:
         # Anything may be in a file.
-        return 500, "application/json", _told(f"cannot be shown: {first_line(error)}")
+        return 500, "application/json", _error(f"cannot be shown: {first_line(error)}")
 
 
-def _told(message: str) -> bytes:
+def _error(message: str) -> bytes:
     return json.dumps({"error": text(" ".join(message.split()), 1000)}).encode()
 
 
-def _number(asked: Any, name: str) -> float | None:
-    given = asked.get(name)
-    if given is None:
+def _number(query: Any, name: str) -> float | None:
+    raw = query.get(name)
+    if raw is None:
         return None
     try:
-        value = float(given)
+        value = float(raw)
     except ValueError:
         value = float("nan")
     if not abs(value) < 1e15:
-        raise InvalidArgument(f"{name}: expected a number, got {text(given, 40)}")
+        raise InvalidArgument(f"{name}: expected a number, got {text(raw, 40)}")
     return value
 
 
 def stop_session(folder: Path) -> None:
-    """Ask a session to end. Nothing is waited for or read first: it may be urgent.
+    """Ask a session to end, without waiting or reading anything first, as it may be urgent.
 
     Raises:
-        InvalidArgument: where no session is, or one that has ended.
-        InvalidFile: if the file cannot be made.
+        InvalidArgument: if there is no session, or it has ended.
+        InvalidFile: if the file cannot be created.
     """
     if not (folder / LOG_FILE).is_file():
         raise InvalidArgument(f"{folder.name}: expected a session to stop, got none")
     if (folder / RECORDING_FILE).exists():
         raise InvalidArgument(f"{folder.name}: the session has ended: there is nothing to stop")
     try:
-        # Not through a link, which may lead anywhere.
+        # Never through a link, which may lead anywhere.
         os.close(os.open(folder / STOP_FILE, os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
     except OSError as error:
-        raise InvalidFile(f"{folder / STOP_FILE}: cannot be made: {error.strerror or error}") from error
+        raise InvalidFile(f"{folder / STOP_FILE}: cannot be created: {error.strerror or error}") from error

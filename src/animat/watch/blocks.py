@@ -1,4 +1,4 @@
-"""What a view is made of where it is no closed loop: tables, lists and charts, each with words on how to read it."""
+"""The blocks of all views but that of a closed loop: tables, lists and charts, each with a note on how to read it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def chart(
     x: str,
     y: str,
     series: Sequence[dict[str, Any]],
-    words: str,
+    note: str,
     *,
     marks: Sequence[tuple[float, str]] = (),
     until: float | None = None,
@@ -30,51 +30,51 @@ def chart(
         title: of the chart.
         x, y: names of the axes, with units.
         series: each made by `curve`.
-        words: how to read it, with its main numbers.
-        marks: places on the x axis with what is there.
-        until: where the x axis ends at least.
+        note: how to read it, with its main numbers.
+        marks: places on the x axis with their labels.
+        until: the smallest end of the x axis.
         width: on the page.
     """
-    told = [[number(at), text(what)] for at, what in marks]
+    labelled = [[number(at), text(label)] for at, label in marks]
     return {
-        "kind": "chart", "title": title, "x": x, "y": y, "series": list(series), "words": text(words, 2000),
-        "marks": told, "until": number(until), "width": width,
+        "kind": "chart", "title": title, "x": x, "y": y, "series": list(series), "words": text(note, 2000),
+        "marks": labelled, "until": number(until), "width": width,
     }  # fmt: skip
 
 
 def curve(
     name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str = "", most: int = 2000
 ) -> dict[str, Any]:
-    """A curve of a chart: its name in the legend (none: not in it), and its points, thinned where they are many."""
+    """A curve of a chart: its name in the legend (empty: none), and its points, thinned if there are many."""
     step = max(1, math.ceil(len(x) / most))
-    xs, ys = [number(float(each)) for each in x[::step]], [number(float(each)) for each in y[::step]]
+    xs, ys = ([number(float(value)) for value in values[::step]] for values in (x, y))
     return {"name": text(name), "x": xs, "y": ys, "style": style, "colour": colour}
 
 
 def table(
-    title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], words: str = "", *, width: Width = "half"
+    title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], note: str = "", *, width: Width = "half"
 ) -> dict[str, Any]:
-    """Rows of texts and numbers; the page writes the numbers."""
-    plain = [[each if each is None or isinstance(each, int | float) else text(each) for each in row] for row in rows]
-    cells = [[number(each) if isinstance(each, float) else each for each in row] for row in plain]
+    """Rows of texts and numbers; the page formats the numbers."""
+    cells = [[_number_or_text(value) for value in row] for row in rows]
     return {
-        "kind": "table",
-        "title": title,
-        "head": list(head),
-        "rows": cells,
-        "words": text(words, 2000),
-        "width": width,
-    }
+        "kind": "table", "title": title, "head": list(head), "rows": cells, "words": text(note, 2000), "width": width,
+    }  # fmt: skip
 
 
-def facts(title: str, rows: Sequence[tuple[str, Any]], words: str = "") -> dict[str, Any]:
-    """Names with a value each."""
-    told = [[name, number(value) if isinstance(value, int | float) else text(value, 1000)] for name, value in rows]
-    return {"kind": "facts", "title": title, "rows": told, "words": text(words, 2000)}
+def _number_or_text(value: Any) -> Any:
+    if isinstance(value, float):
+        return number(value)
+    return value if value is None or isinstance(value, int) else text(value)
+
+
+def facts(title: str, rows: Sequence[tuple[str, Any]], note: str = "") -> dict[str, Any]:
+    """Names with one value each."""
+    pairs = [[name, number(value) if isinstance(value, int | float) else text(value, 1000)] for name, value in rows]
+    return {"kind": "facts", "title": title, "rows": pairs, "words": text(note, 2000)}
 
 
 def time_left(seconds: float | None, state: dict[str, Any]) -> str:
-    """How long work will still take, as it stands (`animat.watch.held.state_of`)."""
+    """The remaining time of work in a state (`animat.watch.state.state_of`)."""
     if state["state"] != "running":
-        return "none: it has ended" if state["state"] == "ended" else "none: it does not go on"
+        return "none: it has ended" if state["state"] == "ended" else "none: it is not running"
     return "not known yet" if (known := number(seconds)) is None else duration_in_words(known)

@@ -1,4 +1,4 @@
-"""The view of a study over many cultures: how far each is, and the comparisons over those that are done."""
+"""The view of a study over many cultures: the progress of each, and comparisons over those that are done."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of, newest_s
-from animat.watch.held import is_held, state_of
 from animat.watch.plain import listed, mapped, text
+from animat.watch.state import is_locked, state_of
 from animat.watch.study import share_of
 from animat.watch.view import View, in_blocks, titled
 
 _MANIFEST, _DONE, _COMPARISONS = "cultures.json", "jobs/report.json", "tables/comparisons.csv"
 _MOST_CULTURES, _MOST_BYTES = 10_000, 2**20
-_WORDS = "Mean returns over the cultures that are done, and in how many of them that of the second arm is larger."
+_NOTE = "Mean returns over the cultures that are done, and in how many of them that of the second arm is larger."
 _Means = list[tuple[str, str, float, float]]
-"""Of one culture each comparison and robot, and the means of both arms."""
+"""Comparison, robot, and the means of both arms, on one culture."""
 
 
 class CulturesView(View):
@@ -32,15 +32,15 @@ class CulturesView(View):
         self._compared: dict[str, _Means] = {}
 
     def about(self) -> dict[str, Any]:
-        """How many cultures are studied."""
+        """The number of cultures."""
         return titled(f"study over {len(self._names()):,} cultures")
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How far the cultures are."""
+        """The progress of the cultures."""
         names, failed = self._names(), self._failed()
         done = [name for name in names if (self.folder / name / _DONE).exists()]
         begun = [name for name in names if name not in done and (self.folder / name).is_dir()]
-        shares = {name: share_of(self.folder / name) for name in begun if is_held(self.folder / name) is not False}
+        shares = {name: share_of(self.folder / name) for name in begun if is_locked(self.folder / name) is not False}
         self._speed.see(worked := len(done) + sum(shares.values()))
         changed_s = newest_s([self.folder, *(self.folder / name / "jobs" for name in begun)])
         state = state_of(self.folder, changed_s, is_done=len(done) == len(names))
@@ -48,7 +48,7 @@ class CulturesView(View):
         if failed and state["state"] == "silent":
             state = {
                 "state": "ended",
-                "message": f"{len(failed)} of the cultures failed; start it again and it continues",
+                "message": f"{len(failed)} of the cultures failed; start the study again and it continues",
             }
         rows: list[tuple[str, Any]] = [
             ("cultures done", f"{len(done):,} of {len(names):,}"),
@@ -58,17 +58,18 @@ class CulturesView(View):
             ("time left", time_left(self._speed.left_s(len(names) - worked), state)),
         ]
         is_done = state["state"] == "ended"
-        under_way = [[name, f"{100 * share:.0f} %"] for name, share in running.items()]
+        shares_done = [[name, f"{100 * share:.0f} %"] for name, share in running.items()]
+        note = "" if running else "nothing is running"
         blocks = [
-            facts("Cultures", rows, "The list at the top has each culture's own page."),
-            *([] if is_done else [_running(under_way)]),
-            *([table("Failed", ["culture", "of what"], [[*each] for each in failed.items()])] if failed else ()),
+            facts("Cultures", rows, "The list at the top has a page for each culture."),
+            *([] if is_done else [table("Running", ["culture", "done"], shares_done, note, width="two-thirds")]),
+            *([table("Failed", ["culture", "error"], [[*row] for row in failed.items()])] if failed else ()),
             self._comparisons(done, "two-thirds" if is_done else "whole"),
         ]
         return in_blocks(state, blocks)
 
     def _comparisons(self, done: list[str], width: Width) -> dict[str, Any]:
-        over: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        pairs_of: dict[tuple[str, str], list[tuple[float, float]]] = {}
         left_out = 0
         for name in done:
             if name not in self._compared:
@@ -78,38 +79,33 @@ class CulturesView(View):
                     continue
                 self._compared[name] = means
             for comparison, robot, first, second in self._compared[name]:
-                over.setdefault((comparison, robot), []).append((first, second))
+                pairs_of.setdefault((comparison, robot), []).append((first, second))
         rows = []
-        for (comparison, robot), pairs in over.items():
-            first, second = (sum(each) / len(pairs) for each in zip(*pairs, strict=True))
+        for (comparison, robot), pairs in pairs_of.items():
+            first, second = (sum(means) / len(pairs) for means in zip(*pairs, strict=True))
             larger = sum(after > before for before, after in pairs)
             rows.append([comparison, robot, first, second, f"{larger:,} of {len(pairs):,}"])
         head = ["comparison", "robot", "mean, first arm", "mean, second arm", "second larger in"]
-        words = _WORDS if rows else "none yet"
+        note = _NOTE if rows else "none yet"
         if left_out:
-            words += f" Left out, as their {_COMPARISONS} cannot be read: {left_out:,} of the cultures that are done."
-        return table("Comparisons", head, rows, words, width=width)
+            note += f" Left out, as their {_COMPARISONS} cannot be read: {left_out:,} of the cultures that are done."
+        return table("Comparisons", head, rows, note, width=width)
 
     def _failed(self) -> dict[str, str]:
-        """Those that the last run could not finish, and what they failed of."""
-        found = mapped(mapped(json_of(self.folder / _MANIFEST)).get("failed"))
-        return {name: text(why) for name, why in list(found.items())[:_MOST_CULTURES] if _is_name(name)}
+        """The cultures that the last run could not finish, each with its error."""
+        failed = mapped(mapped(json_of(self.folder / _MANIFEST)).get("failed"))
+        return {name: text(error) for name, error in list(failed.items())[:_MOST_CULTURES] if _is_name(name)}
 
     def _names(self) -> list[str]:
-        found = [
+        names = [
             name
             for name in listed(mapped(json_of(self.folder / _MANIFEST)).get("cultures"))
             # A link may lead out of the folder.
             if _is_name(name) and not (self.folder / name).is_symlink()
         ]
-        if not found:
+        if not names:
             raise InvalidFile(f"{self.folder / _MANIFEST}: expected the names of cultures, got none")
-        return found[:_MOST_CULTURES]
-
-
-def _running(under_way: list[list[str]]) -> dict[str, Any]:
-    words = "" if under_way else "nothing runs now"
-    return table("Running", ["culture", "done"], under_way, words, width="two-thirds")
+        return names[:_MOST_CULTURES]
 
 
 def _is_name(name: Any) -> bool:
@@ -117,13 +113,13 @@ def _is_name(name: Any) -> bool:
 
 
 def _means_of(path: Path) -> _Means | None:
-    """The means in a table of comparisons; None where it is damaged."""
+    """The means in a table of comparisons; None if it is damaged."""
     try:
         rows = csv.DictReader(io.StringIO(read_plain_text(path, _MOST_BYTES)))
-        found = [
+        means = [
             (text(row["comparison"]), text(row["robot"]), float(row["mean_first"]), float(row["mean_second"]))
             for row in rows
         ]
     except (InvalidFile, csv.Error, KeyError, TypeError, ValueError):
         return None
-    return found if all(math.isfinite(mean) for *_, first, second in found for mean in (first, second)) else None
+    return means if all(math.isfinite(mean) for *_, first, second in means for mean in (first, second)) else None

@@ -1,4 +1,4 @@
-"""Small files of a run that may be at work: whole, or as if they were not there."""
+"""Small files of a run that may be in progress: read whole, or treated as missing."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import InvalidFile
+from animat.execution.task import UNFINISHED
 from animat.plain_file import read_plain_text
 from animat.training.policy import CURVE, whole_curve
 from animat.watch.plain import listed, number, text
@@ -22,34 +23,38 @@ _MOST_EPISODES_BYTES = 2**27
 
 
 def json_of(path: Path) -> Any:
-    """What a file of JSON holds; None where there is none that can be read."""
+    """The contents of a JSON file; None if it cannot be read."""
     try:
         return json.loads(read_plain_text(path, _MOST_BYTES))
     except (InvalidFile, ValueError, RecursionError):
         return None
 
 
-def told_by_jobs(folder: Path) -> dict[str, tuple[float, str, float]]:
-    """What running jobs told last: of each its share, a remark, and when that was."""
-    found = {}
-    for path in sorted(folder.glob("*.json"))[:1000]:
-        told = listed(json_of(path))
+JobProgress = dict[str, tuple[float, str, float]]
+"""The share done of each job, a message, and when it was reported."""
+
+
+def job_progress(folder: Path) -> JobProgress:
+    """The last progress reported by the jobs of an unfinished run."""
+    progress = {}
+    for path in sorted((folder / UNFINISHED / ".told").glob("*.json"))[:1000]:
+        report = listed(json_of(path))
         try:
             changed_s = path.stat().st_mtime
         except OSError:
             continue
-        if len(told) == 2 and number(told[0]) is not None:
-            # Of several that are trained at once only one says more.
-            words = "" if told[1] is None else text(told[1])
-            found[path.stem.replace("+", "/")] = (float(told[0]), words, changed_s)
-    return found
+        if len(report) == 2 and number(report[0]) is not None:
+            # Of policies that are trained together, only one reports a message.
+            message = "" if report[1] is None else text(report[1])
+            progress[path.stem.replace("+", "/")] = (float(report[0]), message, changed_s)
+    return progress
 
 
 def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks columns"]]:
-    """The learning curves in a checkpoint, by the numbers of the policies; none where none can be read."""
+    """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
     try:
         with zipfile.ZipFile(path) as archive:
-            curve = _whole(_array_in(archive, "curve.npy"))
+            curve = _complete(_array_in(archive, "curve.npy"))
             if curve is None or curve.ndim != 3:
                 return {}
             members = _array_in(archive, "members.npy").tolist()
@@ -67,7 +72,7 @@ def _array_in(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 
 def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
-    """The learning curve in a policy's file; None where there is none that can be read."""
+    """The learning curve in a policy's file; None if it cannot be read."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -75,17 +80,17 @@ def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
             curve = file.get_tensor("learning_curve")
     except (OSError, SafetensorError, ValueError, TypeError):
         return None
-    return _whole(curve) if curve.ndim == 2 else None
+    return _complete(curve) if curve.ndim == 2 else None
 
 
-def _whole(curve: np.ndarray) -> Float64[np.ndarray, "*_ columns"] | None:
+def _complete(curve: np.ndarray) -> Float64[np.ndarray, "*_ columns"] | None:
     """Learning curves with the columns of `CURVE`; None for anything else."""
     whole = whole_curve(curve)
     return np.asarray(whole, np.float64) if whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f" else None
 
 
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
-    """Of an arm's episodes in a study: mean return, and of how many policies and episodes; None where not known."""
+    """Mean return, number of policies and number of episodes of an arm of a study; None if not known."""
     try:
         if path.stat().st_size > _MOST_EPISODES_BYTES:
             return None
@@ -94,7 +99,7 @@ def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
                 return None
             columns = (file[name] for name in ("return", "actor", "over_time", "agent", "at_min"))
             returns, actors, over_time, agents, at_min = columns
-        # Those of every recording are few, and those of a comparison may be on another one.
+        # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
         own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max())
         mean = float(returns[own].mean()) if own.any() else float("nan")
     except Exception:  # as for a checkpoint
@@ -103,7 +108,7 @@ def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
 
 
 def newest_s(paths: list[Path]) -> float:
-    """When one of these changed last; 0 where none is there."""
+    """When one of these last changed; 0 if there are none."""
     times = [0.0]
     for path in paths:
         try:

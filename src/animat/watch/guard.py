@@ -1,4 +1,4 @@
-"""Who may ask: this machine alone, by the address with the token, from the page itself."""
+"""Access control: only this machine, only the address with the token, only the page itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""What the page may load, and from where: its own files and answers, and nothing else."""
+"""The page may load only its own files and responses."""
 HEADERS = {
     "content-security-policy": POLICY,
     "x-content-type-options": "nosniff",
@@ -23,36 +23,36 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-"""Of every answer."""
+"""Headers of every response."""
 
 
 def guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint], Awaitable[Response]]:
-    """What answers 403 to whatever is not asked by the page, or by its address, and hands the rest on.
+    """Middleware that answers 403 to any request that is not from the page or its address, and passes on the rest.
 
-    A name that leads here (DNS rebinding) is in `Host`, another page in `Origin`; neither knows the token, with which
-    every address begins. When something was last asked is noted in the application's `state.asked_s`.
+    A foreign name that resolves to this machine (DNS rebinding) appears in `Host`, a foreign page in `Origin`. Neither
+    knows the token that begins every path. The time of the last request is kept in the application's `state.asked_s`.
     """
     hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
     origins = {f"http://{host}" for host in hosts}
 
-    def why_not(request: Request) -> str:
-        """Why something is refused; empty where it is not."""
+    def refusal(request: Request) -> str:
+        """Why a request is refused; empty if it is not."""
         host, origin = (request.headers.getlist(name) for name in ("host", "origin"))
         if len(host) != 1 or host[0] not in hosts:
-            return "this page is for this machine alone, by the address that was printed"
-        if len(origin) > 1 or any(each not in origins for each in origin):
-            return "another page may not ask"
+            return "this page is only for this machine, at the printed address"
+        if len(origin) > 1 or any(page not in origins for page in origin):
+            return "requests from other pages are refused"
         if request.method not in ("GET", "HEAD") and not origin:
-            return "expected an Origin with what changes something"
-        given, slash, _ = request.scope["path"].removeprefix("/").partition("/")
-        if not slash or not hmac.compare_digest(given.encode("utf-8", "replace"), token.encode()):
-            return "expected the token of the address that was printed"
+            return "expected an Origin with a request that changes something"
+        prefix, slash, _ = request.scope["path"].removeprefix("/").partition("/")
+        if not slash or not hmac.compare_digest(prefix.encode("utf-8", "replace"), token.encode()):
+            return "expected the token of the printed address"
         return ""
 
     async def guarded(request: Request, answer: RequestResponseEndpoint) -> Response:
         request.app.state.asked_s = time.monotonic()
-        refused = why_not(request)
-        response = PlainTextResponse(refused, 403) if refused else await answer(request)
+        reason = refusal(request)
+        response = PlainTextResponse(reason, 403) if reason else await answer(request)
         response.headers.update(HEADERS)
         return response
 

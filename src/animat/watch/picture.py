@@ -1,4 +1,4 @@
-"""The robot of a tick as a picture, where it is one that is known here and can be drawn."""
+"""The robot of a tick as a picture, if the robot is known here and can be drawn."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def is_drawn(loop: dict[str, Any]) -> bool:
 
 
 def picture_of(loop: dict[str, Any], record: Record, earlier: list[list[float | None]]) -> bytes | None:
-    """A picture as PNG of the robot in a session's header; None for one that is not known here, or cannot be drawn.
+    """A PNG of the robot in a session's header; None if it is not known here or cannot be drawn.
 
-    The record has a tick; the earlier observations are of its episode.
+    The record has a tick; the earlier observations belong to its episode.
     """
     tick = mapped(record.fields.get("tick"))
     observation, command = numbers(tick.get("observation")), numbers(tick.get("command"))
@@ -39,19 +39,19 @@ def picture_of(loop: dict[str, Any], record: Record, earlier: list[list[float | 
         robot = _robot_of(loop)
         if robot is None or not observation or None in observation:
             return None
-        given = np.array([0.0 if each is None else each for each in command]) if command else 0.0
-        drawn = draw_robot(
+        commands = np.array([0.0 if u is None else u for u in command or (0.0,)])
+        picture = draw_robot(
             robot,
             np.array(observation, np.float64),
-            command=given if robot.n_commands > 1 else float(np.ravel(given)[0]),
-            earlier=[np.array(each, np.float64) for each in earlier if None not in each],
+            command=commands if robot.n_commands > 1 else float(commands[0]),
+            earlier=[np.array(past, np.float64) for past in earlier if None not in past],
         )
     except (AnimatError, ArithmeticError, ValueError, TypeError, IndexError, MemoryError):
-        # What a damaged log says of a robot may be anything.
+        # A damaged log may contain anything.
         return None
-    packed = io.BytesIO()
-    Image.fromarray(drawn).save(packed, "PNG", compress_level=1)
-    return packed.getvalue()
+    png = io.BytesIO()
+    Image.fromarray(picture).save(png, "PNG", compress_level=1)
+    return png.getvalue()
 
 
 def _robot_of(loop: dict[str, Any]) -> Robot[Any] | None:

@@ -1,4 +1,4 @@
-"""Values of files as a page can take them: finite numbers, texts of bounded length."""
+"""Values from files in a form safe for a page: finite numbers, texts of limited length."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _MOST_LETTERS = 300
 
 
 def number(value: Any) -> float | None:
-    """A finite number, None for anything else."""
+    """A finite number; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -20,28 +20,28 @@ def number(value: Any) -> float | None:
 
 
 def whole(value: Any) -> int | None:
-    """A whole number that a page can hold, None for anything else."""
-    is_one = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53
-    return value if is_one else None
+    """A whole number that JavaScript can hold; None for anything else."""
+    is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53
+    return value if is_whole else None
 
 
 def numbers(value: Any) -> list[float | None]:
-    """Of a list each as a number; of a number, a list of it; of anything else, none."""
+    """The items of a list as numbers; a number as a list of one; an empty list for anything else."""
     if isinstance(value, list | tuple):
-        return [number(each) for each in value[:64]]
+        return [number(item) for item in value[:64]]
     return [] if number(value) is None else [number(value)]
 
 
 def text(value: Any, most: int = _MOST_LETTERS) -> str:
-    """As text that a page can show, cut off where it is long."""
-    words = value if isinstance(value, str) else json.dumps(value, default=str)
+    """A value as text that a page can show, truncated if it is long."""
+    string = value if isinstance(value, str) else json.dumps(value, default=str)
     # Halves of surrogate pairs cannot be sent.
-    words = words[: most + 1].encode("utf-8", "replace").decode("utf-8")
-    return words if len(words) <= most else words[: most - 1] + "…"
+    string = string[: most + 1].encode("utf-8", "replace").decode("utf-8")
+    return string if len(string) <= most else string[: most - 1] + "…"
 
 
 def short(value: Any) -> str:
-    """A setting in a few letters."""
+    """A setting in a few characters."""
     known = number(value)
     if known is None:
         return text(value, 60)
@@ -49,10 +49,10 @@ def short(value: Any) -> str:
 
 
 def listed(value: Any) -> list[Any]:
-    """A list, empty where it is something else."""
+    """A list; empty for anything else."""
     return value if isinstance(value, list) else []
 
 
 def mapped(value: Any) -> dict[str, Any]:
-    """Names and values, none where it is something else."""
+    """A dictionary; empty for anything else."""
     return value if isinstance(value, dict) else {}

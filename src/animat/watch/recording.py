@@ -1,4 +1,4 @@
-"""The view of recordings: of the one under way or the newest its raster, rates, responses and findings."""
+"""The view of recordings: raster, rates, responses and findings of the one in progress or the newest."""
 
 from __future__ import annotations
 
@@ -13,49 +13,49 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording
 from animat.watch.blocks import chart, curve, facts, table
-from animat.watch.found import changed, recordings_in
-from animat.watch.held import is_held
+from animat.watch.discovery import changed_s, recordings_in
 from animat.watch.plain import text
 from animat.watch.spikes import packed_spikes
+from animat.watch.state import is_locked
 from animat.watch.view import View, in_blocks, titled
 
 _MOST_SPAN_S = 60.0
 _LARGEST = 2**31
-"""Bytes of a file that is read for a look."""
+"""Most bytes of a file that is read."""
 
 
 class RecordingView(View):
-    """A folder of recordings, of which what changed last is read anew."""
+    """A folder of recordings, of which the last changed is read again."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self._key: Any = None
         self._recording: Recording | None = None
         self._inspection: Inspection | None = None
-        self._trouble = ""
+        self._error = ""
         self._shares: dict[Path, tuple[float, dict[str, float]]] = {}
 
     def about(self) -> dict[str, Any]:
-        """What it is."""
+        """The title."""
         return titled("recordings")
 
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         """The newest recording, and the seconds of it before a time."""
         if not 0 < span_s <= _MOST_SPAN_S:
             raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
-        # Before the files are looked at: whoever lets go of the folder has removed what was under way.
-        running = is_held(self.folder)
+        # Before the files are listed: a program removes the recording in progress before it unlocks the folder.
+        running = is_locked(self.folder)
         whole = recordings_in(self.folder)
-        times = {file: when for file in (*whole, self.folder / UNDER_WAY) if (when := changed(file)) is not None}
+        times = {file: time_s for file in (*whole, self.folder / UNDER_WAY) if (time_s := changed_s(file)) is not None}
         if not times:
-            raise InvalidFile(f"{self.folder}: expected recordings, got none any more")
+            raise InvalidFile(f"{self.folder}: expected recordings, but they are gone")
         newest = max(times, key=lambda file: (times[file], file.name))
         self._look_at_another([*times], newest)
         recording = self._recording
         blocks = [facts("Recordings", self._facts(len(whole), newest))]
-        found: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
+        span: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
         if recording is not None:
-            raster, found = _raster(recording, to_s, span_s)
+            raster, span = _raster(recording, to_s, span_s)
             blocks += [raster, _rates(recording)]
         blocks += [_shares(self._shares, len(times)), *_inspected(self._inspection)]
         is_broken = running is False and self.folder / UNDER_WAY in times
@@ -63,10 +63,10 @@ class RecordingView(View):
             "state": "running" if running else "silent" if is_broken else "ended",
             "message": _message(len(whole), newest, recording, running=bool(running), is_broken=is_broken),
         }
-        return in_blocks({**state, **found}, blocks, self._trouble)
+        return in_blocks({**state, **span}, blocks, self._error)
 
     def _facts(self, whole: int, newest: Path) -> list[tuple[str, Any]]:
-        shown = "the one under way, as far as it is" if newest.name == UNDER_WAY else newest.name
+        shown = "the one in progress, as far as it has come" if newest.name == UNDER_WAY else newest.name
         rows: list[tuple[str, Any]] = [("complete", whole), ("shown", shown)]
         inspection = self._inspection
         if inspection is not None:
@@ -82,26 +82,26 @@ class RecordingView(View):
         return rows
 
     def _read(self, file: Path) -> None:
-        """Read a file, if it is another one than before."""
+        """Read a file, if it differs from the last one read."""
         try:
             status = file.stat()
         except OSError:
-            # What is under way is gone when it is whole.
+            # The recording in progress is removed when it is complete.
             return
         key = file, status.st_mtime_ns, status.st_size
         if key == self._key:
             return
-        self._key, self._recording, self._inspection, self._trouble = key, None, None, ""
+        self._key, self._recording, self._inspection, self._error = key, None, None, ""
         try:
             self._recording, self._inspection = _inspection_of(file)
         except AnimatError as error:
-            self._trouble = text(" ".join(str(error).split()))
+            self._error = text(" ".join(str(error).split()))
         self._keep(file, self._inspection)
 
     def _look_at_another(self, files: list[Path], newest: Path) -> None:
-        """Read the newest, or one of the others that was not looked at yet: each takes a second or two."""
+        """Read the newest, or one other that has not been inspected yet: each takes a second or two."""
         before = self._key
-        self._shares = {file: of for file, of in self._shares.items() if file in files}
+        self._shares = {file: row for file, row in self._shares.items() if file in files}
         self._read(newest)
         other = next((file for file in files if file not in self._shares), None)
         if before != self._key or other is None:
@@ -117,21 +117,21 @@ class RecordingView(View):
 
 
 def _message(whole: int, newest: Path, recording: Recording | None, *, running: bool, is_broken: bool) -> str:
-    """How it stands, in words."""
+    """The state of the recordings in words."""
     if is_broken:
-        return "the recording under way was interrupted: what there is of it is shown, and is no recording"
+        return "the recording in progress was interrupted: its data so far are shown, but are not a recording"
     if not running:
         return "1 recording" if whole == 1 else f"{whole} recordings"
     if newest.name != UNDER_WAY:
-        return "of the next recording nothing is known yet: stimulation is set up, or its first block is under way"
-    return "" if recording is None else f"{recording.duration_s:.0f} s of the one under way are shown"
+        return "nothing is known of the next recording yet: stimulation is being set up, or its first block is running"
+    return "" if recording is None else f"{recording.duration_s:.0f} s of the one in progress are shown"
 
 
 def _inspection_of(file: Path) -> tuple[Recording, Inspection]:
     from animat.recordings.reading import read_recording
 
     if file.stat().st_size > _LARGEST:
-        raise InvalidFile(f"{file.name}: too large for a look: {file.stat().st_size:,} bytes")
+        raise InvalidFile(f"{file.name}: expected at most {_LARGEST:,} bytes to show, got {file.stat().st_size:,}")
     recording = read_recording(file)
     return recording, inspect_recording(recording, name=file.name)
 
@@ -145,13 +145,13 @@ def _raster(recording: Recording, to_s: float | None, span_s: float) -> tuple[di
     spikes, _ = packed_spikes(times_s, channels, from_s, to_s, len(recording.channels))
     pulses_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
     pulses_s = pulses_s[(pulses_s >= from_s) & (pulses_s <= to_s)]
-    every = f"; each {spikes['every']}th is drawn" if spikes["every"] > 1 else ""
-    words = (
+    every = f"; every {spikes['every']}th is drawn" if spikes["every"] > 1 else ""
+    note = (
         f"{spikes['n']:,} spikes on {len(recording.channels):,} channels{every}; {len(pulses_s):,} pulses, marked above"
     )
     block = {
         "kind": "raster", "title": "Spikes by channel", "spikes": spikes, "from_s": from_s, "to_s": to_s,
-        "n_channels": len(recording.channels), "pulses_s": pulses_s[:4000].tolist(), "words": words,
+        "n_channels": len(recording.channels), "pulses_s": pulses_s[:4000].tolist(), "words": note,
     }  # fmt: skip
     return block, {"from_s": from_s - start_s, "to_s": to_s - start_s, "end_s": stop_s - start_s}
 
@@ -161,21 +161,21 @@ def _rates(recording: Recording) -> dict[str, Any]:
     rates_hz = np.sort(counts / max(recording.duration_s, 1e-9))[::-1]
     line = curve("", np.arange(1, len(rates_hz) + 1).tolist(), rates_hz.tolist(), "line", "blue")
     median = float(np.median(rates_hz)) if len(rates_hz) else 0.0
-    words = f"Spikes a second, the most active channel first; median {median:.2f} Hz, {int((counts == 0).sum())} silent"
-    return chart("Rates of channels", "channels, by rate", "Hz", [line], words, width="half")
+    note = f"Firing rate, the most active channel first; median {median:.2f} Hz, {int((counts == 0).sum())} silent"
+    return chart("Rates of channels", "channels, by rate", "Hz", [line], note, width="half")
 
 
 def _shares(shares: dict[Path, tuple[float, dict[str, float]]], files: int) -> dict[str, Any]:
-    """How each condition was answered in each recording that was looked at."""
-    known = sorted(((minute, of) for minute, of in shares.values() if of), key=lambda each: each[0])
-    labels = list(dict.fromkeys(label for _, of in known for label in of))
-    rows = [[label, *(f"{of[label]:.2f}" if label in of else None for _, of in known)] for label in labels]
-    words = (
-        "The share of the responses at or above the median of all: the more it differs between conditions, the better "
-        f"a robot can be driven. {len(shares)} of {files} recordings were looked at so far."
+    """The share of responses above the median for each condition, in each recording inspected so far."""
+    columns = sorted(((minute, column) for minute, column in shares.values() if column), key=lambda pair: pair[0])
+    labels = list(dict.fromkeys(label for _, column in columns for label in column))
+    rows = [[label, *(f"{of[label]:.2f}" if label in of else None for _, of in columns)] for label in labels]
+    note = (
+        "The share of responses at or above the median of all: the more it differs between conditions, the better "
+        f"a robot can be driven. {len(shares)} of {files} recordings have been inspected so far."
     )
-    head = ["condition", *(f"{minute:g} min" for minute, _ in known)]
-    return table("P(x >= P50) of each condition", head, rows, words)
+    head = ["condition", *(f"{minute:g} min" for minute, _ in columns)]
+    return table("P(x >= P50) of each condition", head, rows, note)
 
 
 def _median(rate_hz: float) -> str | None:
@@ -184,12 +184,12 @@ def _median(rate_hz: float) -> str | None:
 
 def _inspected(inspection: Inspection | None) -> list[dict[str, Any]]:
     if inspection is None:
-        return [table("Findings", ["severity", "what"], [], "the newest recording could not be inspected")]
+        return [table("Findings", ["severity", "message"], [], "the newest recording could not be inspected")]
     conditions = [[c.label, c.n_responses, c.n_non_burst, _median(c.median_rate_hz)] for c in inspection.conditions]
-    findings = [[each.severity, each.message] for each in inspection.findings]
+    findings = [[finding.severity, finding.message] for finding in inspection.findings]
     return [
         table(
             "Responses", ["condition", "responses", "without bursts", "median (Hz)"], conditions[:200], width="third"
         ),
-        table("Findings", ["severity", "what"], findings, "" if findings else "none", width="two-thirds"),
+        table("Findings", ["severity", "message"], findings, "" if findings else "none", width="two-thirds"),
     ]

@@ -1,4 +1,4 @@
-"""The server of the page: on the loopback interface alone, at an address that nobody can guess."""
+"""The page's server: only on the loopback interface, at an address that cannot be guessed."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import AnimatError, InvalidArgument
-from animat.watch.found import find
+from animat.watch.discovery import find
 
 _NEEDS = ("starlette", "uvicorn")
 _START_S = 60.0
-"""How long a server may take to say its address."""
+"""How long a server may take to report its address."""
 _LINGER_S = 60.0
-"""For how long after its command, and the last look at its page, a server stays."""
+"""How long a server stays up after its command has ended and the page was last requested."""
 
 
 def expect_installed() -> None:
-    """Refuse where what the page needs is not installed (AnimatError, saying how to install it)."""
+    """Raise AnimatError, with the command to install them, if the page's requirements are missing."""
     if missing := [name for name in _NEEDS if find_spec(name) is None]:
         raise AnimatError(f"the page needs {' and '.join(missing)}: pip install 'animat[watch]'")
 
 
-def serve(folder: Path, port: int, say: Callable[[str], None], *, beside: int | None = None) -> None:
+def serve(folder: Path, port: int, announce: Callable[[str], None], *, parent: int | None = None) -> None:
     """Serve the page of a folder until Ctrl-C.
 
     Args:
-        folder: that is watched.
-        port: 0 for any that is free.
-        say: is given the address.
-        beside: a process: a minute after it ended and the page was last looked at, so does this.
+        folder: to watch.
+        port: 0 for any free port.
+        announce: called with the address.
+        parent: id of a process; the server ends a minute after it has ended and the page was last requested.
 
     Raises:
-        AnimatError: if what the page needs is not installed.
-        InvalidArgument: for a port that cannot be listened on.
+        AnimatError: if the page's requirements are not installed.
+        InvalidArgument: if the port is not available.
     """
     expect_installed()
     import uvicorn
@@ -51,7 +51,7 @@ def serve(folder: Path, port: int, say: Callable[[str], None], *, beside: int | 
     from animat.watch.app import app_for
 
     token = secrets.token_urlsafe(24)
-    expected = "--port: expected one from 1 to 65,535 that is free, or 0 for any that is"
+    expected = "--port: expected a free port from 1 to 65,535, or 0 for any"
     if not 0 <= port < 2**16:
         raise InvalidArgument(f"{expected}, got {port}")
     try:
@@ -65,33 +65,33 @@ def serve(folder: Path, port: int, say: Callable[[str], None], *, beside: int | 
         settings: dict[str, Any] = {
             "log_level": "critical", "access_log": False, "lifespan": "off", "ws": "none", "proxy_headers": False,
         }  # fmt: skip
-        # What is refused is told in no header.
+        # No header names the server, not even in refusals.
         server = uvicorn.Server(uvicorn.Config(app, server_header=False, timeout_graceful_shutdown=1, **settings))
-        if beside is not None:
-            threading.Thread(target=_end_after, args=(beside, app, server), daemon=True).start()
-        say(f"http://127.0.0.1:{port}/{token}/")
+        if parent is not None:
+            threading.Thread(target=_end_after, args=(parent, app, server), daemon=True).start()
+        announce(f"http://127.0.0.1:{port}/{token}/")
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
 
 
-def _end_after(process: int, app: Any, server: Any) -> None:
-    # Whoever loses the process that started it gets another parent.
-    while os.getppid() == process or time.monotonic() - app.state.asked_s < _LINGER_S:
+def _end_after(parent: int, app: Any, server: Any) -> None:
+    # A process whose parent ends gets another one.
+    while os.getppid() == parent or time.monotonic() - app.state.asked_s < _LINGER_S:
         time.sleep(1.0)
     server.should_exit = True
 
 
 @contextmanager
 def watching(folder: Path) -> Iterator[None]:
-    """Have the page of a folder served by a process of its own, which stays a minute for whoever looks.
+    """Serve the page of a folder in a separate process, which stays up for a minute after the last request.
 
-    Its address is printed. What is in the block knows nothing of it.
+    Its address is printed. The code in the block is independent of it.
 
     Raises:
-        AnimatError: if it needs what is not installed, or does not start.
+        AnimatError: if its requirements are not installed, or it does not start.
     """
     expect_installed()
-    # A session of its own: Ctrl-C ends the command, and the page shows how.
+    # In its own session: Ctrl-C ends only the command, and the page shows how it ended.
     server = subprocess.Popen(
         [sys.executable, "-m", "animat.watch", str(folder.absolute()), str(os.getpid())],
         stdin=subprocess.DEVNULL,
@@ -104,12 +104,12 @@ def watching(folder: Path) -> Iterator[None]:
         yield
     except AnimatError:
         if not find(folder):
-            # It was refused before anything began.
+            # The command was refused before it began.
             server.kill()
             server.wait()
         raise
     finally:
-        # It goes on for whoever looks, and ends by itself: that it is not waited for is meant, and no leak.
+        # The server continues for viewers and ends by itself: not waiting for it is intended, and not a leak.
         assert server.stdout is not None
         server.stdout.close()
         server.returncode = server.poll() or 0
@@ -117,12 +117,12 @@ def watching(folder: Path) -> Iterator[None]:
 
 def _address(server: subprocess.Popen[str]) -> str:
     assert server.stdout is not None
-    late = threading.Timer(_START_S, server.kill)
-    late.start()
-    said = server.stdout.readline().strip()
-    late.cancel()
-    if not said.startswith("http://127.0.0.1:"):
+    timeout = threading.Timer(_START_S, server.kill)
+    timeout.start()
+    address = server.stdout.readline().strip()
+    timeout.cancel()
+    if not address.startswith("http://127.0.0.1:"):
         server.kill()
         server.communicate()
-        raise AnimatError("--watch: the page's server did not start; run animat watch to see why, or go without")
-    return said
+        raise AnimatError("--watch: the page's server did not start; run animat watch to see why, or omit --watch")
+    return address

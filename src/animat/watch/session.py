@@ -1,4 +1,4 @@
-"""The view of a closed-loop session: what happened in the seconds before a time, and what it all came to so far."""
+"""The view of a closed-loop session: the seconds before a time, and totals so far."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from animat.progress import duration_in_words
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
 from animat.watch.blocks import time_left
-from animat.watch.held import is_held
 from animat.watch.picture import is_drawn
 from animat.watch.plain import listed, mapped, number, numbers, text, whole
 from animat.watch.spikes import packed
+from animat.watch.state import is_locked
 from animat.watch.sums import Sums, first_readout
 from animat.watch.tail import Tail
 from animat.watch.view import View
 
 MOST_SPAN_S = 60.0
-"""That is shown at once."""
+"""Longest span shown at once."""
 _MOST_RECORDS = 8000
-"""Of a view: at 80 Hz more than a minute and a half."""
+"""Most records in a view: at 80 Hz more than a minute and a half."""
 _GROW_S, _COUNT_S = 0.6, 0.15
-"""How long a view may look for new records, and count them; the next one goes on."""
+"""How long a view may look for new records, and count them; the next view continues."""
 _AGENTS_S, _MANY = 0.5, 500
-"""Between times that returns are gathered by agent, of so many episodes or more."""
+"""Interval between updates of the returns by agent, from this many episodes on."""
 _SILENT_S = 5.0
-"""Without a word a session no longer counts as running: it writes down whatever it asks of a culture."""
+"""After which a session without new records no longer counts as running: it logs every request to a culture."""
 _NO_TIME = 64
-"""Records in a row without a time, at most."""
+"""Most consecutive records without a time."""
 
 
 class SessionView(View):
-    """A session's folder, with a log in it."""
+    """The folder of a session, with its log."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -57,14 +57,14 @@ class SessionView(View):
         self._look()
         header, words = self._header, self._words
         loop, channels = mapped(words.get("loop")), header.channels
+        robot = text(mapped(loop.get("robot")).get("name", "robot"))
         return {
             "generation": self.tail.generation,
-            "title": f"{text(mapped(loop.get('robot')).get('name', 'robot'))} on the {text(words.get('culture', ''))} "
-            "culture",
-            "conditions": [text(each) for each in header.conditions],
-            "agents": [text(each.get("name")) for each in map(mapped, listed(words.get("agents")))],
-            "observed": [text(each) for each in header.observed],
-            "readouts": [text(each) for each in header.readouts],
+            "title": f"{robot} on the {text(words.get('culture', ''))} culture",
+            "conditions": list(map(text, header.conditions)),
+            "agents": [text(agent.get("name")) for agent in map(mapped, listed(words.get("agents")))],
+            "observed": list(map(text, header.observed)),
+            "readouts": list(map(text, header.readouts)),
             "mapping": text(mapped(loop.get("mapping")).get("name", loop.get("mapping"))),
             "thresholds": _thresholds(loop.get("mapping")),
             "adaptive": bool(loop.get("adaptive")),
@@ -74,9 +74,9 @@ class SessionView(View):
             "account": {text(name): number(value) for name, value in mapped(words.get("account")).items()},
             "is_drawn": is_drawn(loop),
             "channels": {
-                "x_um": [number(x) for x in channels.x_um.tolist()],
-                "y_um": [number(y) for y in channels.y_um.tolist()],
-                "electrode": [whole(each) for each in channels.electrode.tolist()],
+                "x_um": list(map(number, channels.x_um.tolist())),
+                "y_um": list(map(number, channels.y_um.tolist())),
+                "electrode": list(map(whole, channels.electrode.tolist())),
             },
         }
 
@@ -84,8 +84,8 @@ class SessionView(View):
         """The seconds before a time on the session's clock; None: now, or its end.
 
         Raises:
-            InvalidFile: if there is no session any more.
-            InvalidArgument: for a span that cannot be.
+            InvalidFile: if there is no longer a session.
+            InvalidArgument: for an invalid span.
         """
         if not 0 < span_s <= MOST_SPAN_S:
             raise InvalidArgument(f"span: expected above 0 and at most {MOST_SPAN_S:g} s, got {span_s:g}")
@@ -112,7 +112,7 @@ class SessionView(View):
             "spikes": spikes,
             "counts": counts,
             "pulsed": listed(ticks[-1][1]["electrodes"]) if ticks else [],
-            # Where the robot of the last tick stood last.
+            # The last tick with an observation.
             "picture": next((at for at, tick in ticks[::-1] if tick["observation"]), None),
             "is_found": is_whole,
             **self._so_far(),
@@ -120,7 +120,7 @@ class SessionView(View):
         }
 
     def tick_at(self, at: int) -> tuple[Record, list[list[float | None]]] | None:
-        """The record of a tick, and the observations of the same episode before it, for a picture; None without."""
+        """The record of a tick, and the earlier observations of its episode, for a picture; None without a tick."""
         self._look()
         record = self.tail.record(at)
         tick = None if record is None else record.fields.get("tick")
@@ -128,8 +128,8 @@ class SessionView(View):
             return None
         earlier: list[list[float | None]] = []
         for before in range(at - 1, max(-1, at - _TRAIL), -1):
-            found = self.tail.record(before)
-            past = None if found is None else found.fields.get("tick")
+            previous = self.tail.record(before)
+            past = None if previous is None else previous.fields.get("tick")
             if isinstance(past, dict) and past.get("episode") != tick.get("episode"):
                 break
             if isinstance(past, dict) and past.get("observation"):
@@ -138,12 +138,12 @@ class SessionView(View):
 
     @property
     def robot_data(self) -> dict[str, Any]:
-        """What the header has of the robot and its goal."""
+        """The header's description of the robot and its goal."""
         self._look()
         return mapped(self._words.get("loop"))
 
     def _look(self) -> bool:
-        """Find what was added to the log; False where there is more than could be found by now."""
+        """Find new records in the log; False if there are more than could be found in time."""
         is_whole = self.tail.grow(_GROW_S)
         if self._generation != self.tail.generation or not hasattr(self, "_words"):
             first = self.tail.record(0)
@@ -159,7 +159,7 @@ class SessionView(View):
         sums = self._sums
         outline = sums.outline
         fullest = sums.on_electrode.most_common(1)
-        # Of thousands of episodes not each time.
+        # With thousands of episodes, not every time.
         is_due = self._done < _MANY or time.monotonic() > self._agents_until_s
         if self._agents_at != (outline.ticks, self._generation) and is_due:
             self._agents_at = outline.ticks, self._generation
@@ -170,7 +170,7 @@ class SessionView(View):
         done = self._done
         last = self._last_tick()
         planned, wall_s = len(listed(self._words.get("turns"))), number(mapped(last).get("wall_s"))
-        # What comes before the first move comes once.
+        # The time before the first move is spent only once.
         moving_s = None if wall_s is None else wall_s - (number(outline.moved_at_s) or 0.0)
         left_s = None if not done or moving_s is None else moving_s * (planned - done) / done
         state = self._state()
@@ -193,24 +193,22 @@ class SessionView(View):
         }
 
     def _state(self) -> dict[str, Any]:
-        """Whether it goes on, in words."""
+        """The session's state, with a message."""
         silent_s = max(0.0, time.time() - self.tail.path.stat().st_mtime)
-        silent = duration_in_words(silent_s)
+        silent = f"nothing was written for {duration_in_words(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()
         last = {} if not len(self.tail) else (self.tail.peek(len(self.tail) - 1) or {})
         damage = self.tail.damage
         if last.get("kind") == "end":
-            told = {"state": "ended", "message": text(last.get("message"))}
+            state, message = "ended", text(last.get("message"))
         elif silent_s < _SILENT_S + (number(mapped(self._words.get("loop")).get("pause_s")) or 0.0):
-            # A record that is just being written looks as one that is cut off.
-            told, damage = {"state": "running", "message": "stopping" if stop else ""}, ""
-        elif is_held(self.folder):
-            message = f"nothing was written for {silent}, but its program has not ended: it waits, or it hangs"
-            told = {"state": "running", "message": message}
+            # A record that is just being written looks like a truncated one.
+            state, message, damage = "running", "stopping" if stop else "", ""
+        elif is_locked(self.folder):
+            state, message = "running", f"{silent}, but its program has not ended: it is waiting, or it hangs"
         else:
-            message = f"nothing was written for {silent}, and no end: it was killed, or it hangs"
-            told = {"state": "silent", "message": message}
-        return {**told, "damage": damage, "stop": stop}
+            state, message = "silent", f"{silent}, and the log has no end: it was killed, or it hangs"
+        return {"state": state, "message": message, "damage": damage, "stop": stop}
 
     def _end_s(self) -> float:
         at = self._before(len(self.tail) - 1)
@@ -224,15 +222,15 @@ class SessionView(View):
         return None
 
     def _before(self, at: int) -> tuple[float, float] | None:
-        """From when to when the last record up to `at` goes that has a time."""
-        for number_ in range(at, max(0, at - _NO_TIME), -1):
-            span = _span(self.tail.peek(number_) or {})
+        """The span of the last record up to `at` that has a time."""
+        for earlier in range(at, max(0, at - _NO_TIME), -1):
+            span = _span(self.tail.peek(earlier) or {})
             if span is not None:
                 return span
         return None
 
     def _between(self, from_s: float, to_s: float) -> list[tuple[int, Record]]:
-        """Records that have to do with a span, found by halving: they are in the order of time."""
+        """The records that concern a span, found by bisection, as they are in the order of time."""
         low, high = 1, len(self.tail)
         while low < high:
             middle = (low + high) // 2
@@ -241,26 +239,25 @@ class SessionView(View):
                 high = middle
             else:
                 low = middle + 1
-        found: list[tuple[int, Record]] = []
+        records: list[tuple[int, Record]] = []
         for at in range(low - 1, 0, -1):
             record = self.tail.record(at)
             if record is None:
                 continue
             span = _span(record.fields)
-            if (span is not None and span[1] < from_s) or len(found) >= _MOST_RECORDS:
+            if (span is not None and span[1] < from_s) or len(records) >= _MOST_RECORDS:
                 break
-            found.append((at, record))
-        return found[::-1]
+            records.append((at, record))
+        return records[::-1]
 
     def _tick(self, at: int, record: Record) -> dict[str, Any] | None:
         tick = record.fields.get("tick")
         if not isinstance(tick, dict):
             return None
         totals = self._sums.totals
-        chosen = [row[3] for row in listed(record.fields.get("stimuli")) if isinstance(row, list) and len(row) == 4]
-        named = {name: _plain(tick.get(name)) for name in _NUMBERS}
+        electrodes = [row[3] for row in listed(record.fields.get("stimuli")) if isinstance(row, list) and len(row) == 4]
         return {
-            **named,
+            **{name: _plain(tick.get(name)) for name in _NUMBERS},
             "time_s": number(tick.get("read_after_s")),
             "agent": text(tick.get("agent", "")),
             "handled": text(tick.get("handled", "")),
@@ -268,14 +265,14 @@ class SessionView(View):
             "command": numbers(tick.get("command")),
             "observation": numbers(tick.get("observation")),
             "total": number(totals[at]) if at < len(totals) else None,
-            "electrodes": [whole(each) for each in listed(chosen[-1])] if chosen else [],
+            "electrodes": list(map(whole, listed(electrodes[-1]))) if electrodes else [],
         }
 
 
 _Row = tuple[float, list[float | None]]
-"""When thresholds were set anew, and the percentiles in Hz since then."""
+"""When thresholds changed, and the percentiles in Hz since then."""
 _TRAIL = 400
-"""Ticks that are looked back at for a robot's trail."""
+"""Number of earlier ticks searched for a robot's trail."""
 _NUMBERS = (
     "number", "episode", "iteration", "chosen", "delivered", "spikes", "rate_hz", "reward", "late_s", "decided_s",
     "is_burst",
@@ -295,11 +292,11 @@ def _span(words: dict[str, Any]) -> tuple[float, float] | None:
 
 
 def _thresholds(mapping: Any) -> list[int]:
-    """Which of the eleven percentiles a mapping compares responses with; both ends where that is not known."""
+    """Which of the eleven percentiles a mapping compares responses with; both ends if not known."""
     from animat.coding.mapping import Thresholds
 
     name = mapping if isinstance(mapping, str) else mapped(mapping).get("name")
-    known = {each.name: list(each.percentile_indices) for each in (Thresholds(1), Thresholds(9))}
+    known = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
     return known.get(str(name), [0, 10])
 
 
@@ -311,7 +308,7 @@ def _unanswered(outline: Outline) -> int | None:
 
 
 def _in_force(rows: Sequence[_Row], shown: Sequence[_Row], most: int = 400) -> list[_Row]:
-    """Those of a session, at most so many and evenly, the last one among them, and all of the span that is shown."""
+    """The session's rows, evenly thinned to `most` but including the last, and all rows of the span shown."""
     step = max(1, math.ceil(len(rows) / most))
     rows = [*rows[:-1:step], *rows[-1:]]
     if not shown:

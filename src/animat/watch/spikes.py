@@ -1,4 +1,4 @@
-"""Spikes as a page takes them: packed, and thinned where there are more than a screen has points."""
+"""Spikes for the page: packed, and thinned if there are more than a screen has points."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 from animat.closed_loop.log import Record
 
 MOST = 60_000
-"""That are sent at once."""
+"""Most spikes sent at once."""
 
 
 def packed(records: Sequence[Record], from_s: float, to_s: float, n_channels: int) -> tuple[dict[str, Any], list[int]]:
-    """Spikes of a span, and how many each channel had."""
+    """The spikes of a span, and their number on each channel."""
     times = [np.empty(0), *(record.spike_times_s for record in records)]
     channels = [np.empty(0, np.int64), *(record.spike_channels for record in records)]
     return packed_spikes(np.concatenate(times), np.concatenate(channels), from_s, to_s, n_channels)
@@ -25,9 +25,9 @@ def packed(records: Sequence[Record], from_s: float, to_s: float, n_channels: in
 def packed_spikes(
     times_s: Float[np.ndarray, " spikes"], channels: Int[np.ndarray, " spikes"], from_s: float, to_s: float, n: int
 ) -> tuple[dict[str, Any], list[int]]:
-    """Spikes of a span: times from its start to its end as 0 to 65,535, and channels, both as base64 of uint16.
+    """The spikes of a span: times as 0 (its start) to 65,535 (its end), and channels, both as base64 of uint16.
 
-    Channels beyond 65,535 are not drawn; all are counted.
+    Channels beyond 65,535 are counted but not drawn.
     """
     with np.errstate(invalid="ignore"):
         within = (times_s >= from_s) & (times_s <= to_s) & (channels >= 0) & (channels < n)

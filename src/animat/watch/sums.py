@@ -1,4 +1,4 @@
-"""What a session came to so far, counted a slice at a time while it is looked at: totals, episodes, faults."""
+"""Totals, episodes and faults of a session so far, counted in slices while it is watched."""
 
 from __future__ import annotations
 
@@ -12,26 +12,30 @@ from animat.closed_loop.outline import Outline
 from animat.watch.plain import number, numbers, text, whole
 from animat.watch.tail import Tail
 
-_MOST_TOLD = 50
-"""Faults that are told."""
+_MOST_FAULTS = 50
+"""Most faults shown."""
 _MOST_THRESHOLDS = 20_000
-"""Of a session's; of a longer one every second is kept, and so on."""
+"""Most changes of thresholds kept; beyond it every second one is dropped, repeatedly."""
 _LOOKS = 64
 """Records between two looks at the clock."""
+_KINDS = {
+    "agent": str, "handled": str, "pulse_time_s": list, "is_burst": bool, "terminated": bool, "truncated": bool,
+}  # fmt: skip
+"""Types of a tick's values."""
 
 
 class Sums:
-    """The totals of a log's records, as far as they were counted.
+    """The totals of a log's records counted so far.
 
     Attributes:
-        counted: of the log's records.
-        outline: what they came to.
-        totals: of each record the return of its episode so far; NaN without a tick.
-        on_electrode: pulses on each.
+        counted: number of records counted.
+        outline: their outline.
+        totals: for each record the return of its episode so far; NaN without a tick.
+        on_electrode: number of pulses on each electrode.
         faults: the last ones: when, on the session's clock, and what happened.
-        n_faults: how many there were.
-        percentiles: when thresholds were set anew, and the percentiles in Hz since then.
-        strange: records that say nothing that is known.
+        n_faults: number of all faults.
+        percentiles: when thresholds changed, and the percentiles in Hz since then.
+        strange: number of records that are not understood.
     """
 
     def __init__(self, tail: Tail) -> None:
@@ -45,7 +49,7 @@ class Sums:
         self._episode, self._total, self._end_s = -1, 0.0, 0.0
 
     def go_on(self, within_s: float) -> None:
-        """Count what was added, for so long at most."""
+        """Count the records that were added, for at most `within_s`."""
         until_s = time.monotonic() + within_s
         while self.counted < len(self._tail):
             record = self._tail.peek(self.counted)
@@ -58,7 +62,7 @@ class Sums:
 
     @property
     def share(self) -> float:
-        """Of the records that are there."""
+        """The share of the log's records that are counted."""
         return self.counted / max(1, len(self._tail))
 
     def _add(self, words: dict[str, Any]) -> None:
@@ -76,8 +80,8 @@ class Sums:
             elif kind == "event":
                 self.n_faults += 1
                 when, what = number(words.get("asked_at_s")), f"{text(words['what'])}: {text(words['message'])}"
-                self.faults = [*self.faults, (when, what)][-_MOST_TOLD:]
-            # Sessions of before have records of their own for them.
+                self.faults = [*self.faults, (when, what)][-_MOST_FAULTS:]
+            # Older sessions have separate records for them.
             if "percentiles_hz" in words:
                 self.percentiles.append((self._end_s, first_readout(words["percentiles_hz"])))
                 if len(self.percentiles) > _MOST_THRESHOLDS:
@@ -94,23 +98,17 @@ class Sums:
 
 
 def first_readout(percentiles: Any) -> list[float | None]:
-    """The percentiles of one readout; of several those of the first."""
+    """The percentiles of the first or only readout."""
     return numbers(percentiles[0] if percentiles and isinstance(percentiles[0], list) else percentiles)
 
 
 def _expect_fit(words: dict[str, Any]) -> None:
-    """Raise ValueError for what cannot be counted: one such record would leave sums that no later one could mend."""
+    """Raise ValueError for a record that cannot be counted: it would spoil the sums for good."""
     tick, kind = words.get("tick"), words["kind"]
     if kind == "seen" and tick:
-        kinds = (
-            isinstance(tick["agent"], str),
-            isinstance(tick["handled"], str),
-            isinstance(tick["pulse_time_s"], list),
-        )
-        flags = (tick[name] for name in ("is_burst", "terminated", "truncated"))
-        known = [number(tick[name]) for name in ("late_s", "frequency_hz")]
-        fits = all(kinds) and all(isinstance(flag, bool) for flag in flags) and None not in known
-        if not fits or whole(tick["episode"]) is None or tick["frequency_hz"] <= 0:
+        fits = all(isinstance(tick[name], kind) for name, kind in _KINDS.items())
+        fits &= None not in (number(tick["late_s"]), number(tick["frequency_hz"]), whole(tick["episode"]))
+        if not fits or tick["frequency_hz"] <= 0:
             raise ValueError("tick")
         if tick["reward"] is not None and number(tick["reward"]) is None:
             raise ValueError("reward")

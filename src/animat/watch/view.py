@@ -1,4 +1,4 @@
-"""What is shown of a folder that is watched; each kind of folder has a view of its own."""
+"""The view of a watched folder; each kind of folder has its own view."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from animat.progress import Speed
 from animat.watch.files import json_of
 
 _SPAN_S = 60.0
-"""Over which it is measured how fast work goes on."""
+"""Over which the speed of work is measured."""
 
 
 class View(abc.ABC):
-    """A folder, looked at again and again."""
+    """A folder that is viewed repeatedly."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -24,28 +24,28 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def about(self) -> dict[str, Any]:
-        """What does not change while it goes on."""
+        """What does not change while work goes on."""
 
     @abc.abstractmethod
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """How it is, in the seconds before a time; most have no clock of their own."""
+        """The current view, of the seconds before a time; most views have no clock."""
 
     def close(self) -> None:  # noqa: B027 - most keep nothing open
-        """Let go of files."""
+        """Close files."""
 
     def _described(self, name: str, what: str) -> dict[str, Any]:
-        """What the file of this name tells, which every folder of this kind has."""
-        found = json_of(self.folder / name)
-        if not isinstance(found, dict):
+        """The content of the file that describes every folder of this kind."""
+        content = json_of(self.folder / name)
+        if not isinstance(content, dict):
             raise InvalidFile(f"{self.folder / name}: expected the description of a {what}, got none")
-        return found
+        return content
 
 
 def titled(title: str) -> dict[str, Any]:
-    """About what never changes but in its title."""
+    """The description of an item with only a title."""
     return {"generation": 0, "title": title}
 
 
 def in_blocks(state: dict[str, Any], blocks: Sequence[dict[str, Any]], damage: str = "") -> dict[str, Any]:
-    """A view that is made of blocks, below how the work stands."""
+    """A view made of blocks, with the state of the work."""
     return {"generation": 0, **state, "damage": damage, "blocks": list(blocks)}

@@ -1,8 +1,8 @@
-// Views that are made of tables, lists and charts.
+// Views made of tables, lists and charts.
 
 import { Frame, colour, list, make, series, shown, spanOf, table, unpacked } from "./draw.js";
 
-// Signs of the house's kind, in texts as in numbers.
+// Typographic minus, at-least and plus-minus signs, in texts as in numbers.
 const signs = (text) => text.replace(/(^|[\s(,])-(?=\d)/g, "$1\u2212").replaceAll(">=", "\u2265").replaceAll("+- ", "\u00b1\u00a0");
 const cell = (value) => (typeof value === "number" ? shown(value, 4) : signs(value ?? "none"));
 
@@ -33,7 +33,7 @@ export class BlocksPage {
   }
 
   table({ body, words }, block) {
-    // A head over nothing says nothing.
+    // No head without rows.
     table(body, block.rows.length ? block.head : [], block.rows.map((row) => row.map(cell)));
     words.textContent = signs(block.rows.length ? block.words : block.words || "none");
   }
@@ -56,12 +56,12 @@ export class BlocksPage {
     for (const each of block.series) {
       const how = { line: { width: 2.2 }, thin: { width: 0.8 }, dashed: { dashes: [5, 4] }, steps: { steps: true }, dots: null }[each.style];
       if (how) frame.line(each.x, each.y, paint(each), how);
-      // A single point is no line.
+      // A single point makes no line.
       if (!how || each.x.filter((x, i) => x !== null && each.y[i] !== null).length === 1) each.x.forEach((x, i) => { if (x !== null && each.y[i] !== null) frame.dot(x, each.y[i], paint(each)); });
     }
     for (const [at, what] of block.marks) {
       frame.line([at, at], frame.y, colour("red"), { dashes: [4, 3], width: 1 });
-      // A name that would run into the one before is left out.
+      // A label that would overlap the previous one is left out.
       const wide = frame.g.measureText(what).width, from = Math.min(frame.atX(at) - 2, frame.width - wide);
       if (from < free) continue;
       frame.text(what, from, 10, colour("faint"));

@@ -1,4 +1,4 @@
-// Canvases in the house's colours: a frame with numbers at its axes, and what is drawn in it.
+// Canvases in the page's colours: a frame with numbered axes, and what is drawn in it.
 
 let style = null;
 
@@ -9,7 +9,7 @@ export function colour(name) {
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { style = null; });
 
-// One after the other for what has an order, as frequencies have: from blue to yellow, which all eyes can tell apart.
+// For ordered values such as frequencies: from blue to yellow, distinguishable with any colour vision.
 export function ordered(i, n) {
   const ramp = colour("ramp").split(" ");
   const at = (n < 2 ? 1 : i / (n - 1)) * (ramp.length - 1);
@@ -33,14 +33,14 @@ export function shown(value, digits = 4) {
   return text.replace("-", MINUS);
 }
 
-// Few round numbers within a span.
+// A few round numbers within a span.
 function marks(low, high, most) {
   const raw = (high - low) / Math.max(1, most);
   if (!(raw > 0) || !Number.isFinite(raw)) return [low];
   const unit = 10 ** Math.floor(Math.log10(raw));
   const steps = [0.2, 0.5, 1, 2, 5, 10].map((k) => k * unit);
   let which = steps.findIndex((each) => each >= raw * 0.999), found = multiples(steps[which], low, high);
-  // A single number gives no scale.
+  // A single number does not show the scale.
   while (found.length < 2 && which > 0) found = multiples(steps[which -= 1], low, high);
   return found;
 }
@@ -120,18 +120,18 @@ export class Frame {
 
   atY(value) { return this.bottom - ((value - this.y[0]) / (this.y[1] - this.y[0] || 1)) * (this.bottom - this.top); }
 
-  // Whatever is drawn by `what` stays within the frame.
-  within(what) {
+  // Clips whatever `draw` draws to the frame.
+  within(draw) {
     const { g } = this;
     g.save();
     g.beginPath();
     g.rect(this.left, this.top, this.right - this.left, this.bottom - this.top);
     g.clip();
-    what(g);
+    draw(g);
     g.restore();
   }
 
-  // Points that are joined; null breaks the line. As steps each holds until the next.
+  // Joins points; null breaks the line. With steps, each value holds until the next.
   line(xs, ys, stroke, { steps = false, width = 1.6, dashes = [] } = {}) {
     this.within((g) => {
       g.strokeStyle = stroke;
@@ -161,7 +161,7 @@ export class Frame {
     if (ring) { g.strokeStyle = fill; g.lineWidth = 1.5; g.stroke(); } else { g.fillStyle = fill; g.fill(); }
   }
 
-  // Set as pixels of a sheet, at times within x as 0 to 65,535: thousands of rectangles kept a core busy.
+  // Spikes at times of 0 to 65,535 within x, set as pixels of a sheet: drawing thousands of rectangles kept a core busy.
   spikes(times, channels, n) {
     const ratio = window.devicePixelRatio || 1;
     const width = Math.max(1, Math.round((this.right - this.left) * ratio)), height = Math.max(1, Math.round((this.bottom - this.top) * ratio));
@@ -191,13 +191,13 @@ export class Frame {
   }
 }
 
-// The least span that holds all values, a little wider.
+// The smallest span that holds all values, with a margin.
 export function spanOf(values, least = 1e-9) {
   const known = values.filter((each) => each !== null && Number.isFinite(each));
   if (!known.length) return [0, 1];
   let low = Infinity, high = -Infinity;
   for (const each of known) { low = Math.min(low, each); high = Math.max(high, each); }
-  // Around a single value there is room too: ten equal numbers at an axis say nothing.
+  // A single value gets a margin too: an axis with ten equal numbers is useless.
   const more = Math.max((high - low) * 0.06, least, Math.abs(high) * (high > low ? 1e-6 : 0.1));
   return [low - more, high + more];
 }
@@ -218,7 +218,7 @@ export function list(target, pairs) {
   target.replaceChildren(...pairs.flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: value })]));
 }
 
-// Numbers to the right, texts to the left; in a column of numbers "none yet" stands where they will.
+// Numbers are right-aligned, texts left-aligned; "none yet" is aligned like the numbers of its column.
 export function table(target, head, rows) {
   const isText = head.map((_, i) => rows.some((row) => /[a-z]{3}/i.test(row[i]) && !/^(none|not)\b/.test(row[i])));
   const line = (cells, kind) => make("tr", {}, ...cells.map((each, i) => make(kind, { textContent: each.replaceAll(" %", "\u00a0%"), className: isText[i] ? "text" : "" })));

@@ -1,4 +1,4 @@
-// What is watched, when, and how often it is asked for.
+// What is watched, at which time, and how often it is requested.
 
 import { BlocksPage } from "./blocks.js";
 import { make, shown } from "./draw.js";
@@ -12,7 +12,7 @@ const KINDS = {
   tuning: { name: "tuning", page: BlocksPage },
   recording: { name: "recordings", page: BlocksPage, seeks: true },
 };
-// From the start of a look to that of the next, and after a look at what does not change.
+// From the start of one look to the next, and after a look at something that does not change.
 const LIVE_MS = 200, SETTLED_MS = 1000, THINGS_MS = 3000;
 const $ = (id) => document.getElementById(id);
 
@@ -20,39 +20,39 @@ let thing = null, about = null, page = null, view = null;
 let picked = false;
 let following = true, to = null, span = 8, asking = false, timer = 0, again = false;
 
-// What a study makes is part of it.
-function isPartOf(whole, each) {
-  return ["study", "cultures", "tuning"].includes(whole?.kind) && each.kind !== whole.kind && (!whole.place || each.place.startsWith(`${whole.place}/`));
+// The outputs of a study are part of it.
+function isPartOf(whole, item) {
+  return ["study", "cultures", "tuning"].includes(whole?.kind) && item.kind !== whole.kind && (!whole.place || item.place.startsWith(`${whole.place}/`));
 }
 
-function ask(path, more = {}) {
-  const words = new URLSearchParams({ ...(thing ? { kind: thing.kind, in: thing.place } : {}), ...more });
-  return `${path}?${words}`;
+function urlOf(path, more = {}) {
+  const query = new URLSearchParams({ ...(thing ? { kind: thing.kind, in: thing.place } : {}), ...more });
+  return `${path}?${query}`;
 }
 
-async function fetched(path, more, options = {}) {
-  const answer = await fetch(ask(path, more), { ...options, cache: "no-store" });
-  const type = answer.headers.get("content-type") ?? "";
-  const said = type.startsWith("application/json") ? await answer.json() : { error: await answer.text() };
-  if (!answer.ok) throw new Error(said.error ?? `status ${answer.status}`);
-  return said;
+async function request(path, more, options = {}) {
+  const response = await fetch(urlOf(path, more), { ...options, cache: "no-store" });
+  const type = response.headers.get("content-type") ?? "";
+  const content = type.startsWith("application/json") ? await response.json() : { error: await response.text() };
+  if (!response.ok) throw new Error(content.error ?? `status ${response.status}`);
+  return content;
 }
 
-function trouble(words) {
-  $("trouble").hidden = !words;
-  if ($("trouble").textContent !== words) $("trouble").textContent = words;
+function showError(message) {
+  $("trouble").hidden = !message;
+  if ($("trouble").textContent !== message) $("trouble").textContent = message;
 }
 
 async function look() {
   if (asking) { again = true; return; }
   asking = true;
   again = false;
-  const of = thing, began = performance.now();
+  const item = thing, began = performance.now();
   try {
-    if (of) await lookAt(of);
-    trouble("");
+    if (item) await lookAt(item);
+    showError("");
   } catch (error) {
-    if (of === thing) trouble(error instanceof TypeError ? "the page's server does not answer: it was ended, or its machine sleeps. What it showed goes on without it; a session is stopped by a file STOP in its folder." : error.message);
+    if (item === thing) showError(error instanceof TypeError ? "the page's server does not respond: it was ended, or its machine is asleep. What it showed continues without it; a session is stopped by a file STOP in its folder." : error.message);
   }
   asking = false;
   clearTimeout(timer);
@@ -61,28 +61,28 @@ async function look() {
   timer = setTimeout(look, again || busy ? 20 : settled ? SETTLED_MS : Math.max(20, LIVE_MS - (performance.now() - began)));
 }
 
-async function lookAt(of) {
+async function lookAt(item) {
   if (!about) {
-    const found = await fetched("about");
-    if (of !== thing) return;
-    about = found;
+    const content = await request("about");
+    if (item !== thing) return;
+    about = content;
     $("main").replaceChildren();
-    page = new KINDS[of.kind].page($("main"), about, ask);
+    page = new KINDS[item.kind].page($("main"), about, urlOf);
     $("title").textContent = about.title;
     document.title = `${about.title} – animat watch`;
   }
-  const found = await fetched("view", { span, ...(following || to === null ? {} : { to }) });
-  if (of !== thing) return;
-  if (found.generation !== about.generation) { about = null; again = true; return; }
-  view = found;
+  const content = await request("view", { span, ...(following || to === null ? {} : { to }) });
+  if (item !== thing) return;
+  if (content.generation !== about.generation) { about = null; again = true; return; }
+  view = content;
   page.draw(view);
-  tellState();
+  showState();
 }
 
-function tellState() {
-  const words = { running: "● running", ended: "■ ended", silent: "▲ silent" }[view.state] ?? "";
-  const told = `${words}${view.message ? `: ${view.message}` : ""}${view.damage ? `; ${view.damage}` : ""}`;
-  if ($("state").textContent !== told) $("state").textContent = told;
+function showState() {
+  const state = { running: "● running", ended: "■ ended", silent: "▲ silent" }[view.state] ?? "";
+  const line = `${state}${view.message ? `: ${view.message}` : ""}${view.damage ? `; ${view.damage}` : ""}`;
+  if ($("state").textContent !== line) $("state").textContent = line;
   const canStop = thing.kind === "session";
   $("stop").hidden = !canStop;
   $("stop").disabled = view.state === "ended" || view.stop;
@@ -97,41 +97,41 @@ function tellState() {
 
 async function things() {
   try {
-    const found = await fetched("things", {});
-    $("folder").textContent = found.folder;
-    const key = (each) => `${each.kind} ${each.place}`;
-    const listed = [...found.things].sort((a, b) => (key(a) < key(b) ? -1 : 1));
-    const known = [...$("things").options].map((each) => each.value).join("\n");
+    const content = await request("things", {});
+    $("folder").textContent = content.folder;
+    const key = (item) => `${item.kind} ${item.place}`;
+    const listed = [...content.things].sort((a, b) => (key(a) < key(b) ? -1 : 1));
+    const known = [...$("things").options].map((option) => option.value).join("\n");
     if (known !== listed.map(key).join("\n")) {
       const before = new Set(known.split("\n"));
-      $("things").replaceChildren(...listed.map((each) => make("option", { value: key(each), textContent: `${KINDS[each.kind].name}${each.place ? `: ${each.place}` : ""}` })));
+      $("things").replaceChildren(...listed.map((item) => make("option", { value: key(item), textContent: `${KINDS[item.kind].name}${item.place ? `: ${item.place}` : ""}` })));
       $("things").things = listed;
       if (thing) $("things").value = key(thing);
-      // What came last is what goes on, unless somebody chose.
-      const fresh = found.things.find((each) => !before.has(key(each)) && !isPartOf(thing, each));
+      // Show the newest item, unless the user has chosen one.
+      const fresh = content.things.find((item) => !before.has(key(item)) && !isPartOf(thing, item));
       if (thing && fresh && !picked) choose(fresh);
     }
-    $("choose").hidden = found.things.length < 2;
-    const [newest] = found.things;
-    const [outermost] = found.things.filter((each) => isPartOf(each, newest)).sort((a, b) => a.place.length - b.place.length);
+    $("choose").hidden = content.things.length < 2;
+    const [newest] = content.things;
+    const [outermost] = content.things.filter((item) => isPartOf(item, newest)).sort((a, b) => a.place.length - b.place.length);
     if (!thing && newest) choose(outermost ?? newest);
-    if (!thing) $("main").replaceChildren(make("p", { className: "words", textContent: `${found.folder} holds nothing to watch yet: no session, training, study, tuning or recording. It is looked at again every few seconds.` }));
+    if (!thing) $("main").replaceChildren(make("p", { className: "words", textContent: `${content.folder} holds nothing to watch yet: no session, training, study, tuning or recording. It is checked again every few seconds.` }));
   } catch {
-    // Said where it is looked at.
-    if (!thing) trouble("the page's server does not answer");
+    // With an item shown, `look` reports the error.
+    if (!thing) showError("the page's server does not respond");
   }
   setTimeout(things, THINGS_MS);
 }
 
-function choose(one) {
-  thing = one;
+function choose(item) {
+  thing = item;
   about = page = view = null;
   following = true;
   to = null;
-  $("things").value = `${one.kind} ${one.place}`;
-  // Nothing of what was shown before may be taken for this one's.
+  $("things").value = `${item.kind} ${item.place}`;
+  // Nothing of the previous item may be mistaken for this one's.
   $("stop").hidden = $("controls").hidden = true;
-  $("title").textContent = KINDS[one.kind].name;
+  $("title").textContent = KINDS[item.kind].name;
   $("state").textContent = "reading…";
   $("main").replaceChildren();
   look();
@@ -149,9 +149,9 @@ $("span").addEventListener("change", () => { span = Number($("span").value); loo
 $("stop").addEventListener("click", async () => {
   $("stop").disabled = true;
   try {
-    await fetched("stop", {}, { method: "POST" });
+    await request("stop", {}, { method: "POST" });
   } catch (error) {
-    trouble(`it could not be stopped from here: ${error.message}. Make a file STOP in its folder, or press Ctrl-C where it runs.`);
+    showError(`it could not be stopped from here: ${error.message}. Create a file STOP in its folder, or press Ctrl-C where it runs.`);
   }
   look();
 });

@@ -2,7 +2,7 @@
 
 import { Frame, colour, list, make, ordered, series, shown, spanOf, table, unpacked } from "./draw.js";
 
-// Of every canvas over the last seconds, so that their times stand below each other.
+// The same left margin for every canvas over time, so that their times line up.
 const LEFT = 52, CLOCK = "session's clock (s)";
 const units = (column) => column.replaceAll("_per_", "/").replace(/_([^_]+)$/, (all, unit) => (/^(m|s|rad|deg|Hz|V|N)(\/.*)?$/.test(unit) ? ` (${unit})` : all)).replaceAll("_", " ");
 
@@ -17,9 +17,9 @@ function card(main, kind, title, canvasKind, extra = []) {
 }
 
 export class SessionPage {
-  constructor(main, about, ask) {
+  constructor(main, about, urlOf) {
     this.about = about;
-    this.ask = ask;
+    this.urlOf = urlOf;
     this.picture = null;
     this.now = make("dl", { id: "now" });
     this.robot = make("canvas", { className: "robot", hidden: true });
@@ -31,7 +31,7 @@ export class SessionPage {
     this.raster.section.insertBefore(this.legend, this.raster.words);
     this.response = card(main, "half", "Response (Hz per channel) against thresholds", "");
     this.command = card(main, "half", "Command", "");
-    this.array = card(main, "third", "Array: spikes a second on each channel", "square");
+    this.array = card(main, "third", "Array: firing rate of each channel", "square");
     this.observed = make("section", { className: "two-thirds" }, make("h2", { textContent: "Observation" }));
     const grid = make("div", { className: "pair" });
     this.observed.append(grid);
@@ -71,14 +71,14 @@ export class SessionPage {
     this.#drawLate(view, last);
     this.#drawAgents(view);
     this.#drawDrift(view);
-    this.#tellTotals(view);
+    this.#listTotals(view);
   }
 
   #drawNow(view, last) {
     const { ticks } = view, { about } = this;
     if (last < 0) {
       this.now.replaceChildren();
-      this.robotWords.textContent = "nothing was presented in this span";
+      this.robotWords.textContent = "no stimulus was presented in this span";
       return;
     }
     const at = (name) => ticks[name][last];
@@ -100,7 +100,7 @@ export class SessionPage {
 
   #drawRobot(wanted) {
     if (!this.about.is_drawn) {
-      this.robotWords.textContent = "no picture: this robot is not known here, or has no drawing of its own";
+      this.robotWords.textContent = "no picture: this robot is not known here, or cannot be drawn";
       return;
     }
     if (wanted === null || wanted === this.picture || this.loading) return;
@@ -112,11 +112,11 @@ export class SessionPage {
     ).finally(() => { this.loading = false; });
   }
 
-  // Into one canvas: images that follow each other in an element stay in the browser's memory, as does an answer that is not read.
+  // Into one canvas: successive images in an element stay in the browser's memory, as does a response that is not read.
   async #loadRobot(wanted) {
-    const answer = await fetch(this.ask("robot.png", { at: wanted }), { cache: "no-store" });
-    const content = await answer.blob();
-    if (!answer.ok) throw new Error(`status ${answer.status}`);
+    const response = await fetch(this.urlOf("robot.png", { at: wanted }), { cache: "no-store" });
+    const content = await response.blob();
+    if (!response.ok) throw new Error(`status ${response.status}`);
     const image = await createImageBitmap(content);
     this.robot.width = image.width;
     this.robot.height = image.height;
@@ -136,7 +136,7 @@ export class SessionPage {
         frame.g.fillRect(frame.atX(pulse) - 1, 4, 2, 12);
       }
     });
-    const thin = view.spikes.every > 1 ? `; each ${view.spikes.every}th is drawn` : "";
+    const thin = view.spikes.every > 1 ? `; every ${view.spikes.every}th is drawn` : "";
     const pulses = ticks.pulse_time_s.flat().filter((each) => each >= this.span[0] && each <= this.span[1]).length;
     this.raster.words.textContent = view.spikes.n || n
       ? `${shown(view.spikes.n)} spikes on ${shown(n)} channels in ${shown(this.span[1] - this.span[0])} s${thin}; ${shown(pulses)} pulses, marked above the frame in the colour of their stimulus`
@@ -156,7 +156,7 @@ export class SessionPage {
     const known = x.map((each, i) => each !== null && y[i] !== null);
     const count = known.filter(Boolean).length;
     if (!count) {
-      this.array.words.textContent = "the log has no positions of channels";
+      this.array.words.textContent = "the log has no channel positions";
       this.array.canvas.hidden = true;
       return;
     }
@@ -167,12 +167,12 @@ export class SessionPage {
     const xs = x.filter((_, i) => known[i]), ys = y.filter((_, i) => known[i]);
     let [across, down] = [spanOf(xs, 20), spanOf(ys, 20)];
     const { canvas } = this.array;
-    const frame0 = { width: canvas.clientWidth - 50, height: canvas.clientHeight - 45 };
-    // As wide as it is, whichever side the canvas has more of.
-    const scale = Math.max((across[1] - across[0]) / frame0.width, (down[1] - down[0]) / frame0.height);
-    const wider = (span, px) => { const middle = (span[0] + span[1]) / 2, half = (px * scale) / 2; return [middle - half, middle + half]; };
-    across = wider(across, frame0.width);
-    down = wider(down, frame0.height);
+    const width = canvas.clientWidth - 50, height = canvas.clientHeight - 45;
+    // The same scale in both directions.
+    const scale = Math.max((across[1] - across[0]) / width, (down[1] - down[0]) / height);
+    const widened = (span, px) => { const middle = (span[0] + span[1]) / 2, half = (px * scale) / 2; return [middle - half, middle + half]; };
+    across = widened(across, width);
+    down = widened(down, height);
     const frame = new Frame(canvas, across, [down[1], down[0]], { xLabel: "x and y (µm)", left: 44 });
     const steps = 12;
     rates.forEach((rate, i) => {
@@ -187,7 +187,7 @@ export class SessionPage {
       found += 1;
       frame.dot(x[i], y[i], colour("red"), { radius: 6, ring: true });
     });
-    const where = pulsed.size ? `last pulse on electrodes ${[...pulsed].join(", ")}, ringed${found < pulsed.size ? `; ${pulsed.size - found} of them no channel reads` : ""}` : "no pulse at the last tick";
+    const where = pulsed.size ? `last pulse on electrodes ${[...pulsed].join(", ")}, ringed${found < pulsed.size ? `; no channel reads ${pulsed.size - found} of them` : ""}` : "no pulse at the last tick";
     this.array.words.textContent = `0 to ${shown(most, 3)} Hz (the brightest), mean ${shown(rates.reduce((a, b) => a + b, 0) / Math.max(1, rates.length), 3)} Hz; ${where}`;
   }
 
@@ -200,7 +200,7 @@ export class SessionPage {
   #drawResponse(view, last) {
     const { ticks } = view;
     const now = this.#percentilesAt(view, this.span[1]);
-    // Bursts would press all others to the ground: they are at the upper edge.
+    // Bursts would flatten all other responses: they are drawn at the upper edge.
     const sorted = ticks.rate_hz.filter((each, i) => each !== null && !ticks.is_burst[i]).sort((a, b) => a - b);
     const high = sorted[Math.floor(0.97 * (sorted.length - 1))] ?? 1;
     const frame = new Frame(this.response.canvas, this.span, [0, Math.max(high, now[9] ?? 0, 1e-6) * 1.25], { left: LEFT, xLabel: CLOCK });
@@ -214,12 +214,12 @@ export class SessionPage {
       if (rate !== null && ticks.time_s[i] !== null) frame.dot(ticks.time_s[i], rate, ticks.is_burst[i] ? colour("red") : this.condition(ticks.delivered[i]), { ring: Boolean(ticks.is_burst[i]) });
     });
     const thresholds = this.about.thresholds.map((i) => shown(now[i], 3)).join(", ");
-    const response = last < 0 ? "no response here" : `last response ${shown(ticks.rate_hz[last], 6)} Hz per channel`;
+    const response = last < 0 ? "no response in this span" : `last response ${shown(ticks.rate_hz[last], 6)} Hz per channel`;
     const of = this.about.readouts.length > 1 ? ` of ${this.about.readouts[0]}, the first of ${this.about.readouts.length} readouts` : "";
-    this.response.words.textContent = `${response}; thresholds${of} (dashed, ${this.about.adaptive ? "adaptive" : "fixed"}): ${thresholds} Hz. A dot has the colour of its stimulus, a ring is a burst; what is above the frame is at its edge.`;
+    this.response.words.textContent = `${response}; thresholds${of} (dashed, ${this.about.adaptive ? "adaptive" : "fixed"}): ${thresholds} Hz. A dot has the colour of its stimulus, a ring is a burst; responses above the frame are drawn at its edge.`;
   }
 
-  // Each episode on its own: its last command does not lead into the next one.
+  // Ticks by episode: lines do not connect episodes.
   #runs(ticks) {
     const runs = [];
     ticks.episode.forEach((episode, i) => {
@@ -265,7 +265,7 @@ export class SessionPage {
       const first = at[0], x = frame.atX(ticks.time_s[first]);
       if (x > frame.left - 1 && x + frame.g.measureText(ticks.agent[first]).width < frame.right - 3) frame.text(ticks.agent[first], x + 3, frame.top + 9, colour("faint"));
     }
-    this.total.words.textContent = last < 0 ? "no episode here" : `${ticks.agent[last]}, episode ${shown(ticks.episode[last])}: ${ticks.total[last] === null ? "being added up" : shown(ticks.total[last], 6)}; rewards are added up anew in each episode`;
+    this.total.words.textContent = last < 0 ? "no episode in this span" : `${ticks.agent[last]}, episode ${shown(ticks.episode[last])}: ${ticks.total[last] === null ? "being added up" : shown(ticks.total[last], 6)}; the sum restarts with each episode`;
   }
 
   #drawLate(view, last) {
@@ -277,11 +277,11 @@ export class SessionPage {
       if (decided[i] !== null) frame.dot(time, decided[i], colour("blue"), { radius: 1.8 });
       if (late[i]) frame.dot(time, late[i], colour("red"), { radius: 3, ring: true });
     });
-    this.late.words.textContent = last < 0 ? "no tick here" : `last pulse ${late[last] ? `${shown(late[last], 3)} ms late` : "in time"} (late: red rings), decided in ${shown(decided[last], 3)} ms (blue dots); ${view.late ? `late ticks in all: ${shown(view.late)}, the latest by ${shown(view.latest_s === null ? null : view.latest_s * 1000, 3)} ms` : "no tick was late so far"}`;
+    this.late.words.textContent = last < 0 ? "no tick in this span" : `last pulse ${late[last] ? `${shown(late[last], 3)} ms late` : "in time"} (late: red rings), decided in ${shown(decided[last], 3)} ms (blue dots); ${view.late ? `late ticks in total: ${shown(view.late)}, the latest by ${shown(view.latest_s === null ? null : view.latest_s * 1000, 3)} ms` : "no tick was late so far"}`;
   }
 
   #drawAgents(view) {
-    // As the session names them; those that did not act yet too.
+    // In the session's order, including agents that have not acted yet.
     const order = new Map(this.about.agents.map((name, i) => [name, i]));
     const acted = new Set(view.agents.map((each) => each.name));
     const waiting = this.about.agents.filter((name) => !acted.has(name)).map((name) => ({ name, n: 0, returns: [], mean: null, half: null, predicted: null }));
@@ -306,9 +306,9 @@ export class SessionPage {
       if (each.mean !== null) frame.dot(each.mean, i, colour("orange"), { radius: 5 });
       for (const total of each.returns) frame.dot(total, i, colour("blue"), { radius: 3, ring: true });
     });
-    const goesOn = agents.some((each) => each.half !== null && (each.mean - each.half < frame.x[0] || each.mean + each.half > frame.x[1]));
+    const exceeds = agents.some((each) => each.half !== null && (each.mean - each.half < frame.x[0] || each.mean + each.half > frame.x[1]));
     const predicted = agents.some((each) => each.predicted) ? "Grey: predicted, the bar its 95 % interval, the line its mean." : "The log has no prediction of these returns.";
-    this.returns.words.textContent = `${predicted} Blue rings: whole episodes. Orange: their mean and its 95 % interval, which narrows as episodes are added${goesOn ? "; one that reaches the frame goes on beyond it" : ""}.`;
+    this.returns.words.textContent = `${predicted} Blue rings: whole episodes. Orange: their mean and its 95 % interval, which narrows as episodes are added${exceeds ? "; one that reaches the frame extends beyond it" : ""}.`;
     const within = (low, high) => ` (${shown(low, 3)} to\u00a0${shown(high, 3)})`;
     const measured = ({ mean, half }) => (mean === null ? "none yet" : `${shown(mean, 4)}${half === null ? "" : within(mean - half, mean + half)}`);
     table(this.agentTable, ["agent", "episodes", "measured (95 % interval)", "predicted (95 % interval)"], agents.map((each) => [
@@ -330,25 +330,25 @@ export class SessionPage {
     this.drift.words.textContent = first.length ? `${shownOnes.map((i) => `P${10 * i}: ${shown(first[i], 3)} at the start, ${shown(latest[i], 3)} now`).join("; ")} (Hz)${this.about.adaptive ? "" : "; thresholds are fixed"}` : "the log has no percentiles";
   }
 
-  #tellTotals(view) {
+  #listTotals(view) {
     const { limits, account } = this.about;
-    const budget = account.of ? ` of a budget of ${shown(account.of)} (${shown(account.pulses)} were spent before)` : limits.stimuli_per_session ? `; no budget was set, the culture's limit is ${shown(limits.stimuli_per_session)}` : "; the log has no budget";
+    const budget = account.of ? ` of a budget of ${shown(account.of)} (${shown(account.pulses)} had been spent before)` : limits.stimuli_per_session ? `; no budget was set, the culture's limit is ${shown(limits.stimuli_per_session)}` : "; the log has no budget";
     const each = account.of_per_electrode ? ` of ${shown(account.of_per_electrode)}` : "";
-    const summing = view.summed < 1 ? [["added up", `${(100 * view.summed).toFixed(0)} % of the log; what follows is of that part`]] : [];
+    const summing = view.summed < 1 ? [["added up", `${(100 * view.summed).toFixed(0)} % of the log, to which the rest applies`]] : [];
     list(this.totals, [
       ...summing,
       ["ticks", shown(view.n_ticks)],
       ["episodes", `${shown(view.episodes_done)} of ${this.about.planned ? shown(this.about.planned) : "an unknown number"}`],
       ["time left", view.time_left],
       ["pulses", `${shown(view.pulses)}${budget}`],
-      ["fullest electrode", view.fullest ? `${view.fullest[0]}, with ${shown(view.fullest[1])}${each} pulses` : "none was pulsed"],
+      ["most pulsed electrode", view.fullest ? `${view.fullest[0]}, with ${shown(view.fullest[1])}${each} pulses` : "none was pulsed"],
       ["bursts", `${shown(view.bursts)} (${shown((100 * view.bursts) / Math.max(1, view.n_ticks), 2)} % of the responses)`],
       ["late ticks", shown(view.late)],
       ["unanswered pulses", view.state === "running" ? "known when it has ended" : shown(view.unanswered)],
       ["damage", view.damage || "none"],
       ...(view.strange ? [["not understood", `${shown(view.strange)} records`]] : []),
     ]);
-    this.faultWords.textContent = view.n_faults ? `${shown(view.n_faults)} in all, the last ones first` : "none were written down";
-    table(this.faults, view.n_faults ? ["time", "what"] : [], [...view.faults].reverse().map(([time, what]) => [time === null ? "not known" : `${shown(time, 6)} s`, what]));
+    this.faultWords.textContent = view.n_faults ? `${shown(view.n_faults)} in total, the latest first` : "none were logged";
+    table(this.faults, view.n_faults ? ["time", "fault"] : [], [...view.faults].reverse().map(([time, what]) => [time === null ? "not known" : `${shown(time, 6)} s`, what]));
   }
 }

@@ -1,0 +1,108 @@
+"""Find items to watch in a folder: sessions, trainings, studies, tunings and recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from animat.closed_loop.session_data import LOG_FILE
+from animat.cultures.under_way import UNDER_WAY
+from animat.errors import InvalidArgument
+from animat.marks import MARKS
+
+Kind = Literal["session", "training", "study", "cultures", "tuning", "recording"]
+
+_MARKED: tuple[Kind, ...] = ("session", "training", "tuning", "study", "cultures")
+_MARKS = tuple((kind, MARKS[kind][0]) for kind in _MARKED)
+"""The file that identifies each kind."""
+_DEPTH, _MOST_FOLDERS, _MOST_ITEMS = 4, 4000, 2000
+_SKIPPED = ("jobs", "figures", "tables", "checkpoints")
+
+
+@dataclass(frozen=True)
+class Item:
+    """An item to watch: its place in the watched folder ("": the folder itself), and when it last changed."""
+
+    kind: Kind
+    place: str
+    changed_s: float
+
+
+def find(folder: Path) -> list[Item]:
+    """The items in a folder and its subfolders, newest first, without links that lead out of it.
+
+    A folder that does not exist yet holds none.
+    """
+    items = [item for subfolder in _folders(folder) for item in _in_folder(folder, subfolder)]
+    items.sort(key=lambda item: (-item.changed_s, item.place))
+    # An item that contains the others is kept, however many are newer.
+    containers = [item for item in items[_MOST_ITEMS:] if item.kind == "cultures" or not item.place]
+    return items[:_MOST_ITEMS] + containers
+
+
+def place_within(folder: Path, place: str) -> Path:
+    """A folder inside the watched one, by its place there; raises InvalidArgument for one outside."""
+    try:
+        inside = (folder / place).resolve()
+    except (OSError, ValueError) as error:
+        raise InvalidArgument("in: expected a folder inside the watched one, got an invalid name") from error
+    if not inside.is_relative_to(folder.resolve()):
+        raise InvalidArgument("in: expected a folder inside the watched one, got one outside")
+    return inside
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    """The folder and its subfolders, level by level."""
+    level, seen = [folder], 0
+    for _ in range(_DEPTH):
+        below: list[Path] = []
+        for parent in level:
+            seen += 1
+            if seen > _MOST_FOLDERS:
+                return
+            yield parent
+            try:
+                with os.scandir(parent) as entries:
+                    below += [
+                        parent / entry.name
+                        for entry in entries
+                        if entry.is_dir(follow_symlinks=False) and entry.name[0] != "." and entry.name not in _SKIPPED
+                    ]
+            except OSError:
+                continue
+        level = sorted(below)
+
+
+def _in_folder(root: Path, folder: Path) -> Iterator[Item]:
+    place = "" if folder == root else folder.relative_to(root).as_posix()
+    for kind, name in _MARKS:
+        file = folder / name
+        try:
+            if file.is_file() and file.resolve().is_relative_to(root.resolve()):
+                yield Item(kind, place, max(file.stat().st_mtime, folder.stat().st_mtime))
+        except OSError:
+            continue
+    times_s = [time_s for time_s in map(changed_s, (*recordings_in(folder), folder / UNDER_WAY)) if time_s is not None]
+    if times_s:
+        yield Item("recording", place, max(times_s))
+
+
+def changed_s(file: Path) -> float | None:
+    """When a file last changed; None if there is none, or it is a link."""
+    try:
+        return None if file.is_symlink() else file.stat().st_mtime
+    except OSError:
+        return None
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """The NWB recordings in a folder by name, except that of a session."""
+    try:
+        if (folder / LOG_FILE).exists():
+            return []
+        return [file for file in sorted(folder.glob("[!.]*.nwb")) if file.is_file() and not file.is_symlink()][:500]
+    except OSError:
+        return []
