@@ -156,11 +156,11 @@ class _Supervisor:
                 ending = self._watch(thread)
             except BaseException as error:
                 # From the caller's progress, or our own: an unsupervised loop must not continue.
-                by, message = "person", "stopped by a person"
+                ending = Ending("person", "stopped by a person")
                 if not isinstance(error, KeyboardInterrupt):
-                    by, message = "crash", f"the loop's supervisor raised {describe_error(error)}"
+                    ending = Ending("crash", f"the loop's supervisor raised {describe_error(error)}")
                 with suppress(Exception):
-                    self._end(thread, Ending(by, message))
+                    self._end(thread, ending)
                 raise
             if ending is not None:
                 return self._end(thread, ending)
