@@ -22,18 +22,18 @@ from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
-from animat.studies.arms import arms_shown, what_parts
+from animat.studies.arms import arms_table, arm_differences
 from animat.studies.captions import CULTURE
-from animat.studies.cultures import RanCultures
+from animat.studies.cultures import CulturesRun
 from animat.studies.cultures_page import _in_short
-from animat.studies.differences import came_out_otherwise, decisions, explain
+from animat.studies.differences import differing_comparisons, decisions, explain
 from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper, _facts_of_culture
 from animat.studies.results import write_typed
-from animat.studies.shown import comparisons_shown, controllability_shown
+from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.source import Source
 from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
@@ -83,16 +83,16 @@ def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
 
 def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     study = paper_study()
-    told = dict(arms_shown(study).rows)
+    told = dict(arms_table(study).rows)
     assert list(told) == [arm.name for arm in study.arms]
     assert "depending on how many of nine thresholds it passes. Trained with shadowing" in told["9 thresholds"]
     assert "above the median gives the motor command +1" in told["control"] and "drawn at random" in told["control"]
     assert told["before training"].startswith("New networks") and "hadowing" not in told["before training"]
     assert "without shadowing: on the simulator of the first recording" in told["without shadowing"]
     assert told["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
-    (fixed,) = arms_shown(Study(arms=(Arm("fixed", percentiles="first"),))).rows
+    (fixed,) = arms_table(Study(arms=(Arm("fixed", percentiles="first"),))).rows
     assert fixed[1].endswith("Percentiles are those of the first recording throughout.")
-    parts = {each.name: list(what_parts(each, study.arm("1 threshold"))) for each in study.arms}
+    parts = {each.name: list(arm_differences(each, study.arm("1 threshold"))) for each in study.arms}
     assert parts["1 threshold"] == parts["before training"] == []
     assert parts["without shadowing"] == [
         "“1 threshold” is trained with shadowing: during training, each newer recording replaces the simulator of the "
@@ -105,7 +105,7 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
 def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
     names = [("control and 1 threshold", robot) for robot in ("cartpole", "navigation")]
     rows = [OverCultures(*name, 4, 1.0, 2.0, 1.0, None, None, larger_in=4, holds_in=4, tested=4) for name in names]
-    section = _in_short(paper_study(), RanCultures(Path(), {}, {}, {}, tuple(rows), None))
+    section = _in_short(paper_study(), CulturesRun(Path(), {}, {}, {}, tuple(rows), None))
     (_, first), (_, second) = section.points
     assert first.endswith("In “control” the delivered stimulus is drawn at random, whatever the policy chooses.")
     assert first.startswith(second)
@@ -117,7 +117,7 @@ def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
         replace(ROW, outcome=outcome, p_holm=p_holm)
         for outcome, p_holm in ((SECOND, 0.005), (SECOND, 0.05), (FIRST, 0.05), (NONE, 1.0))
     ]
-    shown = comparisons_shown(rows)
+    shown = comparisons_table(rows)
     outcomes = [row[shown.head.index("outcome")] for row in shown.rows]
     assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
 
@@ -160,11 +160,11 @@ def test_a_control_is_given_no_optimum() -> None:
 
 
 def test_what_binning_takes_is_said_where_it_takes_something() -> None:
-    ((_, words),) = came_out_otherwise([ROW], {0.0: 0.5, 140.0: 0.02})
+    ((_, words),) = differing_comparisons([ROW], {0.0: 0.5, 140.0: 0.02})
     assert "binning" not in words and "none found" in words
-    ((_, words),) = came_out_otherwise([ROW], {140.0: 0.21})
+    ((_, words),) = differing_comparisons([ROW], {140.0: 0.21})
     assert "binning moves P(x ≥ P50) by up to 0.21" in words
-    assert came_out_otherwise([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)]) == ()
+    assert differing_comparisons([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)]) == ()
 
 
 # --- decisions are the study's ---------------------------------------------------------------------------------------
@@ -319,7 +319,7 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
         for at in (0.0, 10.0)
     ]
     write_typed(optima_file(tmp_path, "cartpole", "over-time"), optima)
-    table = controllability_shown(study, tmp_path, kept)
+    table = controllability_table(study, tmp_path, kept)
     assert table.head[-3:] == ("difference, data", "difference, simulator", "optimum, cartpole")
     assert table.marked == (1,)
     assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"

@@ -46,13 +46,13 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import describe_study, held, sums_of
+from animat.studies.folder import describe_study, claim_folder, hash_files
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file, paths_file
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
-from animat.studies.run import Ran, run_study
+from animat.studies.run import StudyRun, run_study
 from animat.studies.simulating import Fit, load_timeline
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
@@ -196,7 +196,7 @@ def test_a_folder_of_before_results_were_typed_is_refused_with_what_to_do(tmp_pa
 def test_a_folder_in_which_other_programs_hid_a_file_is_empty(tmp_path: Path) -> None:
     for name in (".DS_Store", ".gitignore"):
         (tmp_path / name).write_text("theirs")
-    with held(tmp_path, "study", {"fingerprint": "00"}, "study.json", {}):
+    with claim_folder(tmp_path, "study", {"fingerprint": "00"}, "study.json", {}):
         assert json.loads((tmp_path / "study.json").read_text()) == {"fingerprint": "00"}
     assert (tmp_path / ".gitignore").read_text() == "theirs"
 
@@ -394,13 +394,13 @@ def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
         (tmp_path / day / "rec[1]_spikes.csv").write_text(day)
         (tmp_path / day / "rec[1]_stimuli.csv").write_text(day)
     both = [tmp_path / day / "rec[1]_spikes.csv" for day in ("day1", "day2")]
-    sums = sums_of(both, tmp_path)
+    sums = hash_files(both, tmp_path)
     assert list(sums) == [f"{day}/rec[1]_{of}.csv" for day in ("day1", "day2") for of in ("spikes", "stimuli")]
     assert len(set(sums.values())) == 2
     with pytest.raises(InvalidArgument, match="each file once"):
-        sums_of([both[0], both[0]], tmp_path)
+        hash_files([both[0], both[0]], tmp_path)
     with pytest.raises(InvalidFile, match="no such file"):
-        sums_of([tmp_path / "none.nwb"], tmp_path)
+        hash_files([tmp_path / "none.nwb"], tmp_path)
 
 
 @pytest.mark.oracle
@@ -1035,7 +1035,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
         policies=1,
         paper=False,
     )
-    ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
+    ran: StudyRun = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
     assert len(ran.done_now) == ran.jobs
     page = ran.report.read_text()
     assert "The study compares no arms" in page

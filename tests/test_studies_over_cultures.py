@@ -25,11 +25,11 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, U
 from animat.evaluation.statistics import compare
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
-from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
+from animat.studies.cultures import CulturesRun, bootstrap_interval, over_cultures, run_over_cultures, studies_of
 from animat.studies.cultures_page import write_cultures_page
 from animat.studies.places import results_file
 from animat.studies.results import write_typed
-from animat.studies.run import Ran, run_study
+from animat.studies.run import StudyRun, run_study
 from animat.studies.source import Source, read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import NONE, SECOND, TOO_FEW, outcome_of
@@ -133,7 +133,7 @@ def test_too_few_are_those_who_could_not_be_found_better_at_best(n: int) -> None
 
 
 def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def ran(study: Study, folder: Path, **_: Any) -> Ran:
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
         if study.culture.seed == 2:
             raise UnusableData("recording 1: no responses")
         return told_and_tables(study, folder)
@@ -141,7 +141,7 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     monkeypatch.setattr(cultures, "run_study", ran)
     study = replace(read_study(TINY), culture=Source(seeds="1-3"))
     found = run_over_cultures(study, tmp_path)
-    assert list(found.ran) == ["culture-1", "culture-3"]
+    assert list(found.finished) == ["culture-1", "culture-3"]
     assert found.failed == {"culture-2": "recording 1: no responses"}
     assert json.loads((tmp_path / cultures.MANIFEST).read_text()) == {
         "cultures": ["culture-1", "culture-2", "culture-3"],
@@ -162,18 +162,18 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     assert (tmp_path / cultures.MANIFEST).read_bytes() == before
 
 
-def told_and_tables(study: Study, folder: Path) -> Ran:
+def told_and_tables(study: Study, folder: Path) -> StudyRun:
     results_file(folder).parent.mkdir(parents=True, exist_ok=True)
     rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
     write_typed(results_file(folder), Results((), rows, (), (), (), ()))
-    return Ran(folder, folder / "report.html", 1, {})
+    return StudyRun(folder, folder / "report.html", 1, {})
 
 
 def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The barrier lets nobody through before two are there; told in order, the whole never goes back."""
     both, at_once, most = threading.Barrier(2, timeout=60), 0, 0
 
-    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> Ran:
+    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> StudyRun:
         nonlocal at_once, most
         at_once += 1
         both.wait()
@@ -189,7 +189,7 @@ def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeyp
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     whole = SimpleNamespace(update=lambda done, total, note="": told.append((done / total, note)))
     found = run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-4")), tmp_path, progress=whole)
-    assert list(found.ran) == ["culture-1", "culture-2", "culture-3", "culture-4"]
+    assert list(found.finished) == ["culture-1", "culture-2", "culture-3", "culture-4"]
     assert most == 2
     assert [share for share, _ in told] == sorted(share for share, _ in told)
     assert told[-1] == (1.0, "4 of 4 cultures")
@@ -200,7 +200,7 @@ def test_what_nobody_foresaw_ends_all_cultures(tmp_path: Path, monkeypatch: pyte
     """As Ctrl-C does: the others are stopped at their next report, and no more are begun."""
     begun, running = [], threading.Event()
 
-    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> Ran:
+    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> StudyRun:
         begun.append(study.culture.seed)
         if study.culture.seed == 1:
             running.wait(60)
@@ -230,12 +230,12 @@ SCORED: dict[str, Any] = {
 }
 
 
-def run_scored(folder: Path, monkeypatch: pytest.MonkeyPatch) -> RanCultures:
-    def ran(study: Study, folder: Path, **_: Any) -> Ran:
+def run_scored(folder: Path, monkeypatch: pytest.MonkeyPatch) -> CulturesRun:
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
         results_file(folder).parent.mkdir(parents=True, exist_ok=True)
         scores = tuple(Score(**SCORED | {"mean_return": study.culture.seed + i / 3}) for i in range(2))
         write_typed(results_file(folder), Results(scores, (), (), (), (), ()))
-        return Ran(folder, folder / "report.html", 1, {})
+        return StudyRun(folder, folder / "report.html", 1, {})
 
     monkeypatch.setattr(cultures, "run_study", ran)
     return run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-3")), folder)
@@ -294,6 +294,6 @@ def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
 
 
 def test_results_that_cannot_be_read_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cultures, "run_study", lambda study, folder, **_: Ran(folder, folder, 1, {}))
+    monkeypatch.setattr(cultures, "run_study", lambda study, folder, **_: StudyRun(folder, folder, 1, {}))
     with pytest.raises(InvalidFile, match="results"):
         run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1")), tmp_path)

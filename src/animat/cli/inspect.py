@@ -44,7 +44,7 @@ class Inspect(Responding):
         """Inspect each file."""
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings
-        from animat.report.inspection import expect_unlike_stems
+        from animat.report.inspection import expect_unique_stems
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
@@ -64,7 +64,7 @@ class Inspect(Responding):
         files = list_recordings(self.recordings)
         if self.out is not None:
             # The figures of the series have a name of their own.
-            expect_unlike_stems([file.name for file in files], "series")
+            expect_unique_stems([file.name for file in files], "series")
         with Bar("inspecting") as progress:
             return self._inspect(files, by, window_ms, progress)
 

@@ -96,18 +96,18 @@ def _run_many(study: Study, base: Path, command: Working) -> dict[str, Any]:
     if cells:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(lined_up(head, cells)))
-    jobs = sum(len(each.done_now) for each in found.ran.values())
-    print(f"{len(found.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
+    jobs = sum(len(each.done_now) for each in found.finished.values())
+    print(f"{len(found.finished)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
     if found.parquet is None:
         print(f"scores.csv only, no Parquet table: {MISSING}")
     for name, why in found.failed.items():
         print(f"failed: {name}: {why}", file=sys.stderr)
     if found.failed:
-        total = len(found.ran) + len(found.failed)
+        total = len(found.finished) + len(found.failed)
         raise AnimatError(f"{len(found.failed)} of {total} cultures failed; the same command tries them again")
     return {
         "folder": str(found.folder),
         "report": str(report),
-        "cultures": list(found.ran),
+        "cultures": list(found.finished),
         "over_cultures": [asdict(row) for row in found.summary],
     }

@@ -114,7 +114,7 @@ def figure_stem(name: str) -> str:
     return Path(name).name.removesuffix(".gz").rsplit(".", 1)[0]
 
 
-def expect_unlike_stems(names: Sequence[str], *others: str) -> None:
+def expect_unique_stems(names: Sequence[str], *others: str) -> None:
     """Refuse recordings whose figures would have the same names, or one of these others (InvalidArgument)."""
     stems = [*others, *map(figure_stem, names)]
     for stem in stems:

@@ -9,7 +9,7 @@ from animat.recordings.findings import Finding
 
 TRAINED = "trained: "
 """In front of an arm's name among the controls."""
-ADMITTED = 0.5
+CONTEXT_GAP_LEVEL = 0.5
 """The context gap of a task that needs more than a reflex, on every culture."""
 
 
@@ -116,7 +116,7 @@ class ControlReturns:
 
 
 @dataclass(frozen=True)
-class BesideHeuristic:
+class HeuristicComparison:
     """Trained policies beside the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
 
     robot: str
@@ -130,7 +130,7 @@ class BesideHeuristic:
 
 
 @dataclass(frozen=True)
-class BesideReflex:
+class ReflexComparison:
     """Trained policies beside the best coupling, as in `animat.evaluation.coupling`; None for what is not known.
 
     Attributes:
@@ -183,11 +183,11 @@ class Results:
     scores: tuple[Score, ...]
     comparisons: tuple[ComparedReturns, ...]
     controls: tuple[ControlReturns, ...]
-    heuristic: tuple[BesideHeuristic, ...]
+    heuristic: tuple[HeuristicComparison, ...]
     optima: tuple[StudyOptimum, ...]
     findings: tuple[Finding, ...]
     goals: tuple[ObjectiveMet, ...] = ()
-    reflexes: tuple[BesideReflex, ...] = ()
+    reflexes: tuple[ReflexComparison, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ class ContextRow:
     @property
     def needs_context(self) -> bool:
         """Whether a reflex leaves half of the task undone."""
-        return self.gap is not None and self.gap >= ADMITTED
+        return self.gap is not None and self.gap >= CONTEXT_GAP_LEVEL
 
     @property
     def has_context(self) -> bool:

@@ -25,19 +25,19 @@ FIXED = "percentiles are those of the first recording throughout."
 SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy chooses."
 
 
-def many_arms(study: Study) -> str:
+def summarise_arms(study: Study) -> str:
     """What an arm is, and how many there are: a sentence and the beginning of one."""
     arms = f"There {'is 1 arm' if len(study.arms) == 1 else f'are {len(study.arms)} arms'}"
     policies = "1 policy" if study.policies == 1 else f"{study.policies} policies"
     return f"An arm is one way to train policies. {arms} with {policies} each"
 
 
-def mapped(arm: Arm) -> str:
+def describe_mapping(arm: Arm) -> str:
     """How a response becomes a command in an arm: a sentence without its capital."""
     return _MAPPED.get(arm.mapping, f"responses become motor commands by the mapping {arm.mapping}.")
 
 
-def what_parts(first: Arm, second: Arm) -> Iterator[str]:
+def arm_differences(first: Arm, second: Arm) -> Iterator[str]:
     """What two arms differ in, where a name does not say it: a sentence each."""
     for arm, other in ((first, second), (second, first)):
         if arm.shadowing is True is not other.shadowing:
@@ -49,10 +49,10 @@ def what_parts(first: Arm, second: Arm) -> Iterator[str]:
         if arm.delivery == "shuffled" != other.delivery:
             yield f"In “{arm.name}” {SHUFFLED}"
         if arm.mapping != other.mapping:
-            yield f"In “{arm.name}” {mapped(arm)}"
+            yield f"In “{arm.name}” {describe_mapping(arm)}"
 
 
-def arms_shown(study: Study) -> Table:
+def arms_table(study: Study) -> Table:
     """The arms and what each of them is."""
     return Table(
         "The arms",
@@ -66,7 +66,7 @@ def arms_shown(study: Study) -> Table:
 def _in_words(arm: Arm) -> Iterator[str]:
     if not arm.trained:
         yield "New networks, as they are before training."
-    said = mapped(arm)
+    said = describe_mapping(arm)
     yield said[:1].upper() + said[1:]
     if arm.through_neurons and arm.trained:
         yield _SHADOWED[arm.shadowing]

@@ -18,7 +18,7 @@ from animat.progress import Progress, Silent
 from animat.report.results import ContextRow, LostRow
 from animat.robots.registry import robot_named
 from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
-from animat.studies.folder import MANIFEST, held
+from animat.studies.folder import MANIFEST, claim_folder
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
 from animat.training.settings import LEARNER
@@ -27,7 +27,7 @@ TABLE, WHOSE_WORK = "context.csv", "whose-work.csv"
 
 
 @dataclass(frozen=True)
-class RanContext:
+class ContextRun:
     """What a run of the study came to: rows of each culture and robot, and what was lost by each intervention.
 
     Attributes:
@@ -47,7 +47,7 @@ def run_context_study(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> RanContext:
+) -> ContextRun:
     """Run the study into a folder, or go on with one: what is done is not done again.
 
     Args:
@@ -65,7 +65,7 @@ def run_context_study(
     folder = Path(folder).absolute()
     manifest = _describe(study)
     cultures = [f"culture-{culture}" for culture in study.cultures]
-    with held(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
+    with claim_folder(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
         left = Jobs(plan_context_study(study), folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s = {}
         if left.waiting:
@@ -76,7 +76,7 @@ def run_context_study(
         lost = tuple(row for pair in pairs for row in _lost(folder, *pair))
         write_records(folder / TABLE, ContextRow, rows)
         write_records(folder / WHOSE_WORK, LostRow, lost)
-    return RanContext(folder, rows, lost, took_s)
+    return ContextRun(folder, rows, lost, took_s)
 
 
 def _describe(study: ContextStudy) -> dict[str, Any]:

@@ -11,14 +11,14 @@ from animat.report.context import draw_context, draw_whose_work
 from animat.report.html import Columns, Picture, Section, Table, cell, columns_of, table_of, write_page
 from animat.report.results import ContextRow, LostRow
 from animat.report.style import FORMATS, save_figure
-from animat.studies.context import TABLE, WHOSE_WORK, RanContext
+from animat.studies.context import TABLE, WHOSE_WORK, ContextRun
 from animat.studies.context_tasks import ContextStudy
 from animat.studies.places import REPORT
 
 _GAPS, _LOST = "context", "whose-work"
 
 
-def write_context_page(study: ContextStudy, found: RanContext) -> Path:
+def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
     """Write the page and its figures beside it."""
     by_robot = {robot: [row for row in found.rows if row.robot == robot] for robot in study.robots}
     lost = _shares_lost(found.rows, found.lost)
@@ -27,8 +27,8 @@ def write_context_page(study: ContextStudy, found: RanContext) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"{name}.{ending}")
     sections = [
-        Section("Results in short", (on_every_culture(by_robot),),
-                points=tuple((robot, in_short(rows)) for robot, rows in by_robot.items()),
+        Section("Results in short", (summarise_cultures(by_robot),),
+                points=tuple((robot, summarise_robot(rows)) for robot, rows in by_robot.items()),
                 pictures=(_context_picture(study, found.folder),)),
         _whose_work(study, found, lost),
         Section("Every culture", tables=(_on_the_simulator(found.rows), _on_the_culture(found.rows))),
@@ -44,7 +44,7 @@ def write_context_page(study: ContextStudy, found: RanContext) -> Path:
     )
 
 
-def _whose_work(study: ContextStudy, found: RanContext, lost: dict[str, dict[str, list[float]]]) -> Section:
+def _whose_work(study: ContextStudy, found: ContextRun, lost: dict[str, dict[str, list[float]]]) -> Section:
     """What the policies lose, on cultures on which they have something to lose."""
     left_out = [f"{row.robot} on culture {row.culture}" for row in found.rows if not _has_something(row)]
     told = (f"Left out, as the policies are hardly above random stimuli: {', '.join(left_out)}.",) if left_out else ()
@@ -61,7 +61,7 @@ def _has_something(row: ContextRow) -> bool:
     return row.policies - row.random > 0.1 * (best - row.random) > 0
 
 
-def on_every_culture(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
+def summarise_cultures(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
     """In two sentences, of all robots: which tasks ask for more than a reflex, and where the policies do more."""
     needs = [robot for robot, rows in by_robot.items() if rows and all(row.needs_context for row in rows)]
     has = [robot for robot, rows in by_robot.items() if rows and all(row.has_context for row in rows)]
@@ -71,7 +71,7 @@ def on_every_culture(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
     )
 
 
-def in_short(rows: Sequence[ContextRow]) -> str:
+def summarise_robot(rows: Sequence[ContextRow]) -> str:
     """In two sentences, of one robot on all cultures: what the task asks for, and what the policies do."""
     n, needs = sum(row.gap is not None for row in rows), sum(row.needs_context for row in rows)
     if not n:

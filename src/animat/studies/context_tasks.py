@@ -111,7 +111,7 @@ class RecordCulture(ContextTask):
         out = self.recordings(folder, self.n_commands)
         files = record_series(
             lambda: VirtualCulture(self.culture),
-            presented_for(self.n_commands),
+            protocol_for(self.n_commands),
             out,
             sessions=2,
             progress=progress,
@@ -215,7 +215,7 @@ class Measure(RobotTask):
         shutil.rmtree(session, ignore_errors=True)
         culture = VirtualCulture(self.culture)
         culture.restore_state(self.recordings(folder, self.n_commands) / STATE_FILE)
-        protocol = presented_for(self.n_commands)
+        protocol = protocol_for(self.n_commands)
         with culture:
             gap = run_policies(
                 policies,
@@ -238,7 +238,7 @@ class Measure(RobotTask):
         return [write_json(self.beside(folder, MEASURED), kept)]
 
 
-def presented_for(n_commands: int) -> Protocol:
+def protocol_for(n_commands: int) -> Protocol:
     """How a culture is stimulated in recordings for robots with so many commands, as by `animat record`."""
     from animat.stimulation import protocol
 

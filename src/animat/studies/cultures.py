@@ -25,7 +25,7 @@ from animat.progress import Progress, Silent
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.studies.places import results_file
 from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
-from animat.studies.run import Ran, run_study
+from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND, TOO_FEW
@@ -40,7 +40,7 @@ MANIFEST = "cultures.json"
 
 
 @dataclass(frozen=True)
-class RanCultures:
+class CulturesRun:
     """What a run over cultures did.
 
     Attributes:
@@ -53,7 +53,7 @@ class RanCultures:
     """
 
     folder: Path
-    ran: dict[str, Ran]
+    ran: dict[str, StudyRun]
     failed: dict[str, str]
     comparisons: dict[str, tuple[ComparedReturns, ...]]
     summary: tuple[OverCultures, ...]
@@ -87,7 +87,7 @@ def run_over_cultures(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> RanCultures:
+) -> CulturesRun:
     """Run a study of many cultures, or go on with one: each culture as `run_study` does, one for each core at a time.
 
     A culture is recorded on one core, whatever there is. Beside it the jobs of other cultures are done.
@@ -128,7 +128,7 @@ def _name_cultures(folder: Path, names: Iterable[str], failed: Mapping[str, str]
     write_whole(folder / MANIFEST, json.dumps({"cultures": list(names), "failed": failed}, indent=1) + "\n")
 
 
-def _over_those_that_ran(folder: Path, ran: dict[str, Ran], failed: dict[str, str]) -> RanCultures:
+def _over_those_that_ran(folder: Path, ran: dict[str, StudyRun], failed: dict[str, str]) -> CulturesRun:
     """Write the tables over the cultures that are finished."""
     if not ran:
         raise AnimatError("; ".join(f"{which}: {why}" for which, why in failed.items()))
@@ -142,7 +142,7 @@ def _over_those_that_ran(folder: Path, ran: dict[str, Ran], failed: dict[str, st
     write_named_records(folder / SCORES, scores, Score, "culture")
     parquet = (folder / SCORES).with_suffix(".parquet")
     is_written = write_parquet(parquet, scores, Score, "culture")
-    return RanCultures(folder, ran, failed, comparisons, summary, parquet if is_written else None)
+    return CulturesRun(folder, ran, failed, comparisons, summary, parquet if is_written else None)
 
 
 @contextmanager
@@ -160,10 +160,10 @@ def _room(workers: int | None, executor: Executor | None) -> Iterator[tuple[Exec
 
 
 def _side_by_side(
-    runs: Mapping[str, Callable[..., Ran]], at_once: int, room: Executor | None, progress: Progress
-) -> tuple[dict[str, Ran], dict[str, str]]:
+    runs: Mapping[str, Callable[..., StudyRun]], at_once: int, room: Executor | None, progress: Progress
+) -> tuple[dict[str, StudyRun], dict[str, str]]:
     """Run studies, so many at a time: those that are finished, and why the others are not."""
-    ran: dict[str, Ran] = {}
+    ran: dict[str, StudyRun] = {}
     failed: dict[str, str] = {}
     together = _Together(progress, len(runs))
     with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:

@@ -8,14 +8,14 @@ from animat.report.html import Picture, Section, cell, columns_of, table_of, wri
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import OverCultures
 from animat.report.style import FORMATS, save_figure
-from animat.studies.arms import arms_shown, many_arms, what_parts
-from animat.studies.cultures import COMPARISONS, SUMMARY, RanCultures
+from animat.studies.arms import arms_table, summarise_arms, arm_differences
+from animat.studies.cultures import COMPARISONS, SUMMARY, CulturesRun
 from animat.studies.places import REPORT
 from animat.studies.specification import Compared, Study
 from animat.studies.tabulating import LEVEL
 
 
-def write_cultures_page(study: Study, found: RanCultures) -> Path:
+def write_cultures_page(study: Study, found: CulturesRun) -> Path:
     """Write the page and its figure beside it."""
     sections = []
     if found.summary:
@@ -26,20 +26,20 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"over-cultures.{ending}")
         sections.append(_in_short(study, found))
-    pages = tuple(f"{name}/{REPORT}" for name in found.ran)
-    points = [(name, f"finished: {page}") for name, page in zip(found.ran, pages, strict=True)]
+    pages = tuple(f"{name}/{REPORT}" for name in found.finished)
+    points = [(name, f"finished: {page}") for name, page in zip(found.finished, pages, strict=True)]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
     sections.append(Section("Each culture", points=tuple(points), links=pages))
-    cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
-    lead = f"{cultures}. {many_arms(study)} on every culture."
+    cultures = f"{len(found.finished)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
+    lead = f"{cultures}. {summarise_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
 
 
-def _in_short(study: Study, found: RanCultures) -> Section:
+def _in_short(study: Study, found: CulturesRun) -> Section:
     points, explained = [], set[str]()
     for row in found.summary:
         compared = next(each for each in study.comparisons if each.name == row.comparison)
-        parts = list(what_parts(study.arm(compared.first), study.arm(compared.second)))
+        parts = list(arm_differences(study.arm(compared.first), study.arm(compared.second)))
         # Each where it comes first.
         words = " ".join([_told(compared, row), *(each for each in parts if each not in explained)])
         points.append((f"{row.robot}, {row.comparison}", words))
@@ -66,7 +66,7 @@ def _in_short(study: Study, found: RanCultures) -> Section:
         f"{len(found.comparisons)} cultures.",
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
-    return Section("Results in short", (), tuple(points), (arms_shown(study), table), (picture,))
+    return Section("Results in short", (), tuple(points), (arms_table(study), table), (picture,))
 
 
 def _told(compared: Compared, row: OverCultures) -> str:

@@ -176,7 +176,7 @@ def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
         )
 
 
-def came_out_otherwise(
+def differing_comparisons(
     rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
 ) -> tuple[tuple[str, str], ...]:
     """For each comparison that differs from the paper or cannot tell: what came out, and what its optimum says to it.

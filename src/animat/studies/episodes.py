@@ -23,7 +23,7 @@ COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "
 """Of the table:
 
 - robot: its name in the study.
-- arm: what it was run in: an arm's name, or of controls what they act through (`named_mapping`).
+- arm: what it was run in: an arm's name, or of controls what they act through (`mapping_label`).
 - agent: `POLICY`, or the control's name.
 - actor: which of several, from 0: of policies p0, p1, ...
 - at_min: the recording that answers.
@@ -41,7 +41,7 @@ RANDOM = "random"
 COUPLING = "coupling"
 
 
-def tabulated(
+def episode_rows(
     ran: Episodes, *, robot: str, arm: str, at_min: float, agent: str = POLICY, over_time: bool = False
 ) -> DataFrame:
     """Episodes that were run together, as rows of the table."""

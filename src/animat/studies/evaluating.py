@@ -14,11 +14,11 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
-from animat.studies.episodes import COUPLING, RANDOM, tabulated, write_episodes
+from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask, draw_seed
 from animat.studies.training import training_of
 from animat.training.policy import Policy
@@ -46,13 +46,13 @@ class Evaluate(StudyTask):
         parts = []
         for at_min, episodes in study.minutes_of(self.arm, first, last).items():
             ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
-            parts.append(tabulated(ran, robot=robot, arm=self.arm.name, at_min=at_min))
+            parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min))
         if self.arm.through_neurons and timeline is not None:
             for i, at_min in enumerate(timeline.start_min.tolist()):
                 progress.update(i, len(timeline), "over time")
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
                 ran = setting.run(networks, n, at_min, study.episodes_over_time, seed)
-                parts.append(tabulated(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
+                parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
         seed = draw_seed(study.seed, robot, slug, last, "paths")
         paths = record_paths(setting.environment, setting.simulator(last), networks, n, seed)
         return [
@@ -82,7 +82,7 @@ class Control(StudyTask):
         arm, robot = replace(self.plain, delivery="chosen"), self.spec.name
         setting = setting_of(study, self.spec, arm, timeline)
         name = f"controls-{arm.thresholds}"
-        through = named_mapping(*arm.kind)
+        through = mapping_label(*arm.kind)
         networks = _networks(study, folder, self.spec, self.plain) if is_usual(self.plain) else None
         parts = []
         first, last = span_min(timeline)
@@ -95,18 +95,18 @@ class Control(StudyTask):
                 seed = draw_seed(study.seed, robot, name, at_min, drawn_by)
                 within = each.within(setting.environment, answering)
                 ran = roll_out(*within, each.actor, each.n_actors, episodes=study.episodes, seed=seed)
-                parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
+                parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:
             if networks is not None and not isinstance(setting.environment.robot, HostRobot):
                 progress.update(len(minutes), len(minutes) + 1, "best coupling")
                 seeds = [draw_seed(study.seed, robot, name, last, COUPLING, part) for part in ("search", "episodes")]
                 coupling = best_coupling(setting.environment, setting.simulator(last), seed=seeds[0])
                 ran = setting.run(coupling, 1, last, study.episodes, seeds[1])
-                parts.append(tabulated(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
+                parts.append(episode_rows(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
                 ran = setting.run(Uniform(), 1, at_min, study.episodes, seed)
-                parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
+                parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
         return [write_episodes(controls_file(folder, self.spec, arm), parts)]
 
 

@@ -79,7 +79,7 @@ def source_files(study: Study, base: Path) -> list[Path]:
     return list_recordings([base / name for name in study.culture.files])
 
 
-def sums_of(files: list[Path], base: Path) -> dict[str, str]:
+def hash_files(files: list[Path], base: Path) -> dict[str, str]:
     """SHA-256 of each file, by its place as seen from `base`; stimuli beside CSV spikes belong to them.
 
     Raises:
@@ -108,7 +108,7 @@ def _place(file: Path, base: Path) -> str:
 
 
 @contextmanager
-def held(
+def claim_folder(
     folder: Path,
     what: str,
     manifest: dict[str, Any],
@@ -145,7 +145,7 @@ def held(
         yield
 
 
-def described_beside(study: Study) -> dict[str, str]:
+def specification_files(study: Study) -> dict[str, str]:
     """What lies beside a study's description: its specification, to be changed and run."""
     return {SPECIFICATION: _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)}
 

@@ -25,7 +25,7 @@ def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
                 yield ObjectiveMet(spec.name, arm, agent, at_min, *met, str(objective), satisfaction)
 
 
-def goals_shown(rows: Sequence[ObjectiveMet]) -> Table:
+def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
     """An objective of each arm and control a row."""
     names = ("robot", "arm", "agent", "at_min", "episodes", "success_share", "margin", "objective", "satisfaction")
     return Table(

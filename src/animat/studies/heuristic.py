@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from animat.evaluation.verdict import beside, is_worse
-from animat.report.results import BesideHeuristic, Results
+from animat.report.results import HeuristicComparison, Results
 from animat.studies.episodes import POLICY, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
-from animat.studies.specification import RobotSpec, Study, named_mapping
+from animat.studies.specification import RobotSpec, Study, mapping_label
 
 HEURISTIC = "heuristic"
 OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few episodes to tell"
 
 
-def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[BesideHeuristic]:
+def compare_with_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[HeuristicComparison]:
     """Each arm that is trained as usual, at each minute at which the rule was run too, by the table of episodes."""
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     for arm in filter(is_usual, study.arms):
-        through = named_mapping(*arm.kind)
+        through = mapping_label(*arm.kind)
         heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
         policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")
         rule = {at_min: returns.to_numpy() for at_min, returns in heuristic}
@@ -29,7 +29,7 @@ def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterato
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.can_tell else TOO_FEW
                 # Of the policies' means, as in the scores: another order of summing can round to another digit.
                 means = float(mean_returns(episodes).mean()), float(theirs.mean())
-                yield BesideHeuristic(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
+                yield HeuristicComparison(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
 
 
 def not_outperforming(results: Results) -> list[str]:

@@ -38,7 +38,7 @@ def rough_kinds(study: Study) -> list[Arm]:
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
 
-def optima_of_all(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
+def read_complete_optima(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
     """The optima of all conditions; what policies could do with fewer is none of theirs."""
     return [optimum for optimum in read_optima(folder, robot, what) if optimum.left_out is None]
 

@@ -38,7 +38,7 @@ from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
 from animat.studies.results import read_typed
 from animat.studies.simulating import read_series
-from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 from animat.training.settings import SAC
@@ -201,7 +201,7 @@ def _courses(
         optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
-                named_mapping(*kind.kind),
+                mapping_label(*kind.kind),
                 tuple(courses),
                 np.array([rough.random(kind, at_min) for at_min in every_min]),
                 None if levels[0] is None else np.array(levels, np.float64),
@@ -220,5 +220,5 @@ def _controls(rows: Iterable[ControlReturns]) -> list[tuple[str, list[ControlRet
     panels = []
     for (mapping, percentiles, at_min), same in groupby(rows, lambda row: (row.mapping, row.percentiles, row.at_min)):
         at = "" if mapping == "none" else f", recording at {at_min:g} min"
-        panels.append((f"{named_mapping(mapping, percentiles)}{at}", list(same)))
+        panels.append((f"{mapping_label(mapping, percentiles)}{at}", list(same)))
     return panels

@@ -20,26 +20,26 @@ from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.style import FORMATS, save_figure
 from animat.responses.responses import Responses
-from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
+from animat.studies.arms import arms_table, summarise_arms, describe_mapping, arm_differences
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT
-from animat.studies.differences import came_out_otherwise, decisions
+from animat.studies.differences import differing_comparisons, decisions
 from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
-from animat.studies.goals import goals_shown
+from animat.studies.goals import goals_table
 from animat.studies.heuristic import not_outperforming
 from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
-from animat.studies.reflex import reflexes_told
+from animat.studies.reflex import describe_reflexes
 from animat.studies.results import read_typed
-from animat.studies.shown import (
-    comparisons_shown,
-    controllability_shown,
-    controls_shown,
-    heuristic_shown,
-    optima_shown,
-    reflexes_shown,
-    returns_shown,
-    scores_shown,
+from animat.studies.report_tables import (
+    comparisons_table,
+    controllability_table,
+    controls_table,
+    heuristic_table,
+    optima_table,
+    reflexes_table,
+    returns_table,
+    scores_table,
 )
 from animat.studies.simulating import controllability, load_timeline, read_series
 from animat.studies.specification import Arm, RobotSpec, Study
@@ -70,7 +70,7 @@ class Publish(StudyTask):
             pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT, _facts_of_robot(study, spec))
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
         if kept:
-            table = controllability_shown(study, folder, kept)
+            table = controllability_table(study, folder, kept)
             pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(series))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
@@ -97,7 +97,7 @@ def _lead(study: Study) -> str:
     robots = _and([spec.name for spec in study.robots])
     neurons = {"virtual": "a virtual culture", "files": "recordings"}[study.culture.kind]
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
-    return f"{robots.capitalize()}, driven through {neurons}. {many_arms(study)}, trained for {trained}."
+    return f"{robots.capitalize()}, driven through {neurons}. {summarise_arms(study)}, trained for {trained}."
 
 
 def _and(parts: Sequence[str]) -> str:
@@ -123,7 +123,7 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
         best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.interquartile_mean, default=None)
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
-            means = f"In “{best.arm}” {mapped(study.arm(best.arm))}"
+            means = f"In “{best.arm}” {describe_mapping(study.arm(best.arm))}"
             words = f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}{at_random}"
             sentences.append(words if means in explained else f"{words} {means}")
             explained.append(means)
@@ -131,7 +131,7 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
     printed = [row for row in rows if row.paper_p is not None]
     if printed:
         otherwise = [row for row in printed if row.as_in_paper == "no"]
-        parts = [each for row in otherwise for each in what_parts(study.arm(row.first), study.arm(row.second))]
+        parts = [each for row in otherwise for each in arm_differences(study.arm(row.first), study.arm(row.second))]
         explain = [each for each in dict.fromkeys(parts) if each not in explained]
         if otherwise:
             explain.append("The section “Differences from the paper” says what is known about the reasons.")
@@ -152,7 +152,7 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
         (*(f"figures/{file.name}" for file in drawn[1:]), "tables/scores.csv"),
         narrow,
     )
-    return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_shown(study),))
+    return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_table(study),))
 
 
 def _beside(row: Score) -> str:
@@ -193,7 +193,7 @@ def _compared(study: Study, results: Results) -> Section:
         "that there is no difference. The effect is the rank-biserial correlation, +1 where every "
         "policy of the second arm is better, with Newcombe's 95 % interval."
     )
-    return Section("Comparisons", (said,), tables=(comparisons_shown(rows), returns_shown(rows)))
+    return Section("Comparisons", (said,), tables=(comparisons_table(rows), returns_table(rows)))
 
 
 def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
@@ -224,9 +224,9 @@ def _otherwise(rows: Sequence[ComparedReturns]) -> Iterator[str]:
 
 
 def _scores(results: Results) -> Section:
-    tables = [scores_shown(results.scores), optima_shown(results.optima)]
+    tables = [scores_table(results.scores), optima_table(results.optima)]
     if results.goals:
-        tables.append(goals_shown(results.goals))
+        tables.append(goals_table(results.goals))
     said = (
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     )
@@ -303,13 +303,13 @@ def _controls(study: Study, results: Results) -> Section:
             "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and without a goal.",
         ),
     )
-    beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
-    told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
+    beside = heuristic_table(results.heuristic), reflexes_table(results.reflexes)
+    told = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
         ("Each control takes something away.", *(each[:1].upper() + each[1:] for each in told)),
         points,
-        (*(table for table in beside if table.rows), controls_shown(study, results.controls)),
+        (*(table for table in beside if table.rows), controls_table(study, results.controls)),
     )
 
 
@@ -318,7 +318,7 @@ def _differences(
 ) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
     lost = {at_min: of.largest_loss for at_min, of in kept.items()}
-    otherwise = came_out_otherwise(rows, lost)
+    otherwise = differing_comparisons(rows, lost)
     paragraphs = [
         "Sawada, Wake, Sasabuchi, Takamatsu, Takahashi, Ikeuchi: Design strategies for controlling neuron-connected "
         "robots using reinforcement learning (2022). First what came out otherwise, then what was decided where the "

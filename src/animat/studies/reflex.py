@@ -7,15 +7,15 @@ from collections.abc import Iterable, Iterator
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
-from animat.report.results import BesideReflex, StudyOptimum
+from animat.report.results import ReflexComparison, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
-from animat.studies.specification import RobotSpec, Study, named_mapping
+from animat.studies.specification import RobotSpec, Study, mapping_label
 
 
-def beside_reflex(
+def compare_with_reflex(
     study: Study, table: DataFrame, spec: RobotSpec, optima: Iterable[StudyOptimum]
-) -> Iterator[BesideReflex]:
+) -> Iterator[ReflexComparison]:
     """Each arm that is trained as usual, at the minute at which the best coupling was run too.
 
     The table is of episodes. Where there is no optimal return of all conditions there is no context gap, and no row.
@@ -27,7 +27,7 @@ def beside_reflex(
         if each.robot == spec.name and each.left_out is None and each.best_return is not None
     }
     for arm in filter(is_usual, study.arms):
-        of = at[at["arm"] == named_mapping(*arm.kind)]
+        of = at[at["arm"] == mapping_label(*arm.kind)]
         for at_min, coupled in of[of["agent"] == COUPLING].groupby("at_min")["return"]:
             best = known.get((*arm.kind, at_min))
             policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY) & (at["at_min"] == at_min)]
@@ -38,7 +38,7 @@ def beside_reflex(
             optimum = Optimum(best.best_return or 0.0, best.grid_error or 0.0, nan, nan, nan, nan, 0, 0)
             context = context_gap(coupled.to_numpy(), random, optimum)
             gap, score = context.gap, context.score(mean_returns(policies), optimum)
-            yield BesideReflex(
+            yield ReflexComparison(
                 spec.name,
                 arm.name,
                 at_min,
@@ -51,7 +51,7 @@ def beside_reflex(
             )
 
 
-def reflexes_told(rows: Iterable[BesideReflex]) -> list[str]:
+def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
     """A sentence for each row of which the gap is known."""
     told = []
     for row in rows:

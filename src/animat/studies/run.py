@@ -17,14 +17,14 @@ from animat.execution.jobs import Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import MANIFEST, describe_study, described_beside, held, source_files, sums_of
+from animat.studies.folder import MANIFEST, describe_study, specification_files, claim_folder, source_files, hash_files
 from animat.studies.places import RECEIPTS, REPORT
 from animat.studies.plan import plan_study
 from animat.studies.specification import RobotSpec, Study
 
 
 @dataclass(frozen=True)
-class Ran:
+class StudyRun:
     """What a run of a study did: where, of how many jobs.
 
     Attributes:
@@ -45,7 +45,7 @@ def run_study(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Ran:
+) -> StudyRun:
     """Run a study into a folder, or go on with one.
 
     Killed at any moment and called again, it goes on from the jobs that are done and, within a training, from its last
@@ -70,9 +70,9 @@ def run_study(
     expect_workers(workers, executor)
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None
-    check_own(study.robots, [arm.mapping for arm in study.arms])
-    manifest = describe_study(study, sums_of(source_files(study, base), base), gpu)
-    with held(folder, "study", manifest, MANIFEST, described_beside(study)):
+    check_custom(study.robots, [arm.mapping for arm in study.arms])
+    manifest = describe_study(study, hash_files(source_files(study, base), base), gpu)
+    with claim_folder(folder, "study", manifest, MANIFEST, specification_files(study)):
         jobs = plan_study(study, base)
         left = Jobs(jobs, folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s: dict[str, float] = {}
@@ -85,10 +85,10 @@ def run_study(
                 workers=workers, executor=executor, progress=progress or Silent(), has_gpu=gpu is not None
             )
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-    return Ran(folder, folder / REPORT, len(jobs), took_s)
+    return StudyRun(folder, folder / REPORT, len(jobs), took_s)
 
 
-def check_own(robots: Iterable[RobotSpec], mappings: Iterable[str]) -> None:
+def check_custom(robots: Iterable[RobotSpec], mappings: Iterable[str]) -> None:
     """Refuse robots and mappings of one's own that do not keep to the contract (InvalidArgument)."""
     for spec in robots:
         if ":" in spec.kind:

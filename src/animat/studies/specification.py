@@ -207,7 +207,7 @@ class Arm:
         return self.trained and self.through_neurons and not self.shadowing and self.delivery == "chosen"
 
 
-def named_mapping(mapping: str, percentiles: str) -> str:
+def mapping_label(mapping: str, percentiles: str) -> str:
     """A mapping in words, with whether its percentiles are fixed."""
     fixed = ", percentiles fixed" if percentiles == "first" else ""
     return "without neurons" if mapping == "none" else f"{mapping}{fixed}"

@@ -20,14 +20,14 @@ from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Resu
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
-from animat.studies.heuristic import beside_heuristic
-from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
+from animat.studies.heuristic import compare_with_heuristic
+from animat.studies.optima import kinds_of, left_out, read_complete_optima, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
-from animat.studies.reflex import beside_reflex
+from animat.studies.reflex import compare_with_reflex
 from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.simulating import controllability
-from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
 from animat.writing import atomic_write
@@ -58,11 +58,11 @@ class Tabulate(StudyTask):
             scores=tuple(_scores(study, table, first, last, known)),
             comparisons=tuple(_comparisons(study, table, last, known)),
             controls=tuple(row for spec in study.robots for row in _controls(study, table, spec, known[spec.name])),
-            heuristic=tuple(row for spec in study.robots for row in beside_heuristic(study, table, spec)),
+            heuristic=tuple(row for spec in study.robots for row in compare_with_heuristic(study, table, spec)),
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
             goals=tuple(goals_met(study, table)),
-            reflexes=tuple(row for spec in study.robots for row in beside_reflex(study, table, spec, optima)),
+            reflexes=tuple(row for spec in study.robots for row in compare_with_reflex(study, table, spec, optima)),
         )
         files = [write_typed(results_file(folder), results)]
         for name, kinds in get_type_hints(Results).items():
@@ -99,7 +99,7 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
     if timeline is not None:
         yield from timeline.findings
     for optimum in optima:
-        where = f"{optimum.robot}, {named_mapping(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
+        where = f"{optimum.robot}, {mapping_label(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
         for told in optimum.findings():
             yield replace(told, message=f"{where}: {told.message}")
     for message in left_out(study):
@@ -117,12 +117,12 @@ class References:
     ) -> None:
         self._optima = {
             (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
-            for optimum in optima_of_all(folder, spec.name, "over-time" if over_time else "optima")
+            for optimum in read_complete_optima(folder, spec.name, "over-time" if over_time else "optima")
         }
         random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_kind = random[random["arm"] == named_mapping(*kind.kind)]
+            of_kind = random[random["arm"] == mapping_label(*kind.kind)]
             for at_min, returns in of_kind.groupby("at_min")["return"]:
                 self._random[*kind.kind, at_min] = float(returns.to_numpy().mean())
 
@@ -271,7 +271,7 @@ def _comparisons(
 
 def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        through = named_mapping(*kind.kind)
+        through = mapping_label(*kind.kind)
         of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
         for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []

@@ -36,7 +36,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it; what is left out has its
     default; a key that is not known is refused. Lists in robots, arms and comparisons stand for their products
-    (`without_lists`).
+    (`expand_lists`).
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -61,7 +61,7 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")
             raise InvalidFile(f"{path}: {name}: expected [[{name}]] for each, and its name in it, got {wrote}")
     try:
-        return read_record(Study, without_lists(_in_todays_words(data)))
+        return read_record(Study, expand_lists(_in_todays_words(data)))
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
 
@@ -127,7 +127,7 @@ def _written(value: Any) -> str:
 TABLES = ("robots", "arms", "comparisons")
 
 
-def without_lists(data: Mapping[str, Any]) -> dict[str, Any]:
+def expand_lists(data: Mapping[str, Any]) -> dict[str, Any]:
     """A specification's plain data with all products named, `{key}` in a name replaced by each value.
 
     What is no table of the right kind is left for the checks. Raises InvalidArgument for a name that does not tell

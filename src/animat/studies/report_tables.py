@@ -8,11 +8,11 @@ from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
-from animat.report.results import BesideHeuristic, BesideReflex, ComparedReturns, ControlReturns, Score, StudyOptimum
+from animat.report.results import HeuristicComparison, ReflexComparison, ComparedReturns, ControlReturns, Score, StudyOptimum
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
-from animat.studies.optima import optima_of_all, rough_kinds
-from animat.studies.specification import Study, named_mapping
+from animat.studies.optima import read_complete_optima, rough_kinds
+from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
 _MOST_LABELS = 12
@@ -26,7 +26,7 @@ _SCORE_NOTE = (
 )
 
 
-def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
+def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
     """Tests and outcomes, beside the paper's p where it printed one."""
     printed = any(row.paper_p is not None for row in rows)
     columns: Columns = [
@@ -54,7 +54,7 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
     )
 
 
-def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
+def returns_table(rows: Sequence[ComparedReturns]) -> Table:
     """The same comparisons as mean returns, optima and scores."""
     return table_of(
         "The same comparisons as returns",
@@ -71,7 +71,7 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
     )
 
 
-def scores_shown(rows: Sequence[Score]) -> Table:
+def scores_table(rows: Sequence[Score]) -> Table:
     """Every arm at every minute it was evaluated at."""
     return table_of(
         "Every arm",
@@ -91,11 +91,11 @@ def scores_shown(rows: Sequence[Score]) -> Table:
     )
 
 
-def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
+def optima_table(optima: Sequence[StudyOptimum]) -> Table:
     """The optimal returns as brackets, with their intervals; what was left out of them is said."""
     columns: Columns = [
         ("robot", "robot"),
-        ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
+        ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
         ("at (min)", "at_min"),
         ("optimum ± grid", _pair("best_return", "grid_error")),
         ("95 % interval", lambda row: None if row.low_95 is None else _ends(row.low_95, row.high_95)),
@@ -127,13 +127,13 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
     )
 
 
-def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
+def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
     """How often each condition passes the median in every recording, in the data and in what the simulator kept."""
     kinds = rough_kinds(study)[:1]
     optima = {
         spec.name: {
             optimum.at_min: optimum.best_return
-            for optimum in optima_of_all(folder, spec.name, "over-time")
+            for optimum in read_complete_optima(folder, spec.name, "over-time")
             if (optimum.mapping, optimum.percentiles) == kinds[0].kind
         }
         for spec in study.robots
@@ -158,7 +158,7 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
         "have is not what the culture would give."
     )
     if kinds:
-        mapping = named_mapping(*kinds[0].kind)
+        mapping = mapping_label(*kinds[0].kind)
         note += f" Optimum: the optimal return with {mapping} on a rough grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."
@@ -178,14 +178,14 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
     )
 
 
-def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
+def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
     """Trained policies and the controls of their mapping, at every recording that anything is evaluated at."""
     return table_of(
         "Controls",
         rows,
         [
             ("robot", "robot"),
-            ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
+            ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
             ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
             *columns_of("control", "actors"),
             ("mean return", _pair("mean_return", "standard_error")),
@@ -205,7 +205,7 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
     )
 
 
-def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
+def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
     """Trained policies beside the heuristic policy, episode by episode."""
     return table_of(
         "Policies beside the heuristic policy",
@@ -225,7 +225,7 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
     )
 
 
-def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
+def reflexes_table(rows: Sequence[ReflexComparison]) -> Table:
     """Trained policies beside the best coupling: context gap and context score."""
     return table_of(
         "Policies beside the best reflex",
