@@ -78,7 +78,7 @@ def test_where_no_optimal_return_is_known_it_says_at_least(tmp_path: Path) -> No
 
 def test_robots_with_more_commands_than_two_are_refused() -> None:
     assert ContextStudy(robots=("wheels", "detour", "arm"))
-    with pytest.raises(InvalidArgument, match="robots: expected ones in JAX with one or two commands, got 'gymnasium:"):
+    with pytest.raises(InvalidArgument, match="robots: expected JAX robots with one or two commands, got 'gymnasium:"):
         ContextStudy(robots=("gymnasium:Pendulum-v1",))
 
 

@@ -26,7 +26,7 @@ from animat.goals.robot import with_goal
 from animat.reality_gap.answered import outcomes
 from animat.responses.condition import Condition
 from animat.robots import Cartpole, Navigation
-from animat.studies.episodes import read_episodes, episode_rows, write_episodes
+from animat.studies.episodes import episode_rows, read_episodes, write_episodes
 from animat.studies.folder import describe_study
 from animat.studies.goals import goals_met
 from animat.studies.specification import Arm, RobotSpec, Study

@@ -22,18 +22,18 @@ from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
-from animat.studies.arms import arms_table, arm_differences
+from animat.studies.arms import arm_differences, arms_table
 from animat.studies.captions import CULTURE
 from animat.studies.cultures import CulturesRun
-from animat.studies.cultures_page import _in_short
-from animat.studies.differences import differing_comparisons, decisions, explain
+from animat.studies.cultures_page import _summary
+from animat.studies.differences import decisions, differing_comparisons, explain
 from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper, _facts_of_culture
-from animat.studies.results import write_typed
 from animat.studies.report_tables import comparisons_table, controllability_table
+from animat.studies.results import write_typed
 from animat.studies.source import Source
 from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
@@ -66,14 +66,14 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
     words = _as_in_paper([replace(ROW, as_in_paper=each) for each in ("yes", "cannot tell", "cannot tell")])
     assert words.startswith("1 of 3 comparisons") and "For 2 there are too few policies" in words
-    assert "otherwise" not in words
-    assert "is not known, with so few policies" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
+    assert "differently" not in words
+    assert "With so few policies it is not known" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
 
 
 def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
     rows = [replace(ROW, robot=robot, outcome=outcome) for robot, outcome in (("arm", NONE), ("wheels", FIRST))]
     words = _as_in_paper([replace(ROW, as_in_paper="yes"), *rows, replace(ROW, second="c")])
-    assert words.startswith("1 of 4 comparisons came out as in the paper")
+    assert words.startswith("1 of 4 comparisons agrees with the paper")
     assert words.endswith(
         "3 came out differently: the paper found “b” better than “a”, but here “a” was better on wheels and no "
         "difference was found on arm; the paper found “c” better than “a”, but here no difference was found on "
@@ -85,7 +85,7 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     study = paper_study()
     told = dict(arms_table(study).rows)
     assert list(told) == [arm.name for arm in study.arms]
-    assert "depending on how many of nine thresholds it passes. Trained with shadowing" in told["9 thresholds"]
+    assert "depending on how many of nine thresholds it exceeds. Trained with shadowing" in told["9 thresholds"]
     assert "above the median gives the motor command +1" in told["control"] and "drawn at random" in told["control"]
     assert told["before training"].startswith("New networks") and "hadowing" not in told["before training"]
     assert "without shadowing: on the simulator of the first recording" in told["without shadowing"]
@@ -105,7 +105,7 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
 def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
     names = [("control and 1 threshold", robot) for robot in ("cartpole", "navigation")]
     rows = [OverCultures(*name, 4, 1.0, 2.0, 1.0, None, None, larger_in=4, holds_in=4, tested=4) for name in names]
-    section = _in_short(paper_study(), CulturesRun(Path(), {}, {}, {}, tuple(rows), None))
+    section = _summary(paper_study(), CulturesRun(Path(), {}, {}, {}, tuple(rows), None))
     (_, first), (_, second) = section.points
     assert first.endswith("In “control” the delivered stimulus is drawn at random, whatever the policy chooses.")
     assert first.startswith(second)
@@ -131,7 +131,7 @@ def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
 
 def test_a_comparison_knows_what_its_optimum_says() -> None:
     assert "other way round" in explain(ROW)
-    assert "take more policies" in explain(replace(ROW, n=4))
+    assert "use more policies" in explain(replace(ROW, n=4))
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
     assert "no optimum" in explain(replace(ROW, optimum_second=None))
     assert "leaves room" in explain(replace(ROW, optimum_second=100.0))
@@ -188,18 +188,18 @@ def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
     flat = responses_of([1.0] * 4)
     words = dict(decisions(paper_study(), [one_peak, two_groups, flat]))["Bursts"]
     assert words == (
-        "In the paper Otsu's threshold always cuts. Here its cut is kept only where the ratios of active channels form "
-        "two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 responses "
-        "that the paper's rule would leave out."
+        "In the paper Otsu's threshold is always applied. Here it is applied only where the ratios of active channels "
+        "form two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 "
+        "responses that the paper's rule would leave out."
     )
     assert dict(decisions(paper_study()))["Bursts"].endswith("elsewhere no response is set apart.")
     given = replace(paper_study(), simulators=Simulators(burst_threshold=0.5))
-    assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is given: 0.5 of the channels.")
+    assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is set to 0.5 of the channels.")
 
 
 def test_a_caption_promises_a_threshold_only_where_there_is_one() -> None:
     with_bursts, without = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5), responses_of([1.0] * 20)
-    for responses, said in ((with_bursts, "Right of the dashed threshold"), (without, "so there is no threshold.")):
+    for responses, said in ((with_bursts, "to the right of the dashed threshold"), (without, "so there is no threshold.")):
         _, caption = CULTURE["bursts"]
         assert said in caption.format(**_facts_of_culture([responses]))
 
@@ -234,7 +234,7 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "0.55 kg, chosen for this study" in told["Pole mass"]
     assert "22.9 degrees" in told["12 degrees"]
     assert "there are 20 " in told["20 iterations"] and "no policy can reach" in told["20 iterations"]
-    assert "recordings at hand" in told["The culture"] and "Pulse" not in told
+    assert "existing recordings" in told["The culture"] and "Pulse" not in told
     assert (
         "40 bins of equal width reach to 60 Hz" in told["Histogram range"] and "paper's 20" in told["Histogram range"]
     )

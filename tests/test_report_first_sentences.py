@@ -11,7 +11,7 @@ from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import ControlReturns, OverCultures
-from animat.studies.publishing import _beside
+from animat.studies.publishing import _describe
 from test_report_claims import score
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     ],
 )
 def test_the_first_sentence_goes_by_the_interval(low: float, high: float, found: str) -> None:
-    told = _beside(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
+    told = _describe(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
     assert told.startswith(f"policies trained as “1 threshold” {found}")
     assert "return is 50, that of random actions −10, that of the optimal controller 70." in told
 
 
 def test_without_an_interval_nothing_is_claimed() -> None:
-    told = _beside(score("cartpole", "linear", 50.0, None, None, None, None))
+    told = _describe(score("cartpole", "linear", 50.0, None, None, None, None))
     assert told == "of the policies trained as “linear” the interquartile mean return is 50."
 
 

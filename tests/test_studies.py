@@ -46,7 +46,7 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import describe_study, claim_folder, hash_files
+from animat.studies.folder import claim_folder, describe_study, hash_files
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file, paths_file
@@ -432,7 +432,7 @@ def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
     written = tmp_path / "study" / "study.toml"
     assert read_study(written) == study
-    assert written.read_text().startswith("# files: as seen from where the specification lay.")
+    assert written.read_text().startswith("# files: relative to the original specification.")
     write_nwb(synthetic_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())

@@ -25,13 +25,13 @@ from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.responses.series import extract_series
 from animat.robots import Navigation
-from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, episode_rows, write_episodes
+from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
 from animat.studies.optima import FindOptima, read_optima
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
-from animat.studies.results import read_typed, write_typed
 from animat.studies.report_tables import optima_table
+from animat.studies.results import read_typed, write_typed
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label

@@ -1,4 +1,4 @@
-"""A study's policies beside the best coupling: whether a task needs more than a reflex, and what they do beyond one."""
+"""A study's policies against the best coupling: whether a task needs more than a reflex, and if policies do more."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from animat.studies.specification import RobotSpec, Study, mapping_label
 def compare_with_reflex(
     study: Study, table: DataFrame, spec: RobotSpec, optima: Iterable[StudyOptimum]
 ) -> Iterator[ReflexComparison]:
-    """Each arm that is trained as usual, at the minute at which the best coupling was run too.
+    """Compare each arm that `is_usual` at the minute at which the best coupling was run; `table` is of episodes.
 
-    The table is of episodes. Where there is no optimal return of all conditions there is no context gap, and no row.
+    Without an optimal return over all conditions there is no context gap, and hence no row.
     """
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     known = {
@@ -52,8 +52,8 @@ def compare_with_reflex(
 
 
 def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
-    """A sentence for each row of which the gap is known."""
-    told = []
+    """A sentence for each row whose gap is known."""
+    sentences = []
     for row in rows:
         if row.gap is None:
             continue
@@ -61,11 +61,11 @@ def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
         if not row.needs_context:
             is_known = row.gap_high_95 is not None and row.gap_high_95 <= REFLEX_GAP
             more = "the task needs no more than that" if is_known else "whether the task needs more is not known"
-            told.append(f"{where}; {more}.")
+            sentences.append(f"{where}; {more}.")
         else:
             score = "" if row.score is None else f"; the policies' context score is {row.score:.2f}"
-            told.append(f"{where}; the task needs more{score}.")
-    return told
+            sentences.append(f"{where}; the task needs more{score}.")
+    return sentences
 
 
 def _ends(interval: Interval | None) -> tuple[float | None, float | None, float | None]:

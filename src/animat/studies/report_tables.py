@@ -8,7 +8,14 @@ from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
-from animat.report.results import HeuristicComparison, ReflexComparison, ComparedReturns, ControlReturns, Score, StudyOptimum
+from animat.report.results import (
+    ComparedReturns,
+    ControlReturns,
+    HeuristicComparison,
+    ReflexComparison,
+    Score,
+    StudyOptimum,
+)
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
 from animat.studies.optima import read_complete_optima, rough_kinds

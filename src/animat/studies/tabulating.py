@@ -21,7 +21,7 @@ from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, rea
 from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import compare_with_heuristic
-from animat.studies.optima import kinds_of, left_out, read_complete_optima, read_optima
+from animat.studies.optima import kinds_of, missing_capabilities, read_complete_optima, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
 from animat.studies.reflex import compare_with_reflex
@@ -102,7 +102,7 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
         where = f"{optimum.robot}, {mapping_label(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
         for told in optimum.findings():
             yield replace(told, message=f"{where}: {told.message}")
-    for message in left_out(study):
+    for message in missing_capabilities(study):
         yield Finding(LEFT_OUT, "note", message)
 
 

@@ -18,7 +18,7 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
-from animat.studies.folder import describe_study, claim_folder, source_files, hash_files
+from animat.studies.folder import claim_folder, describe_study, hash_files, source_files
 from animat.studies.places import OWN_FOLDERS, RECEIPTS
 from animat.studies.plan import ITERATIONS_PER_S
 from animat.studies.recording import JOB, Record
