@@ -121,8 +121,8 @@ def test_a_gif_lasts_as_long_as_what_it_shows_and_moves(
 ) -> None:
     out = tmp_path / "film.gif"
     assert film(folder, "--out", out, "--span-s", 1, 3, "--json") == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation", "lost_bytes": 0}
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation", "lost_bytes": 0}
     durations_ms, pictures = [], []
     with Image.open(out) as gif:
         assert gif.size == (WIDTH_PX, HEIGHT_PX)

@@ -83,13 +83,13 @@ def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
 
 def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     study = paper_study()
-    told = dict(arms_table(study).rows)
-    assert list(told) == [arm.name for arm in study.arms]
-    assert "depending on how many of nine thresholds it exceeds. Trained with shadowing" in told["9 thresholds"]
-    assert "above the median gives the motor command +1" in told["control"] and "drawn at random" in told["control"]
-    assert told["before training"].startswith("New networks") and "hadowing" not in told["before training"]
-    assert "without shadowing: on the simulator of the first recording" in told["without shadowing"]
-    assert told["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
+    shown = dict(arms_table(study).rows)
+    assert list(shown) == [arm.name for arm in study.arms]
+    assert "depending on how many of nine thresholds it exceeds. Trained with shadowing" in shown["9 thresholds"]
+    assert "above the median gives the motor command +1" in shown["control"] and "drawn at random" in shown["control"]
+    assert shown["before training"].startswith("New networks") and "hadowing" not in shown["before training"]
+    assert "without shadowing: on the simulator of the first recording" in shown["without shadowing"]
+    assert shown["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
     (fixed,) = arms_table(Study(arms=(Arm("fixed", percentiles="first"),))).rows
     assert fixed[1].endswith("Percentiles are those of the first recording throughout.")
     parts = {each.name: list(arm_differences(each, study.arm("1 threshold"))) for each in study.arms}
@@ -171,17 +171,17 @@ def test_what_binning_takes_is_said_where_it_takes_something() -> None:
 
 
 def test_decisions_of_the_papers_study_are_those_of_its_own() -> None:
-    told = dict(decisions(paper_study()))
+    decided = dict(decisions(paper_study()))
     assert {"Ten levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
-            "Most probable actions", "Walls", "Before training"} <= set(told)  # fmt: skip
-    assert "0.055 kg, the simulator's" in told["Pole mass"]
-    assert "12 degrees (angle" in told["12 degrees"]
-    assert "there are 100" in told["20 iterations"]
-    assert "percentiles of each recording" in told["Histogram range"]
-    assert "simulated" in told["The culture"]
+            "Most probable actions", "Walls", "Before training"} <= set(decided)  # fmt: skip
+    assert "0.055 kg, the simulator's" in decided["Pole mass"]
+    assert "12 degrees (angle" in decided["12 degrees"]
+    assert "there are 100" in decided["20 iterations"]
+    assert "percentiles of each recording" in decided["Histogram range"]
+    assert "simulated" in decided["The culture"]
 
 
-def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
+def test_the_papers_burst_rule_is_reported_with_what_it_would_leave_out() -> None:
     # Of one peak, which Otsu cuts in two: 0.5 is its cut; of two groups; and of no two values.
     one_peak = responses_of([1.0] * 10, active_ratio=np.repeat([0.4, 0.5, 0.6, 0.7], [2, 5, 2, 1]))
     two_groups = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5)
@@ -199,20 +199,20 @@ def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
 
 def test_a_caption_promises_a_threshold_only_where_there_is_one() -> None:
     with_bursts, without = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5), responses_of([1.0] * 20)
-    for responses, said in ((with_bursts, "to the right of the dashed threshold"), (without, "so there is no threshold.")):
-        _, caption = CULTURE["bursts"]
-        assert said in caption.format(**_facts_of_culture([responses]))
+    _, caption = CULTURE["bursts"]
+    assert "to the right of the dashed threshold" in caption.format(**_facts_of_culture([with_bursts]))
+    assert "so there is no threshold." in caption.format(**_facts_of_culture([without]))
 
 
-def test_what_a_quick_study_has_less_of_than_the_paper_is_told() -> None:
-    told = dict(decisions(paper_study(quick=True)))
-    assert told["Recordings"] == (
+def test_a_quick_study_reports_what_it_has_less_of_than_the_paper() -> None:
+    decided = dict(decisions(paper_study(quick=True)))
+    assert decided["Recordings"] == (
         "The paper has 15 recordings, 10 minutes apart, of 100 trials of each stimulus, each frequency in a block. "
         "Here there are 8 recordings, 20 minutes apart, of 100 trials of each stimulus, each frequency in a block."
     )
-    assert told["Policies"] == "The paper has 10 per arm. Here there are 4."
-    assert told["Iterations on cartpole"] == "The paper trains a policy for 800,000. Here it is trained for 60,000."
-    assert "500,000" in told["Iterations on navigation"] and "60,000" in told["Iterations on navigation"]
+    assert decided["Policies"] == "The paper has 10 per arm. Here there are 4."
+    assert decided["Iterations on cartpole"] == "The paper trains a policy for 800,000. Here it is trained for 60,000."
+    assert "500,000" in decided["Iterations on navigation"] and "60,000" in decided["Iterations on navigation"]
     papers = dict(decisions(paper_study()))
     assert not any(name.startswith(("Recordings", "Policies", "Iterations")) for name in papers)
 
@@ -230,15 +230,15 @@ def test_decisions_follow_a_changed_study() -> None:
         comparisons=(),
         actions="drawn",
     )
-    told = dict(decisions(changed))
-    assert "0.55 kg, chosen for this study" in told["Pole mass"]
-    assert "22.9 degrees" in told["12 degrees"]
-    assert "there are 20 " in told["20 iterations"] and "no policy can reach" in told["20 iterations"]
-    assert "existing recordings" in told["The culture"] and "Pulse" not in told
+    made = dict(decisions(changed))
+    assert "0.55 kg, chosen for this study" in made["Pole mass"]
+    assert "22.9 degrees" in made["12 degrees"]
+    assert "there are 20 " in made["20 iterations"] and "no policy can reach" in made["20 iterations"]
+    assert "existing recordings" in made["The culture"] and "Pulse" not in made
     assert (
-        "40 bins of equal width reach to 60 Hz" in told["Histogram range"] and "paper's 20" in told["Histogram range"]
+        "40 bins of equal width reach to 60 Hz" in made["Histogram range"] and "paper's 20" in made["Histogram range"]
     )
-    assert "Ten levels without zero" not in told and "Most probable actions" not in told
+    assert "Ten levels without zero" not in made and "Most probable actions" not in made
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
     alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
@@ -259,8 +259,8 @@ def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
     names = [job.name for job in plan_study(study, tmp_path)]
     assert len(set(names)) == len(names) and "train/as printed/1-threshold/p0" in names
     assert training_of(study, printed, Arm("a", mapping="none")).commands == (-1.0, 1.0)
-    told = [words for name, words in decisions(study) if name == "Pole mass"]
-    assert len(told) == 2 and "0.55 kg, chosen" in told[1]
+    texts = [words for name, words in decisions(study) if name == "Pole mass"]
+    assert len(texts) == 2 and "0.55 kg, chosen" in texts[1]
     with pytest.raises(InvalidArgument, match="expected each name once"):
         Study(robots=(RobotSpec("cartpole"), RobotSpec("cartpole", parameters={"pole_mass_kg": 0.55})))
     with pytest.raises(InvalidArgument, match=r"^name: expected letters"):
@@ -310,10 +310,10 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
     in_data[1, [0, 12]], in_simulator[1, [0, 12]] = (0.13, 0.9), (0.28, 0.88)
     kept = {10.0 * i: Fidelity(labels, in_data[i], in_simulator[i], 0) for i in range(2)}
     unknown = dict.fromkeys(field.name for field in fields(StudyOptimum))
-    told = {"robot": "cartpole", "percentiles": "moving"}
+    known = {"robot": "cartpole", "percentiles": "moving"}
     optima = [
         StudyOptimum(
-            **unknown | told | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"}
+            **unknown | known | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"}
         )
         for m, x in (("9-thresholds", 99.0), ("1-threshold", 42.0))
         for at in (0.0, 10.0)

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     ],
 )
 def test_the_first_sentence_goes_by_the_interval(low: float, high: float, found: str) -> None:
-    told = _describe(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
-    assert told.startswith(f"policies trained as “1 threshold” {found}")
-    assert "return is 50, that of random actions −10, that of the optimal controller 70." in told
+    text = _describe(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
+    assert text.startswith(f"policies trained as “1 threshold” {found}")
+    assert "return is 50, that of random actions −10, that of the optimal controller 70." in text
 
 
 def test_without_an_interval_nothing_is_claimed() -> None:
-    told = _describe(score("cartpole", "linear", 50.0, None, None, None, None))
-    assert told == "of the policies trained as “linear” the interquartile mean return is 50."
+    text = _describe(score("cartpole", "linear", 50.0, None, None, None, None))
+    assert text == "of the policies trained as “linear” the interquartile mean return is 50."
 
 
 def left_out(figure: Figure) -> list[str]:

@@ -49,20 +49,20 @@ def test_parameters_of_robots_are_products_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             'name = "a"\nshadowing = [true, false]',
-            r"arms\.name: expected \{shadowing\} in it, as that is a list, got 'a'",
+            r"arms\.name: expected it to contain \{shadowing\}, which is a list, got 'a'",
         ),
-        ("shadowing = [true, false]", r"arms\.name: expected \{shadowing\} in it, as that is a list, got None"),
+        ("shadowing = [true, false]", r"arms\.name: expected it to contain \{shadowing\}, which is a list, got None"),
         ('name = "a {shadowing}"\nshadowing = [true, 3]', r"arms"),
         ('name = "a {shadowing}"\nshadowing = [true, true]', r"arms: expected each name once, got 'a-true' 2 times"),
         ('name = "a {delivery}"\ndelivery = []', r"arms.*delivery"),
         (f'name = "a {{percentiles}}"\npercentiles = [{"1, " * 1001}]', r"arms: expected at most 1,000, got 1,001"),
     ],
 )
-def test_what_is_no_grid_is_a_line(text: str, told: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidFile, match=told) as raised:
+def test_what_is_no_grid_is_a_line(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidFile, match=message) as raised:
         study(tmp_path, f"[[arms]]\n{text}\n")
     assert "\n" not in str(raised.value)

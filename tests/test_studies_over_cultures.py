@@ -71,16 +71,16 @@ def test_a_seed_of_too_many_digits_is_refused_as_such() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"seeds": "1-3", "seed": 2}, "seeds: expected seed or seeds"),
         ({"kind": "files", "files": ("a",), "folders": ("b",)}, "folders: expected files of one culture"),
-        ({"folders": ("b",)}, "files, folders: expected some for kind = 'files' only, got 1 for 'virtual'"),
+        ({"folders": ("b",)}, "files, folders: expected only with kind = 'files', got 1 for 'virtual'"),
         ({"kind": "files", "folders": ("b",), "seeds": "1-2"}, "seeds: expected only for a culture"),
     ],
 )
-def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], told: str) -> None:
-    with pytest.raises(InvalidArgument, match=told):
+def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidArgument, match=message):
         Source(**given)
 
 
@@ -128,15 +128,15 @@ def test_with_too_few_policies_larger_means_are_still_counted(found: list[tuple[
 @pytest.mark.parametrize("n", range(1, 12))
 def test_too_few_are_those_who_could_not_be_found_better_at_best(n: int) -> None:
     best = mannwhitneyu(np.arange(n), np.arange(n) + n, method="asymptotic").pvalue
-    told = outcome_of(compare(np.arange(n), np.arange(n) + n))
-    assert told == (SECOND if best < 0.01 else TOO_FEW)
+    outcome = outcome_of(compare(np.arange(n), np.arange(n) + n))
+    assert outcome == (SECOND if best < 0.01 else TOO_FEW)
 
 
-def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_culture_that_fails_is_reported_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
         if study.culture.seed == 2:
             raise UnusableData("recording 1: no responses")
-        return told_and_tables(study, folder)
+        return run_with_results(study, folder)
 
     monkeypatch.setattr(cultures, "run_study", ran)
     study = replace(read_study(TINY), culture=Source(seeds="1-3"))
@@ -162,7 +162,7 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     assert (tmp_path / cultures.MANIFEST).read_bytes() == before
 
 
-def told_and_tables(study: Study, folder: Path) -> StudyRun:
+def run_with_results(study: Study, folder: Path) -> StudyRun:
     results_file(folder).parent.mkdir(parents=True, exist_ok=True)
     rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
     write_typed(results_file(folder), Results((), rows, (), (), (), ()))
@@ -170,7 +170,7 @@ def told_and_tables(study: Study, folder: Path) -> StudyRun:
 
 
 def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The barrier lets nobody through before two are there; told in order, the whole never goes back."""
+    """The barrier lets nobody through before two are there; reported in order, the whole never goes back."""
     both, at_once, most = threading.Barrier(2, timeout=60), 0, 0
 
     def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> StudyRun:
@@ -181,19 +181,19 @@ def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeyp
         for done in range(4):
             progress.update(done, 3)
         at_once -= 1
-        return told_and_tables(study, folder)
+        return run_with_results(study, folder)
 
-    told: list[tuple[float, str]] = []
+    reports: list[tuple[float, str]] = []
     monkeypatch.setattr(cultures, "run_study", ran)
     monkeypatch.setattr(cultures, "find_gpu", lambda: None)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    whole = SimpleNamespace(update=lambda done, total, note="": told.append((done / total, note)))
+    whole = SimpleNamespace(update=lambda done, total, note="": reports.append((done / total, note)))
     found = run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-4")), tmp_path, progress=whole)
     assert list(found.finished) == ["culture-1", "culture-2", "culture-3", "culture-4"]
     assert most == 2
-    assert [share for share, _ in told] == sorted(share for share, _ in told)
-    assert told[-1] == (1.0, "4 of 4 cultures")
-    assert any(note.startswith("0 of 4 cultures; culture-") for _, note in told)
+    assert [share for share, _ in reports] == sorted(share for share, _ in reports)
+    assert reports[-1] == (1.0, "4 of 4 cultures")
+    assert any(note.startswith("0 of 4 cultures; culture-") for _, note in reports)
 
 
 def test_what_nobody_foresaw_ends_all_cultures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,9 +275,9 @@ def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     files = 'files = ["data/tiny"]'
     (tmp_path / "many.toml").write_text(TINY.read_text().replace(files, 'folders = ["one", "other"]'))
     assert main(["study", str(tmp_path / "many.toml"), "--out", str(tmp_path / "many"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["cultures"] == ["culture-one", "culture-other"]
-    assert {row["cultures"] for row in told["over_cultures"]} == {2}
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary["cultures"] == ["culture-one", "culture-other"]
+    assert {row["cultures"] for row in summary["over_cultures"]} == {2}
     alone = replace(read_study(TINY), culture=Source("files", files=("other",)))
     run_study(alone, tmp_path / "alone", base=tmp_path)
     both = (tmp_path / "many" / "culture-other", tmp_path / "alone")
@@ -293,7 +293,7 @@ def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     assert "failed: culture-missing" in err and "1 of 2 cultures failed" in err
 
 
-def test_results_that_cannot_be_read_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_that_cannot_be_read_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cultures, "run_study", lambda study, folder, **_: StudyRun(folder, folder, 1, {}))
     with pytest.raises(InvalidFile, match="results"):
         run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1")), tmp_path)

@@ -25,8 +25,8 @@ def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
         ours[at_min], theirs[at_min] = rng.normal(by, 10, (2, episodes)), rng.normal(0, 10, (1, episodes))
         parts.append(episode_rows(episodes_of(ours[at_min]), robot="cartpole", arm=arm.name, at_min=at_min))
         for agent, returns in ((HEURISTIC, theirs[at_min]), (RANDOM, np.full((1, episodes), -80.0))):
-            told = {"robot": "cartpole", "arm": "1-threshold", "agent": agent, "at_min": at_min}
-            parts.append(episode_rows(episodes_of(returns), **told))
+            columns = {"robot": "cartpole", "arm": "1-threshold", "agent": agent, "at_min": at_min}
+            parts.append(episode_rows(episodes_of(returns), **columns))
 
     table = pd.concat(parts)
     rows = tuple(compare_with_heuristic(study, table, spec))

@@ -27,7 +27,7 @@ def optimum(**changed: object) -> StudyOptimum:
 
 
 def found(coupled: np.ndarray, *optima: StudyOptimum) -> list[ReflexComparison]:
-    told = {"policy": POLICIES, RANDOM: RANDOMS, COUPLING: coupled}
+    returns_of = {"policy": POLICIES, RANDOM: RANDOMS, COUPLING: coupled}
     table = pd.concat(
         episode_rows(
             episodes_of(returns),
@@ -36,7 +36,7 @@ def found(coupled: np.ndarray, *optima: StudyOptimum) -> list[ReflexComparison]:
             agent=agent,
             at_min=0.0,
         )
-        for agent, returns in told.items()
+        for agent, returns in returns_of.items()
     )
     return list(compare_with_reflex(STUDY, table, STUDY.robots[0], optima))
 
@@ -80,9 +80,9 @@ def test_without_the_optimum_of_all_conditions_there_is_no_row(known: list[Study
     assert found(np.array([[40.0, 50.0]]), *known) == []
 
 
-def test_it_is_told_in_a_sentence() -> None:
-    (told,) = describe_reflexes(found(np.array([[45.0, 45.0]]), optimum()))
-    assert told == (
+def test_it_is_reported_in_a_sentence() -> None:
+    (sentence,) = describe_reflexes(found(np.array([[45.0, 45.0]]), optimum()))
+    assert sentence == (
         "cartpole, taught, at 0 min: the best reflex returns 45.0; the task needs more; "
         "the policies' context score is 0.62."
     )

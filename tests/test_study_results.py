@@ -144,8 +144,8 @@ def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_ar
     score = Score("rover", "one", "none", 0.0, 1, 2, 3.0, None, 3.0, *5 * [None])
     results = Results((score,), (), (), (), (), ())
     write_typed(tmp_path / "results.json", results)
-    told = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
-    assert told["scores"][0]["low_95"] is None
+    data = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+    assert data["scores"][0]["low_95"] is None
     assert read_typed(tmp_path / "results.json", Results) == results
 
 
@@ -223,7 +223,7 @@ def optima_of(folder: Path, name: str = "optima") -> tuple[StudyOptimum, ...]:
 
 
 @pytest.mark.oracle
-def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
+def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_named(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     series = extract_series(read_recordings(recorded / "recordings"))

@@ -156,26 +156,16 @@ def _learning_decisions(study: Study) -> Iterator[tuple[str, str]]:
         "much of the episode is left, so that a time limit ends the return they learn; policies do not.",
     )
     if study.actions == "most probable":
-        yield (
-            "Most probable actions",
-            "The paper does not say whether policies draw their actions when they are evaluated. Here they take the "
-            "most probable one.",
-        )
+        actions, here = "Most probable actions", "take the most probable one"
+        untrained = "Taking the most probable one turns each into a fixed rule, which can do worse than random actions."
     else:
-        yield (
-            "Drawn actions",
-            "The paper does not say whether policies draw their actions when they are evaluated. Here they do.",
-        )
+        actions, here, untrained = "Drawn actions", "do", "They act almost at random."
+    yield actions, f"The paper does not say whether policies draw their actions in evaluation. Here they {here}."
     if any(not arm.trained for arm in study.arms):
         yield (
             "Before training",
             "The policies before training are networks with random initial weights: all actions are nearly equally "
-            "probable. "
-            + (
-                "Taking the most probable one turns each into a fixed rule, which can do worse than random actions."
-                if study.actions == "most probable"
-                else "They act almost at random."
-            ),
+            f"probable. {untrained}",
         )
 
 

@@ -89,10 +89,10 @@ class Control(StudyTask):
         minutes = study.optimum_minutes(first, last) if arm.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
-            answering = setting.simulator(at_min)
-            for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
+            simulator = setting.simulator(at_min)
+            for each in controls_of(setting.environment, simulator, setting.action_labels, networks, study.policies):
                 seed = draw_seed(study.seed, robot, name, at_min, _SEED_NAMES.get(each.name, each.name))
-                within = each.within(setting.environment, answering)
+                within = each.within(setting.environment, simulator)
                 ran = roll_out(*within, each.actor, each.n_actors, episodes=study.episodes, seed=seed)
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:

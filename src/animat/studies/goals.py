@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 
 from animat.goals.robot import RobotWithGoal
-from animat.report.html import Table
+from animat.report.html import Table, table_of
 from animat.report.results import ObjectiveMet
 from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame
 from animat.studies.specification import Study
@@ -27,11 +28,11 @@ def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
 
 def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
     """One row for each objective, arm and control."""
-    names = ("robot", "arm", "agent", "at_min", "episodes", "success_share", "margin", "objective", "satisfaction")
-    return Table(
+    names = ("robot", "arm", "agent", "at (min)", "episodes", "success", "margin", "objective", "satisfied (%)")
+    return table_of(
         "Goals",
-        ("robot", "arm", "agent", "at (min)", "episodes", "success", "margin", "objective", "satisfied (%)"),
-        tuple(tuple(getattr(row, name) for name in names) for row in rows),
+        rows,
+        [*zip(names, (field.name for field in fields(ObjectiveMet)), strict=True)],
         note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
         "goal, or from meeting it, in scales of the quantities; above 0 it succeeded.",
         beside="tables/goals.csv",

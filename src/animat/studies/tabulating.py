@@ -1,4 +1,4 @@
-"""The study's results as tables: scores of every arm, comparisons, controls, learning curves, the culture."""
+"""The study's results as tables: scores, comparisons, controls, learning curves, controllability, findings."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from animat.writing import atomic_write
 T = TypeVar("T")
 
 LEVEL = 0.01
-"""The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
+"""The p below which an arm counts as better: by the normal approximation and uncorrected, as in the paper."""
 
 LEFT_OUT = "left-out"
-"""The finding that a robot cannot do something, which the study is without."""
+"""The finding that the study lacks something, as a robot cannot do it."""
 
 CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 
@@ -46,7 +46,7 @@ CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 @final
 @dataclass(frozen=True)
 class Tabulate(StudyTask):
-    """Summarise the table of episodes and write `tables/`: results for the tasks that show them, all else as CSV."""
+    """Summarise the table of episodes and write `tables/`: typed results for later tasks, and everything as CSV."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
@@ -67,18 +67,18 @@ class Tabulate(StudyTask):
         files = [write_typed(results_file(folder), results)]
         for name, kinds in get_type_hints(Results).items():
             rows = getattr(results, name)
-            # Findings have columns of their own, and most studies have no goals.
+            # Findings have other columns, below, and most studies have no goals.
             if name != "findings" and (rows or name != "goals"):
                 files.append(write_records(table_file(folder, name), get_args(kinds)[0], rows))
-        told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
-        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
+        findings = ((finding.severity, finding.name, finding.message) for finding in results.findings)
+        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), findings))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             rows = (
-                (at_min, *told)
+                (at_min, *shares)
                 for at_min, kept in controllability(timeline).items()
-                for told in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True)
+                for shares in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True)
             )
             files.append(write_table(table_file(folder, "controllability"), head, rows))
         with atomic_write(table_file(folder, "episodes")) as beside:
@@ -100,16 +100,16 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
         yield from timeline.findings
     for optimum in optima:
         where = f"{optimum.robot}, {mapping_label(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
-        for told in optimum.findings():
-            yield replace(told, message=f"{where}: {told.message}")
+        for finding in optimum.findings():
+            yield replace(finding, message=f"{where}: {finding.message}")
     for message in missing_capabilities(study):
         yield Finding(LEFT_OUT, "note", message)
 
 
 class References:
-    """Random policies and optimal returns on a robot, for every mapping and minute, by the table of its episodes.
+    """Mean returns of random actions and optimal returns on a robot, for every mapping and minute.
 
-    Over time: of the few episodes at every recording, with the optimum on a rough grid.
+    With `over_time`: of the few episodes at every recording, with the optimum on a rough grid.
     """
 
     def __init__(
@@ -128,16 +128,14 @@ class References:
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._of(self._random, arm, at_min)
+        return self._find(self._random, arm, at_min)
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """None for a control, which can do nothing, and where conditions with few responses were left out of it."""
-        if arm.delivery == "shuffled":
-            return None
-        return self._of(self._optima, arm, at_min)
+        """The optimal return; None for the control, which has none, and where it leaves out conditions."""
+        return None if arm.delivery == "shuffled" else self._find(self._optima, arm, at_min)
 
     def score(self, arm: Arm, at_min: float, mean: float) -> float | None:
-        """The normalised score; None where nothing can be learned."""
+        """The normalised score; None if it is not known, or nothing can be learned."""
         random, optimum = self.random(arm, at_min), self.optimum(arm, at_min)
         if random is None or optimum is None or optimum.best_return is None:
             return None
@@ -147,7 +145,7 @@ class References:
             return None
 
     @staticmethod
-    def _of(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
+    def _find(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
         if arm.through_neurons:
             return known.get((*arm.kind, at_min))
         # Without neurons every minute is the same.
@@ -157,13 +155,13 @@ class References:
 def performances(
     table: DataFrame, robot: str, arm: Arm, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
-    """Each policy's mean return over its first `episodes` at a minute, or all: the paper's measure of a policy."""
+    """Each policy's mean return over its first `episodes`, or all, at a minute: the paper's measure of a policy."""
     of_robot = table[(table["robot"] == robot) & (table["arm"] == arm.name) & (table["agent"] == POLICY)]
     return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
 
 
 def _known(end: float) -> float | None:
-    """The end of an interval; one policy on a robot whose returns have no bounds leaves none."""
+    """An end of an interval; None if it is infinite, as for one policy on a robot with unbounded returns."""
     return end if math.isfinite(end) else None
 
 
@@ -204,19 +202,19 @@ FIRST, SECOND, NONE, TOO_FEW = (
 )
 
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
-"""Of each outcome, whether it is the paper's, in which the second arm was always the better."""
+"""Whether each outcome agrees with the paper, in which the second arm was always better."""
 
 
-def outcome_of(told: Comparison) -> str:
-    """In words: which arm is better, that neither was found to be, or that it could not have been found."""
-    if told.p_normal < LEVEL:
-        return SECOND if told.effect.value > 0 else FIRST
-    # With four policies per side even U = 0 has p = 0.03: nothing could be found, which says nothing of a difference.
-    return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
+def outcome_of(comparison: Comparison) -> str:
+    """Which arm is better, that no difference was found, or that none could have been found."""
+    if comparison.p_normal < LEVEL:
+        return SECOND if comparison.effect.value > 0 else FIRST
+    # With four policies per side even U = 0 has p = 0.03, so no difference could have been found.
+    return NONE if p_of_u(0.0, comparison.n_first, comparison.n_second) < LEVEL else TOO_FEW
 
 
 def _optimum_error(optimum: StudyOptimum | None) -> float | None:
-    """How far the optimal return may lie from its value: by the grid, or down to the controller's return."""
+    """The possible error of the optimal return: that of the grid, or the distance to the controller's return."""
     if optimum is None or optimum.grid_error is None:
         return None
     return max(optimum.grid_error, *(abs(each.value or 0.0) for each in optimum.findings()), 0.0)
@@ -232,11 +230,11 @@ def _comparisons(
         for spec in study.robots:
             a, b = (performances(table, spec.name, side, at_min, compared.episodes) for side in sides)
             made.append((compared, spec.name, sides, at_min, a, b, compare(a, b)))
-    corrected = holm({f"{compared.name}/{robot}": told.p_normal for compared, robot, *_, told in made})
-    for compared, robot, (first, second), at_min, a, b, told in made:
+    corrected = holm({f"{compared.name}/{robot}": test.p_normal for compared, robot, *_, test in made})
+    for compared, robot, (first, second), at_min, a, b, test in made:
         known = references[robot]
         printed = PRINTED.get((compared.name, robot)) if study.paper else None
-        outcome = outcome_of(told)
+        outcome = outcome_of(test)
         optima = [known.optimum(arm, at_min) for arm in (first, second)]
         yield ComparedReturns(
             comparison=compared.name,
@@ -255,13 +253,13 @@ def _comparisons(
             optimum_second=None if optima[1] is None else optima[1].best_return,
             optimum_error_first=_optimum_error(optima[0]),
             optimum_error_second=_optimum_error(optima[1]),
-            u=told.u,
-            p_normal=told.p_normal,
-            p_exact=told.p_exact,
+            u=test.u,
+            p_normal=test.p_normal,
+            p_exact=test.p_exact,
             p_holm=corrected[f"{compared.name}/{robot}"],
-            effect=told.effect.value,
-            effect_low_95=told.effect.low,
-            effect_high_95=told.effect.high,
+            effect=test.effect.value,
+            effect_low_95=test.effect.low,
+            effect_high_95=test.effect.high,
             outcome=outcome,
             paper_u=None if printed is None else printed.u,
             paper_p=None if printed is None else printed.p,
@@ -281,7 +279,7 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
                     rows.append((f"{TRAINED}{arm.name}", len(means), means))
             for agent, of_agent in of_minute.groupby("agent", sort=False):
                 means = mean_returns(of_agent)
-                # Over actors, as each is one sample; a control of one actor has its episodes for samples.
+                # Each actor is one sample; for a single actor, each of its episodes is.
                 rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
             optimum = known.optimum(kind, at_min)
             for name, actors, samples in rows:
@@ -313,5 +311,5 @@ def _curves(study: Study, folder: Path) -> Iterator[tuple[Any, ...]]:
         for arm in (arm for arm in study.arms if arm.trained):
             for i, curve in enumerate(learning_of(study, folder, spec, arm).tolist()):
                 for iterations, episodes, mean in curve:
-                    told = int(iterations), int(episodes), None if np.isnan(mean) else mean
-                    yield spec.name, arm.name, f"p{i}", *told
+                    row = int(iterations), int(episodes), None if np.isnan(mean) else mean
+                    yield spec.name, arm.name, f"p{i}", *row
