@@ -1,4 +1,4 @@
-"""The context study: what its page says of made-up numbers, and a small one from a culture to the page."""
+"""The context study: its page for synthetic numbers, and a small study from a culture to the page."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: P
         assert all((tmp_path / f"{name}.{ending}").stat().st_size > 1000 for ending in ("png", "svg", "pdf"))
 
 
-def test_where_no_optimal_return_is_known_it_says_at_least(tmp_path: Path) -> None:
+def test_without_an_optimal_return_values_are_marked_as_lower_bounds(tmp_path: Path) -> None:
     interval = {"score_low_95": 0.5, "score_high_95": 0.7, "gap_low_95": 0.7, "gap_high_95": 0.9}
     known = {"random": -80.0, "policies": 10.0, "best_known": 20.0, "gap": 0.8, "score": 0.6}
     of_robot = (row(1, "detour", **interval, **known), row(2, "detour", **interval, **known | {"gap": 0.75}))

@@ -60,7 +60,7 @@ def test_the_second_is_better_where_its_returns_are_larger() -> None:
     assert AS_IN_PAPER[SECOND] == "yes" and AS_IN_PAPER[FIRST] == AS_IN_PAPER[NONE] == "no"
 
 
-def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
+def test_few_policies_count_neither_for_nor_against_the_paper() -> None:
     """Four that are all better have p = 0.03."""
     assert outcome_of(compare(np.arange(4.0), np.arange(4.0) + 100)) == TOO_FEW
     assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
@@ -70,7 +70,7 @@ def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
     assert "With so few policies it is not known" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
 
 
-def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
+def test_differing_comparisons_are_named_with_their_outcomes() -> None:
     rows = [replace(ROW, robot=robot, outcome=outcome) for robot, outcome in (("arm", NONE), ("wheels", FIRST))]
     words = _as_in_paper([replace(ROW, as_in_paper="yes"), *rows, replace(ROW, second="c")])
     assert words.startswith("1 of 4 comparisons agrees with the paper")
@@ -81,7 +81,7 @@ def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
     )
 
 
-def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
+def test_every_arm_and_every_difference_between_two_is_explained() -> None:
     study = paper_study()
     shown = dict(arms_table(study).rows)
     assert list(shown) == [arm.name for arm in study.arms]
@@ -102,7 +102,7 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     assert [each.split("”")[0] for each in parts["linear"]] == ["In “linear", "In “1 threshold"]
 
 
-def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
+def test_over_cultures_a_difference_is_explained_only_once() -> None:
     names = [("control and 1 threshold", robot) for robot in ("cartpole", "navigation")]
     rows = [OverCultures(*name, 4, 1.0, 2.0, 1.0, None, None, larger_in=4, holds_in=4, tested=4) for name in names]
     section = _summary(paper_study(), CulturesRun(Path(), {}, {}, {}, tuple(rows), None))
@@ -112,7 +112,7 @@ def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
     assert section.tables[0].title == "The arms"
 
 
-def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
+def test_an_outcome_that_does_not_hold_after_correction_says_so() -> None:
     rows = [
         replace(ROW, outcome=outcome, p_holm=p_holm)
         for outcome, p_holm in ((SECOND, 0.005), (SECOND, 0.05), (FIRST, 0.05), (NONE, 1.0))
@@ -122,14 +122,14 @@ def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
     assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
 
 
-def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
+def test_not_finding_a_difference_is_not_called_no_difference() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
 
 
 # --- what an optimum says --------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_knows_what_its_optimum_says() -> None:
+def test_a_comparison_is_explained_by_its_optima() -> None:
     assert "other way round" in explain(ROW)
     assert "use more policies" in explain(replace(ROW, n=4))
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
@@ -147,19 +147,19 @@ def test_there_is_room_as_long_as_the_second_optimum_is_far_above_the_first_arm(
     assert "at its optimum" not in explain(replace(row, score_second=0.96))
 
 
-def test_optima_are_in_order_only_where_they_lie_apart_by_more_than_their_errors() -> None:
+def test_optima_are_ordered_only_if_they_differ_by_more_than_their_errors() -> None:
     close = replace(ROW, optimum_first=119.95, optimum_second=119.94, optimum_error_first=0.4, optimum_error_second=2.2)
     assert "other way round" not in explain(close)
     assert "same within their errors" in explain(close)
     assert "other way round" in explain(replace(close, optimum_first=122.6))
 
 
-def test_a_control_is_given_no_optimum() -> None:
+def test_a_control_has_no_optimum() -> None:
     words = explain(replace(ROW, optimum_first=None, optimum_error_first=None))
     assert "a cannot do better than random actions" in words and "for a" not in words
 
 
-def test_what_binning_takes_is_said_where_it_takes_something() -> None:
+def test_a_loss_by_binning_is_reported_only_where_there_is_one() -> None:
     ((_, words),) = differing_comparisons([ROW], {0.0: 0.5, 140.0: 0.02})
     assert "binning" not in words and "none found" in words
     ((_, words),) = differing_comparisons([ROW], {140.0: 0.21})
@@ -170,7 +170,7 @@ def test_what_binning_takes_is_said_where_it_takes_something() -> None:
 # --- decisions are the study's ---------------------------------------------------------------------------------------
 
 
-def test_decisions_of_the_papers_study_are_those_of_its_own() -> None:
+def test_decisions_of_the_papers_study() -> None:
     decided = dict(decisions(paper_study()))
     assert {"Ten levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
             "Most probable actions", "Walls", "Before training"} <= set(decided)  # fmt: skip
@@ -330,7 +330,7 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
     assert "1 more conditions are in the file" in table.note
 
 
-def test_every_mapping_has_optima_of_its_own_over_time() -> None:
+def test_every_mapping_has_its_own_optima_over_time() -> None:
     study = paper_study()
     assert [kind.mapping for kind in kinds_of(study)] == ["1-threshold", "9-thresholds", "linear", "none"]
     assert [kind.mapping for kind in rough_kinds(study)] == ["1-threshold", "9-thresholds"]
@@ -398,7 +398,7 @@ def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
     assert legend(figure) == said
 
 
-def test_on_a_telephone_the_headline_fits_its_width(tmp_path: Path) -> None:
+def test_on_a_phone_the_headline_fits_the_screen(tmp_path: Path) -> None:
     rows = [
         (score(robot, arm, 5.0, 4.0, 6.0, 0.0, 10.0), np.array([3.0, 7.0]))
         for robot in ("cartpole", "navigation", "swing-up")
@@ -442,7 +442,7 @@ def test_files_that_a_page_names_are_links() -> None:
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
 
 
-def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> None:
+def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> None:
     minutes = np.array([0.0, 10.0])
     courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(6))
     panels = [

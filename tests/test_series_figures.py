@@ -1,4 +1,4 @@
-"""The figures of a series show what is in it: marks are counted and numbers read back from the axes."""
+"""The figures of a series: marks are counted and numbers read back from the axes."""
 
 from __future__ import annotations
 

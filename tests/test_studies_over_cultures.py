@@ -1,4 +1,4 @@
-"""Studies over many cultures: each as if it were alone, one that fails stops no other, and what holds over all."""
+"""Studies over many cultures: each runs as if alone, a failure stops no other, and there are results over all."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def compared(first: float, second: float, outcome: str) -> ComparedReturns:
 
 
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 30)), min_size=1, max_size=6))
-def test_seeds_are_what_their_ranges_hold(ranges: list[tuple[int, int]]) -> None:
+def test_ranges_of_seeds_are_expanded(ranges: list[tuple[int, int]]) -> None:
     text = ", ".join(f"{first}-{first + more}" if more else f"{first}" for first, more in ranges)
     expected = [seed for first, more in ranges for seed in range(first, first + more + 1)]
     if len(set(expected)) < len(expected):
@@ -60,7 +60,7 @@ def test_seeds_are_what_their_ranges_hold(ranges: list[tuple[int, int]]) -> None
 
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1;2", "1-2000", "1.5"])
-def test_what_is_no_range_of_seeds_is_refused(text: str) -> None:
+def test_text_other_than_ranges_of_seeds_is_refused(text: str) -> None:
     with pytest.raises(InvalidArgument, match="seeds: expected"):
         Source(seeds=text)
 
@@ -126,7 +126,7 @@ def test_with_too_few_policies_larger_means_are_still_counted(found: list[tuple[
 
 
 @pytest.mark.parametrize("n", range(1, 12))
-def test_too_few_are_those_who_could_not_be_found_better_at_best(n: int) -> None:
+def test_policies_are_too_few_if_even_the_best_outcome_is_not_significant(n: int) -> None:
     best = mannwhitneyu(np.arange(n), np.arange(n) + n, method="asymptotic").pvalue
     outcome = outcome_of(compare(np.arange(n), np.arange(n) + n))
     assert outcome == (SECOND if best < 0.01 else TOO_FEW)
@@ -196,7 +196,7 @@ def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeyp
     assert any(note.startswith("0 of 4 cultures; culture-") for _, note in reports)
 
 
-def test_what_nobody_foresaw_ends_all_cultures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_ends_all_cultures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As Ctrl-C does: the others are stopped at their next report, and no more are begun."""
     begun, running = [], threading.Event()
 

@@ -1,4 +1,4 @@
-"""What a study says of its policies beside the heuristic policy, for returns whose order is known."""
+"""How a study compares its policies with the heuristic policy, for returns whose order is known."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.tabulating import performances
 
 
-def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
+def test_policies_that_do_not_outperform_the_heuristic_are_named() -> None:
     spec, arm = RobotSpec("cartpole"), Arm("1 threshold")
     without = Arm("without neurons", mapping="none", trained=False)
     study = Study(robots=(spec,), arms=(arm, without))

@@ -1,4 +1,4 @@
-"""A study's policies beside the best coupling: gap and score are what their formulas make of the episodes."""
+"""A study's policies against the best coupling: gap and score follow their formulas."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_without_the_optimum_of_all_conditions_there_is_no_row(known: list[Study
     assert found(np.array([[40.0, 50.0]]), *known) == []
 
 
-def test_it_is_reported_in_a_sentence() -> None:
+def test_gap_and_score_are_reported_in_a_sentence() -> None:
     (sentence,) = describe_reflexes(found(np.array([[45.0, 45.0]]), optimum()))
     assert sentence == (
         "cartpole, taught, at 0 min: the best reflex returns 45.0; the task needs more; "

@@ -1,4 +1,4 @@
-"""What a study's tables say: of returns whose order is known, of episodes run apart, and of a real recording."""
+"""A study's tables: for returns whose order is known, for episodes run separately, and for a real recording."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from animat.studies.results import read_typed, write_typed
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
-from animat.studies.tabulating import References, Tabulate, _known
+from animat.studies.tabulating import References, Tabulate, _finite
 from animat.studies.task import draw_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -140,7 +140,7 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
 
 
 def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_are_json(tmp_path: Path) -> None:
-    assert [_known(end) for end in (-np.inf, 1.5, np.inf)] == [None, 1.5, None]
+    assert [_finite(end) for end in (-np.inf, 1.5, np.inf)] == [None, 1.5, None]
     score = Score("rover", "one", "none", 0.0, 1, 2, 3.0, None, 3.0, *5 * [None])
     results = Results((score,), (), (), (), (), ())
     write_typed(tmp_path / "results.json", results)

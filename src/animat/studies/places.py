@@ -13,17 +13,8 @@ RESPONSES = "simulators/responses.csv"
 REPORT = "report.html"
 RECEIPTS = "jobs"
 OWN_FOLDERS = (
-    RECORDINGS,
-    "simulators",
-    "policies",
-    "episodes",
-    "controls",
-    "optima",
-    "tables",
-    "figures",
-    RECEIPTS,
-    UNFINISHED,
-)
+    RECORDINGS, "simulators", "policies", "episodes", "controls", "optima", "tables", "figures", RECEIPTS, UNFINISHED,
+)  # fmt: skip
 """All folders that a study makes in its folder; its other files are the report, the specification and its manifest."""
 
 

@@ -160,7 +160,7 @@ def performances(
     return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
 
 
-def _known(end: float) -> float | None:
+def _finite(end: float) -> float | None:
     """An end of an interval; None if it is infinite, as for one policy on a robot with unbounded returns."""
     return end if math.isfinite(end) else None
 
@@ -186,8 +186,8 @@ def _scores(
                     mean_return=mean,
                     standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
                     interquartile_mean=middle.value,
-                    low_95=_known(middle.low),
-                    high_95=_known(middle.high),
+                    low_95=_finite(middle.low),
+                    high_95=_finite(middle.high),
                     random=known.random(arm, at_min),
                     optimum=None if optimum is None else optimum.best_return,
                     normalised_score=known.score(arm, at_min, mean),
