@@ -587,7 +587,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
         for ending in ("png", "svg", "pdf"):
             assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
         assert f'href="figures/{stem}.svg"' in page
-    # The headline has another one for telephones.
+    # The headline has a second one for phones.
     assert page.count("<img ") == page.count("data:image/png;base64,") - 1 == len(expected)
     tables = ("Comparisons", "Every arm", "Optimal returns", "Controllability of every recording")
     for title in (*tables, "Controls"):
@@ -596,8 +596,8 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     for decision in ("20 iterations", "Walls", "Histogram range", "Most probable actions", "Bursts", "Policies"):
         assert f"<dt>{decision}</dt>" in page
     assert 'all are in <a href="tables/findings.csv">tables/findings.csv</a>.' in page
-    assert "where the files are found under the same paths from where study.toml lies." in page
-    assert "Right of the dashed threshold a response counts as one, as in the last panel." in page
+    assert "provided that the files are at the same paths relative to study.toml." in page
+    assert "A response to the right of the dashed threshold counts as a burst, as in the last panel." in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "heuristic", "reflexes", "learning-curves", "optima", "controllability",
