@@ -447,7 +447,7 @@ def test_an_episode_of_two_commands_is_kept_whole() -> None:
     environment = WithoutNeurons(robot, None)
     kept = record_paths(environment, None, Uniform(), 2, seed=3)
     assert kept.commands.shape == (2, 20, 2) and kept.observations.shape == (2, 21, 2)
-    for actor, (observations, commands) in enumerate(kept.whole()):
+    for actor, (observations, commands) in enumerate(kept.episodes()):
         body = Bodies(robot, [(3, actor)])
         body.begin()
         for seen, command in zip(observations[1:], commands, strict=True):

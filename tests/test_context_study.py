@@ -1,4 +1,4 @@
-"""The context study: what its page says of made-up numbers, and a small one from a culture to the page."""
+"""The context study: its page for synthetic numbers, and a small study from a culture to the page."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.progress import Silent
 from animat.report.results import ContextRow, LostRow
 from animat.stimulation.protocol import CLOSED_LOOP, TWO_COMMANDS
-from animat.studies.context import RanContext, plan_context_study, run_context_study
-from animat.studies.context_page import in_short, write_context_page
-from animat.studies.context_tasks import ContextStudy, RecordCulture, presented_for
+from animat.studies.context import ContextRun, plan_context_study, run_context_study
+from animat.studies.context_page import summarise_robot, write_context_page
+from animat.studies.context_tasks import ContextStudy, RecordCulture, protocol_for
 
 
 def row(culture: int, robot: str, **known: Any) -> ContextRow:
@@ -40,7 +40,7 @@ def rows() -> tuple[ContextRow, ...]:
 
 
 def test_what_holds_is_counted_over_cultures() -> None:
-    needs, cartpole = in_short(rows()[:2]), in_short(rows()[2:])
+    needs, cartpole = summarise_robot(rows()[:2]), summarise_robot(rows()[2:])
     assert needs == (
         "A reflex leaves half of the task or more undone on 1 of 2 cultures (context gap 0.40 to 0.70). The policies "
         "do significantly more than the best reflex on 1 of 2 (context score 0.10 to 0.90)."
@@ -54,31 +54,31 @@ def test_what_holds_is_counted_over_cultures() -> None:
 def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: Path) -> None:
     study = ContextStudy(cultures=(1, 2), robots=("shuttle", "cartpole"))
     lost = tuple(LostRow(c, r, "silent", 20.0, 60.0, 50.0, 70.0) for c in (1, 2) for r in study.robots)
-    page = write_context_page(study, RanContext(tmp_path, rows(), lost, {}))
+    page = write_context_page(study, ContextRun(tmp_path, rows(), lost, {}))
     text = page.read_text()
-    assert "0.900 (0.700 to 1.10)" in text and in_short(rows()[:2]) in text
+    assert "0.900 (0.700 to 1.10)" in text and summarise_robot(rows()[:2]) in text
     # 60 of the 80 that the policies have over random stimuli.
     assert re.search(r"silent</t[dh]>\s*<td[^>]*>0.750</td>\s*<td[^>]*>0.750</td>", text)
     for name in ("context", "whose-work"):
         assert all((tmp_path / f"{name}.{ending}").stat().st_size > 1000 for ending in ("png", "svg", "pdf"))
 
 
-def test_where_no_optimal_return_is_known_it_says_at_least(tmp_path: Path) -> None:
+def test_without_an_optimal_return_values_are_marked_as_lower_bounds(tmp_path: Path) -> None:
     interval = {"score_low_95": 0.5, "score_high_95": 0.7, "gap_low_95": 0.7, "gap_high_95": 0.9}
     known = {"random": -80.0, "policies": 10.0, "best_known": 20.0, "gap": 0.8, "score": 0.6}
     of_robot = (row(1, "detour", **interval, **known), row(2, "detour", **interval, **known | {"gap": 0.75}))
-    assert in_short(of_robot) == (
+    assert summarise_robot(of_robot) == (
         "A reflex leaves half of the task or more undone on 2 of 2 cultures (context gap at least 0.75 to 0.80). The "
         "policies do significantly more than the best reflex on 2 of 2 (context score at least 0.60)."
     )
     study = ContextStudy(cultures=(1, 2), robots=("detour",))
-    text = write_context_page(study, RanContext(tmp_path, of_robot, (), {})).read_text()
+    text = write_context_page(study, ContextRun(tmp_path, of_robot, (), {})).read_text()
     assert "≥ 20<" in text and "≥ 0.80" in text and "≥ 0.600 (0.500 to 0.700)" in text
 
 
 def test_robots_with_more_commands_than_two_are_refused() -> None:
     assert ContextStudy(robots=("wheels", "detour", "arm"))
-    with pytest.raises(InvalidArgument, match="robots: expected ones in JAX with one or two commands, got 'gymnasium:"):
+    with pytest.raises(InvalidArgument, match="robots: expected JAX robots with one or two commands, got 'gymnasium:"):
         ContextStudy(robots=("gymnasium:Pendulum-v1",))
 
 
@@ -150,4 +150,4 @@ def test_robots_with_two_commands_have_recordings_of_their_own(tmp_path: Path) -
     assert isinstance(one, RecordCulture) and isinstance(two, RecordCulture)
     assert (one.n_commands, two.n_commands) == (1, 2)
     assert one.recordings(tmp_path, 1) != two.recordings(tmp_path, 2)
-    assert presented_for(1) == CLOSED_LOOP and presented_for(2) == TWO_COMMANDS
+    assert protocol_for(1) == CLOSED_LOOP and protocol_for(2) == TWO_COMMANDS

@@ -1,4 +1,4 @@
-"""Films of sessions and of policies: what is in the log is what is shown, in real time."""
+"""Films of sessions and of policies: they show what is in the log, in real time."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path, pause_s
         assert film(tmp_path, "--out", tmp_path / "a.gif", "--span-s", 0.5, 1) == 0
 
 
-def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:
+def test_a_span_equals_that_part_of_the_whole(folder: Path) -> None:
     whole = scene_of_session(folder)
     start_s, stop_s = 0.5 * whole.stop_s, 0.7 * whole.stop_s
     scene = scene_of_session(folder, (start_s, stop_s))
@@ -116,13 +116,13 @@ def test_a_span_is_what_the_whole_has_of_it(folder: Path) -> None:
     assert scene.moments[0].iteration == -1 and scene.moments[0].time_s <= start_s
 
 
-def test_a_gif_lasts_as_long_as_what_it_shows_and_moves(
+def test_a_gif_lasts_as_long_as_its_span_and_moves(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "film.gif"
     assert film(folder, "--out", out, "--span-s", 1, 3, "--json") == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation", "lost_bytes": 0}
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary == {"film": str(out), "span_s": [1.0, 3.0], "robot": "navigation", "lost_bytes": 0}
     durations_ms, pictures = [], []
     with Image.open(out) as gif:
         assert gif.size == (WIDTH_PX, HEIGHT_PX)
@@ -146,7 +146,7 @@ def test_an_mp4_has_as_many_pictures_as_it_should(folder: Path, tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
-def test_of_a_killed_session_what_is_there_is_shown(
+def test_a_killed_session_is_shown_as_far_as_it_got(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = (folder / LOG_FILE).read_bytes()
@@ -207,7 +207,7 @@ def test_a_film_without_neurons_has_no_panel_of_responses(monkeypatch: pytest.Mo
     ]
 
 
-def test_what_cannot_be_filmed_is_one_line_and_leaves_nothing(
+def test_what_cannot_be_filmed_is_an_error_in_one_line_and_leaves_nothing(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (none := tmp_path / "none").mkdir()

@@ -26,7 +26,7 @@ from animat.goals.robot import with_goal
 from animat.reality_gap.session_responses import outcomes
 from animat.responses.condition import Condition
 from animat.robots import Cartpole, Navigation
-from animat.studies.episodes import read_episodes, tabulated, write_episodes
+from animat.studies.episodes import episode_rows, read_episodes, write_episodes
 from animat.studies.folder import describe_study
 from animat.studies.goals import goals_met
 from animat.studies.specification import Arm, RobotSpec, Study
@@ -132,7 +132,7 @@ def test_a_study_tabulates_how_far_each_objective_was_met(tmp_path: Path) -> Non
             WithoutNeurons(spec.robot(), (-0.1, 0.1)), None, Constant(jnp.array([0, 1])), 2, episodes=2, seed=1
         )
         told = {"robot": spec.name, "arm": "a", "at_min": 0.0}
-        parts.append(write_episodes(tmp_path / f"{spec.name}.npz", [tabulated(ran[spec.name], **told)]))
+        parts.append(write_episodes(tmp_path / f"{spec.name}.npz", [episode_rows(ran[spec.name], **told)]))
     table = read_episodes(parts)
     rows = list(goals_met(Study(robots=specs, arms=(Arm("a"),)), table))
     assert [(row.robot, row.objective) for row in rows] == [("cartpole", each) for each in goal.split("; ")]

@@ -452,7 +452,7 @@ def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> 
     said = dict(decisions(replace(paper_study(), simulators=Simulators(kind=kind))))
     words = {
         "histogram": "20 bins are percentiles",
-        "empirical": "there are none",
+        "empirical": "there are no bins",
         "memory": "similar history is drawn",
     }
     for other, message in words.items():

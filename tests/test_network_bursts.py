@@ -47,7 +47,7 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     inspection = inspect_recording(source)
     assert inspection.spontaneous_rate_hz == pytest.approx(len(source.spike_times_s) / 300 / 40)
     text = inspection_text(inspection)
-    assert "0.6 Hz per channel" in text and "3 network bursts (0.6 a minute)" in text
+    assert "0.6 Hz per channel" in text and "3 network bursts (0.6 per minute)" in text
     figure = draw_spontaneous(source, find_network_bursts(source))
     assert figure.axes[0].get_xlim() == (0.0, 300.0)
     assert figure.axes[0].collections[0].get_offsets().shape[0] == len(source.spike_times_s)
@@ -59,9 +59,9 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     assert [file.name for file in (tmp_path / "figures").iterdir()] == ["a-raster.png"]
 
 
-def test_one_burst_is_told_in_the_singular_and_wide_bins_are_said() -> None:
+def test_one_burst_is_reported_in_the_singular_and_wide_bins_are_stated() -> None:
     text = inspection_text(inspect_recording(spontaneous([100.1])))
-    assert "  1 network burst (" in text and "(median) holds " in text and "in bins of" not in text
+    assert "  1 network burst (" in text and "(median) contains " in text and "in bins of" not in text
     # Of 50 ms there would be more than ten million.
     long = recording([(t, 0) for t in np.arange(0.0, 1e6, 100.0)], [], 4, 1e6)
-    assert "looked for in bins of 0.1 s" in inspection_text(inspect_recording(long))
+    assert "detected in bins of 0.1 s" in inspection_text(inspect_recording(long))

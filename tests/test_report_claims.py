@@ -22,18 +22,18 @@ from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
-from animat.studies.arms import arms_shown, what_parts
+from animat.studies.arms import arm_differences, arms_table
 from animat.studies.captions import CULTURE
-from animat.studies.cultures import RanCultures
-from animat.studies.cultures_page import _in_short
-from animat.studies.differences import came_out_otherwise, decisions, explain
+from animat.studies.cultures import CulturesRun
+from animat.studies.cultures_page import _summary
+from animat.studies.differences import decisions, differing_comparisons, explain
 from animat.studies.optima import kinds_of, rough_kinds
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
 from animat.studies.publishing import _as_in_paper, _facts_of_culture
+from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
-from animat.studies.shown import comparisons_shown, controllability_shown
 from animat.studies.source import Source
 from animat.studies.specification import Arm, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
@@ -60,20 +60,20 @@ def test_the_second_is_better_where_its_returns_are_larger() -> None:
     assert AS_IN_PAPER[SECOND] == "yes" and AS_IN_PAPER[FIRST] == AS_IN_PAPER[NONE] == "no"
 
 
-def test_few_policies_tell_nothing_neither_for_nor_against_the_paper() -> None:
+def test_few_policies_count_neither_for_nor_against_the_paper() -> None:
     """Four that are all better have p = 0.03."""
     assert outcome_of(compare(np.arange(4.0), np.arange(4.0) + 100)) == TOO_FEW
     assert AS_IN_PAPER[TOO_FEW] == "cannot tell"
     words = _as_in_paper([replace(ROW, as_in_paper=each) for each in ("yes", "cannot tell", "cannot tell")])
     assert words.startswith("1 of 3 comparisons") and "For 2 there are too few policies" in words
-    assert "otherwise" not in words
-    assert "is not known, with so few policies" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
+    assert "differently" not in words
+    assert "With so few policies it is not known" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
 
 
-def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
+def test_differing_comparisons_are_named_with_their_outcomes() -> None:
     rows = [replace(ROW, robot=robot, outcome=outcome) for robot, outcome in (("arm", NONE), ("wheels", FIRST))]
     words = _as_in_paper([replace(ROW, as_in_paper="yes"), *rows, replace(ROW, second="c")])
-    assert words.startswith("1 of 4 comparisons came out as in the paper")
+    assert words.startswith("1 of 4 comparisons agrees with the paper")
     assert words.endswith(
         "3 came out differently: the paper found “b” better than “a”, but here “a” was better on wheels and no "
         "difference was found on arm; the paper found “c” better than “a”, but here no difference was found on "
@@ -81,18 +81,18 @@ def test_the_comparisons_that_differ_are_named_with_what_came_out() -> None:
     )
 
 
-def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
+def test_every_arm_and_every_difference_between_two_is_explained() -> None:
     study = paper_study()
-    told = dict(arms_shown(study).rows)
-    assert list(told) == [arm.name for arm in study.arms]
-    assert "depending on how many of nine thresholds it passes. Trained with shadowing" in told["9 thresholds"]
-    assert "above the median gives the motor command +1" in told["control"] and "drawn at random" in told["control"]
-    assert told["before training"].startswith("New networks") and "hadowing" not in told["before training"]
-    assert "without shadowing: on the simulator of the first recording" in told["without shadowing"]
-    assert told["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
-    (fixed,) = arms_shown(Study(arms=(Arm("fixed", percentiles="first"),))).rows
+    shown = dict(arms_table(study).rows)
+    assert list(shown) == [arm.name for arm in study.arms]
+    assert "depending on how many of nine thresholds it exceeds. Trained with shadowing" in shown["9 thresholds"]
+    assert "above the median gives the motor command +1" in shown["control"] and "drawn at random" in shown["control"]
+    assert shown["before training"].startswith("New networks") and "hadowing" not in shown["before training"]
+    assert "without shadowing: on the simulator of the first recording" in shown["without shadowing"]
+    assert shown["without neurons"] == "There are no neurons, and policies give the motor commands themselves."
+    (fixed,) = arms_table(Study(arms=(Arm("fixed", percentiles="first"),))).rows
     assert fixed[1].endswith("Percentiles are those of the first recording throughout.")
-    parts = {each.name: list(what_parts(each, study.arm("1 threshold"))) for each in study.arms}
+    parts = {each.name: list(arm_differences(each, study.arm("1 threshold"))) for each in study.arms}
     assert parts["1 threshold"] == parts["before training"] == []
     assert parts["without shadowing"] == [
         "“1 threshold” is trained with shadowing: during training, each newer recording replaces the simulator of the "
@@ -102,36 +102,36 @@ def test_every_arm_is_explained_and_so_is_what_two_differ_in() -> None:
     assert [each.split("”")[0] for each in parts["linear"]] == ["In “linear", "In “1 threshold"]
 
 
-def test_over_cultures_an_arm_is_explained_where_it_comes_first() -> None:
+def test_over_cultures_a_difference_is_explained_only_once() -> None:
     names = [("control and 1 threshold", robot) for robot in ("cartpole", "navigation")]
     rows = [OverCultures(*name, 4, 1.0, 2.0, 1.0, None, None, larger_in=4, holds_in=4, tested=4) for name in names]
-    section = _in_short(paper_study(), RanCultures(Path(), {}, {}, {}, tuple(rows), None))
+    section = _summary(paper_study(), CulturesRun(Path(), {}, {}, {}, tuple(rows), None))
     (_, first), (_, second) = section.points
     assert first.endswith("In “control” the delivered stimulus is drawn at random, whatever the policy chooses.")
     assert first.startswith(second)
     assert section.tables[0].title == "The arms"
 
 
-def test_an_outcome_that_the_correction_takes_back_says_so() -> None:
+def test_an_outcome_that_does_not_hold_after_correction_says_so() -> None:
     rows = [
         replace(ROW, outcome=outcome, p_holm=p_holm)
         for outcome, p_holm in ((SECOND, 0.005), (SECOND, 0.05), (FIRST, 0.05), (NONE, 1.0))
     ]
-    shown = comparisons_shown(rows)
+    shown = comparisons_table(rows)
     outcomes = [row[shown.head.index("outcome")] for row in shown.rows]
     assert outcomes == [SECOND, f"{SECOND}, not after correction", f"{FIRST}, not after correction", NONE]
 
 
-def test_not_finding_a_difference_is_not_said_to_be_none() -> None:
+def test_not_finding_a_difference_is_not_called_no_difference() -> None:
     assert "no difference" not in NONE and "0.01" in NONE
 
 
 # --- what an optimum says --------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_knows_what_its_optimum_says() -> None:
+def test_a_comparison_is_explained_by_its_optima() -> None:
     assert "other way round" in explain(ROW)
-    assert "take more policies" in explain(replace(ROW, n=4))
+    assert "use more policies" in explain(replace(ROW, n=4))
     assert "nothing to learn" in explain(replace(ROW, optimum_second=-79.8))
     assert "no optimum" in explain(replace(ROW, optimum_second=None))
     assert "leaves room" in explain(replace(ROW, optimum_second=100.0))
@@ -147,72 +147,72 @@ def test_there_is_room_as_long_as_the_second_optimum_is_far_above_the_first_arm(
     assert "at its optimum" not in explain(replace(row, score_second=0.96))
 
 
-def test_optima_are_in_order_only_where_they_lie_apart_by_more_than_their_errors() -> None:
+def test_optima_are_ordered_only_if_they_differ_by_more_than_their_errors() -> None:
     close = replace(ROW, optimum_first=119.95, optimum_second=119.94, optimum_error_first=0.4, optimum_error_second=2.2)
     assert "other way round" not in explain(close)
     assert "same within their errors" in explain(close)
     assert "other way round" in explain(replace(close, optimum_first=122.6))
 
 
-def test_a_control_is_given_no_optimum() -> None:
+def test_a_control_has_no_optimum() -> None:
     words = explain(replace(ROW, optimum_first=None, optimum_error_first=None))
     assert "a cannot do better than random actions" in words and "for a" not in words
 
 
-def test_what_binning_takes_is_said_where_it_takes_something() -> None:
-    ((_, words),) = came_out_otherwise([ROW], {0.0: 0.5, 140.0: 0.02})
+def test_a_loss_by_binning_is_reported_only_where_there_is_one() -> None:
+    ((_, words),) = differing_comparisons([ROW], {0.0: 0.5, 140.0: 0.02})
     assert "binning" not in words and "none found" in words
-    ((_, words),) = came_out_otherwise([ROW], {140.0: 0.21})
+    ((_, words),) = differing_comparisons([ROW], {140.0: 0.21})
     assert "binning moves P(x ≥ P50) by up to 0.21" in words
-    assert came_out_otherwise([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)]) == ()
+    assert differing_comparisons([replace(ROW, as_in_paper="yes"), replace(ROW, as_in_paper=None)]) == ()
 
 
 # --- decisions are the study's ---------------------------------------------------------------------------------------
 
 
-def test_decisions_of_the_papers_study_are_those_of_its_own() -> None:
-    told = dict(decisions(paper_study()))
+def test_decisions_of_the_papers_study() -> None:
+    decided = dict(decisions(paper_study()))
     assert {"Ten levels without zero", "Pole mass", "12 degrees", "20 iterations", "Histogram range", "Percentiles",
-            "Most probable actions", "Walls", "Before training"} <= set(told)  # fmt: skip
-    assert "0.055 kg, the simulator's" in told["Pole mass"]
-    assert "12 degrees (angle" in told["12 degrees"]
-    assert "there are 100" in told["20 iterations"]
-    assert "percentiles of each recording" in told["Histogram range"]
-    assert "simulated" in told["The culture"]
+            "Most probable actions", "Walls", "Before training"} <= set(decided)  # fmt: skip
+    assert "0.055 kg, the simulator's" in decided["Pole mass"]
+    assert "12 degrees (angle" in decided["12 degrees"]
+    assert "there are 100" in decided["20 iterations"]
+    assert "percentiles of each recording" in decided["Histogram range"]
+    assert "simulated" in decided["The culture"]
 
 
-def test_the_papers_burst_rule_is_told_with_what_it_would_leave_out() -> None:
+def test_the_papers_burst_rule_is_reported_with_what_it_would_leave_out() -> None:
     # Of one peak, which Otsu cuts in two: 0.5 is its cut; of two groups; and of no two values.
     one_peak = responses_of([1.0] * 10, active_ratio=np.repeat([0.4, 0.5, 0.6, 0.7], [2, 5, 2, 1]))
     two_groups = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5)
     flat = responses_of([1.0] * 4)
     words = dict(decisions(paper_study(), [one_peak, two_groups, flat]))["Bursts"]
     assert words == (
-        "In the paper Otsu's threshold always cuts. Here its cut is kept only where the ratios of active channels form "
-        "two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 responses "
-        "that the paper's rule would leave out."
+        "In the paper Otsu's threshold is always applied. Here it is applied only where the ratios of active channels "
+        "form two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 "
+        "responses that the paper's rule would leave out."
     )
     assert dict(decisions(paper_study()))["Bursts"].endswith("elsewhere no response is set apart.")
     given = replace(paper_study(), simulators=Simulators(burst_threshold=0.5))
-    assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is given: 0.5 of the channels.")
+    assert dict(decisions(given, [one_peak]))["Bursts"].endswith("Here the threshold is set to 0.5 of the channels.")
 
 
 def test_a_caption_promises_a_threshold_only_where_there_is_one() -> None:
     with_bursts, without = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5), responses_of([1.0] * 20)
-    for responses, said in ((with_bursts, "Right of the dashed threshold"), (without, "so there is no threshold.")):
-        _, caption = CULTURE["bursts"]
-        assert said in caption.format(**_facts_of_culture([responses]))
+    _, caption = CULTURE["bursts"]
+    assert "to the right of the dashed threshold" in caption.format(**_facts_of_culture([with_bursts]))
+    assert "so there is no threshold." in caption.format(**_facts_of_culture([without]))
 
 
-def test_what_a_quick_study_has_less_of_than_the_paper_is_told() -> None:
-    told = dict(decisions(paper_study(quick=True)))
-    assert told["Recordings"] == (
+def test_a_quick_study_reports_what_it_has_less_of_than_the_paper() -> None:
+    decided = dict(decisions(paper_study(quick=True)))
+    assert decided["Recordings"] == (
         "The paper has 15 recordings, 10 minutes apart, of 100 trials of each stimulus, each frequency in a block. "
         "Here there are 8 recordings, 20 minutes apart, of 100 trials of each stimulus, each frequency in a block."
     )
-    assert told["Policies"] == "The paper has 10 per arm. Here there are 4."
-    assert told["Iterations on cartpole"] == "The paper trains a policy for 800,000. Here it is trained for 60,000."
-    assert "500,000" in told["Iterations on navigation"] and "60,000" in told["Iterations on navigation"]
+    assert decided["Policies"] == "The paper has 10 per arm. Here there are 4."
+    assert decided["Iterations on cartpole"] == "The paper trains a policy for 800,000. Here it is trained for 60,000."
+    assert "500,000" in decided["Iterations on navigation"] and "60,000" in decided["Iterations on navigation"]
     papers = dict(decisions(paper_study()))
     assert not any(name.startswith(("Recordings", "Policies", "Iterations")) for name in papers)
 
@@ -230,15 +230,15 @@ def test_decisions_follow_a_changed_study() -> None:
         comparisons=(),
         actions="drawn",
     )
-    told = dict(decisions(changed))
-    assert "0.55 kg, chosen for this study" in told["Pole mass"]
-    assert "22.9 degrees" in told["12 degrees"]
-    assert "there are 20 " in told["20 iterations"] and "no policy can reach" in told["20 iterations"]
-    assert "recordings at hand" in told["The culture"] and "Pulse" not in told
+    made = dict(decisions(changed))
+    assert "0.55 kg, chosen for this study" in made["Pole mass"]
+    assert "22.9 degrees" in made["12 degrees"]
+    assert "there are 20 " in made["20 iterations"] and "no policy can reach" in made["20 iterations"]
+    assert "existing recordings" in made["The culture"] and "Pulse" not in made
     assert (
-        "40 bins of equal width reach to 60 Hz" in told["Histogram range"] and "paper's 20" in told["Histogram range"]
+        "40 bins of equal width reach to 60 Hz" in made["Histogram range"] and "paper's 20" in made["Histogram range"]
     )
-    assert "Ten levels without zero" not in told and "Most probable actions" not in told
+    assert "Ten levels without zero" not in made and "Most probable actions" not in made
     drawn = dict(decisions(replace(changed, simulators=Simulators(kind="empirical"))))
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
     alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
@@ -259,8 +259,8 @@ def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
     names = [job.name for job in plan_study(study, tmp_path)]
     assert len(set(names)) == len(names) and "train/as printed/1-threshold/p0" in names
     assert training_of(study, printed, Arm("a", mapping="none")).commands == (-1.0, 1.0)
-    told = [words for name, words in decisions(study) if name == "Pole mass"]
-    assert len(told) == 2 and "0.55 kg, chosen" in told[1]
+    texts = [words for name, words in decisions(study) if name == "Pole mass"]
+    assert len(texts) == 2 and "0.55 kg, chosen" in texts[1]
     with pytest.raises(InvalidArgument, match="expected each name once"):
         Study(robots=(RobotSpec("cartpole"), RobotSpec("cartpole", parameters={"pole_mass_kg": 0.55})))
     with pytest.raises(InvalidArgument, match=r"^name: expected letters"):
@@ -310,16 +310,16 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
     in_data[1, [0, 12]], in_simulator[1, [0, 12]] = (0.13, 0.9), (0.28, 0.88)
     kept = {10.0 * i: Fidelity(labels, in_data[i], in_simulator[i], 0) for i in range(2)}
     unknown = dict.fromkeys(field.name for field in fields(StudyOptimum))
-    told = {"robot": "cartpole", "percentiles": "moving"}
+    known = {"robot": "cartpole", "percentiles": "moving"}
     optima = [
         StudyOptimum(
-            **unknown | told | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"}
+            **unknown | known | {"mapping": m, "at_min": at, "best_return": x, "left_out": None if at else "0 Hz (3)"}
         )
         for m, x in (("9-thresholds", 99.0), ("1-threshold", 42.0))
         for at in (0.0, 10.0)
     ]
     write_typed(optima_file(tmp_path, "cartpole", "over-time"), optima)
-    table = controllability_shown(study, tmp_path, kept)
+    table = controllability_table(study, tmp_path, kept)
     assert table.head[-3:] == ("difference, data", "difference, simulator", "optimum, cartpole")
     assert table.marked == (1,)
     assert table.rows[1][1] == "0.13\u00a0→\u00a00.28"
@@ -330,7 +330,7 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
     assert "1 more conditions are in the file" in table.note
 
 
-def test_every_mapping_has_optima_of_its_own_over_time() -> None:
+def test_every_mapping_has_its_own_optima_over_time() -> None:
     study = paper_study()
     assert [kind.mapping for kind in kinds_of(study)] == ["1-threshold", "9-thresholds", "linear", "none"]
     assert [kind.mapping for kind in rough_kinds(study)] == ["1-threshold", "9-thresholds"]
@@ -398,7 +398,7 @@ def test_an_interval_that_leaves_the_scale_ends_in_an_arrow() -> None:
     assert legend(figure) == said
 
 
-def test_on_a_telephone_the_headline_fits_its_width(tmp_path: Path) -> None:
+def test_on_a_phone_the_headline_fits_the_screen(tmp_path: Path) -> None:
     rows = [
         (score(robot, arm, 5.0, 4.0, 6.0, 0.0, 10.0), np.array([3.0, 7.0]))
         for robot in ("cartpole", "navigation", "swing-up")
@@ -442,7 +442,7 @@ def test_files_that_a_page_names_are_links() -> None:
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
 
 
-def test_optima_over_time_are_said_to_be_rough_and_no_arm_is_lost_unsaid() -> None:
+def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> None:
     minutes = np.array([0.0, 10.0])
     courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(6))
     panels = [

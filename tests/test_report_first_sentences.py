@@ -1,4 +1,4 @@
-"""What a report says first, what came out in a sentence by the numbers beside it; and figures that hold their words."""
+"""The first sentences of a report agree with its numbers; and the text of figures fits into them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import ControlReturns, OverCultures
-from animat.studies.publishing import _beside
+from animat.studies.publishing import _describe
 from test_report_claims import score
 
 if TYPE_CHECKING:
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
         (-90.0, -30.0, "do worse than random actions. Their"),
     ],
 )
-def test_the_first_sentence_goes_by_the_interval(low: float, high: float, found: str) -> None:
-    told = _beside(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
-    assert told.startswith(f"policies trained as “1 threshold” {found}")
-    assert "return is 50, that of random actions −10, that of the optimal controller 70." in told
+def test_the_first_sentence_follows_the_interval(low: float, high: float, found: str) -> None:
+    text = _describe(score("cartpole", "1 threshold", 50.0, low, high, -10.0, 70.0))
+    assert text.startswith(f"policies trained as “1 threshold” {found}")
+    assert "return is 50, that of random actions −10, that of the optimal controller 70." in text
 
 
 def test_without_an_interval_nothing_is_claimed() -> None:
-    told = _beside(score("cartpole", "linear", 50.0, None, None, None, None))
-    assert told == "of the policies trained as “linear” the interquartile mean return is 50."
+    text = _describe(score("cartpole", "linear", 50.0, None, None, None, None))
+    assert text == "of the policies trained as “linear” the interquartile mean return is 50."
 
 
 def left_out(figure: Figure) -> list[str]:
@@ -47,7 +47,7 @@ def left_out(figure: Figure) -> list[str]:
     return [words for words, box in boxes if words and (box.x0 < 0 or box.x1 > width)]
 
 
-def test_words_of_narrow_figures_are_within_them() -> None:
+def test_text_of_narrow_figures_fits() -> None:
     rows = [
         (score("navigation", name, 1.0, 0.0, 2.0, 0.5, 3.0), np.array([0.5, 1.5]))
         for name in ("before training", "linear")

@@ -1,4 +1,4 @@
-"""The figures of a series show what is in it: marks are counted and numbers read back from the axes."""
+"""The figures of a series: marks are counted and numbers read back from the axes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_series_has_its_figures(recordings: list[Recording], series: list[Resp
     with pytest.raises(InvalidArgument, match="at least one recording"):
         draw_series(recordings[0], [], tmp_path)
     others = extract_responses(recordings[1], conditions_named("pattern"))
-    with pytest.raises(Mismatch, match="at 30 min are others than those at 0 min"):
+    with pytest.raises(Mismatch, match="at 30 min differ from those at 0 min"):
         draw_series(recordings[0], [series[0], others], tmp_path)
 
 
@@ -67,7 +67,7 @@ def test_the_array_shows_every_site_and_counts_what_it_cannot_place(recordings: 
     unknown[:3] = np.nan
     some = draw_array(replace(recordings[0], channels=replace(recordings[0].channels, x_um=unknown))).axes[0]
     assert len(some.collections[0].get_offsets()) == 61
-    assert "3 channels of unknown position" in some.figure.get_suptitle()
+    assert "3 channels at unknown positions" in some.figure.get_suptitle()
 
 
 @pytest.mark.parametrize(("width_um", "height_um"), [(3800, 2100), (1200, 1800), (700, 2100), (0, 0)])

@@ -46,13 +46,13 @@ from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
-from animat.studies.folder import describe_study, held, sums_of
+from animat.studies.folder import claim_folder, describe_study, hash_files
 from animat.studies.paper import PRINTED, paper_study
 from animat.studies.pictures import CulturePictures
 from animat.studies.places import controls_file, episodes_file, paths_file
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
-from animat.studies.run import Ran, run_study
+from animat.studies.run import StudyRun, run_study
 from animat.studies.simulating import Fit, load_timeline
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
@@ -196,7 +196,7 @@ def test_a_folder_of_before_results_were_typed_is_refused_with_what_to_do(tmp_pa
 def test_a_folder_in_which_other_programs_hid_a_file_is_empty(tmp_path: Path) -> None:
     for name in (".DS_Store", ".gitignore"):
         (tmp_path / name).write_text("theirs")
-    with held(tmp_path, "study", {"fingerprint": "00"}, "study.json", {}):
+    with claim_folder(tmp_path, "study", {"fingerprint": "00"}, "study.json", {}):
         assert json.loads((tmp_path / "study.json").read_text()) == {"fingerprint": "00"}
     assert (tmp_path / ".gitignore").read_text() == "theirs"
 
@@ -338,7 +338,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
     study = Study(culture=Source(sessions=2, interval_min=2.0, trials=2))
 
     def record(name: str) -> Receipt:
-        done = carry_out(Record(study, tmp_path), tmp_path / name, tmp_path / "told")
+        done = carry_out(Record(study, tmp_path), tmp_path / name, tmp_path / "receipts")
         return Receipt("record", "study", {}, done.files)
 
     undisturbed = record("undisturbed")
@@ -394,13 +394,13 @@ def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
         (tmp_path / day / "rec[1]_spikes.csv").write_text(day)
         (tmp_path / day / "rec[1]_stimuli.csv").write_text(day)
     both = [tmp_path / day / "rec[1]_spikes.csv" for day in ("day1", "day2")]
-    sums = sums_of(both, tmp_path)
+    sums = hash_files(both, tmp_path)
     assert list(sums) == [f"{day}/rec[1]_{of}.csv" for day in ("day1", "day2") for of in ("spikes", "stimuli")]
     assert len(set(sums.values())) == 2
     with pytest.raises(InvalidArgument, match="each file once"):
-        sums_of([both[0], both[0]], tmp_path)
+        hash_files([both[0], both[0]], tmp_path)
     with pytest.raises(InvalidFile, match="no such file"):
-        sums_of([tmp_path / "none.nwb"], tmp_path)
+        hash_files([tmp_path / "none.nwb"], tmp_path)
 
 
 @pytest.mark.oracle
@@ -432,7 +432,7 @@ def test_recordings_that_changed_are_noticed(tmp_path: Path) -> None:
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts(after=1))
     written = tmp_path / "study" / "study.toml"
     assert read_study(written) == study
-    assert written.read_text().startswith("# files: as seen from where the specification lay.")
+    assert written.read_text().startswith("# files: relative to the original specification.")
     write_nwb(synthetic_recording(2, start_min=0.0, patterns=5, channels=16), sorted(made.glob("*.nwb"))[0])
     with pytest.raises(Mismatch, match="sources"):
         run_study(study, tmp_path / "study", base=tmp_path, executor=Halts())
@@ -464,7 +464,7 @@ def episodes_in(folder: Path, **columns: str) -> list[dict[str, str]]:
 
 @pytest.mark.oracle
 def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> None:
-    (told,) = rows(finished / "tables/comparisons.csv")
+    (test,) = rows(finished / "tables/comparisons.csv")
     means = []
     for arm in ("before training", "1 threshold"):
         returns = defaultdict(list)
@@ -473,10 +473,10 @@ def test_comparisons_are_what_scipy_makes_of_the_episodes(finished: Path) -> Non
         assert {len(of_policy) for of_policy in returns.values()} == {5}
         means.append([np.mean(of_policy) for of_policy in returns.values()])
     ours = mannwhitneyu(*means, alternative="two-sided", method="asymptotic")
-    assert float(told["p_normal"]) == pytest.approx(min(1.0, ours.pvalue))
-    assert float(told["u"]) == min(ours.statistic, 4 - ours.statistic)
-    assert float(told["mean_second"]) == pytest.approx(np.mean(means[1]))
-    assert (float(told["paper_p"]), told["as_in_paper"]) == (PRINTED[told["comparison"], "navigation"].p, "cannot tell")
+    assert float(test["p_normal"]) == pytest.approx(min(1.0, ours.pvalue))
+    assert float(test["u"]) == min(ours.statistic, 4 - ours.statistic)
+    assert float(test["mean_second"]) == pytest.approx(np.mean(means[1]))
+    assert (float(test["paper_p"]), test["as_in_paper"]) == (PRINTED[test["comparison"], "navigation"].p, "cannot tell")
 
 
 @pytest.mark.oracle
@@ -491,8 +491,8 @@ def test_scores_are_places_on_the_way_from_random_to_the_optimum(finished: Path)
 
     def returns_of(arm: str, agent: str, at_min: str) -> np.ndarray:
         """All have as many episodes."""
-        told = episodes_in(finished, arm=arm, agent=agent, at_min=at_min, over_time="False")
-        return np.array([float(row["return"]) for row in told])
+        chosen = episodes_in(finished, arm=arm, agent=agent, at_min=at_min, over_time="False")
+        return np.array([float(row["return"]) for row in chosen])
 
     scores = rows(finished / "tables/scores.csv")
     assert {row["mapping"] for row in scores} == set(arm_of)
@@ -587,7 +587,7 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
         for ending in ("png", "svg", "pdf"):
             assert (finished / "figures" / f"{stem}.{ending}").stat().st_size > 1000, stem
         assert f'href="figures/{stem}.svg"' in page
-    # The headline has another one for telephones.
+    # The headline has a second one for phones.
     assert page.count("<img ") == page.count("data:image/png;base64,") - 1 == len(expected)
     tables = ("Comparisons", "Every arm", "Optimal returns", "Controllability of every recording")
     for title in (*tables, "Controls"):
@@ -596,8 +596,8 @@ def test_the_report_holds_every_figure_and_table(finished: Path) -> None:
     for decision in ("20 iterations", "Walls", "Histogram range", "Most probable actions", "Bursts", "Policies"):
         assert f"<dt>{decision}</dt>" in page
     assert 'all are in <a href="tables/findings.csv">tables/findings.csv</a>.' in page
-    assert "where the files are found under the same paths from where study.toml lies." in page
-    assert "Right of the dashed threshold a response counts as one, as in the last panel." in page
+    assert "provided that the files are at the same paths relative to study.toml." in page
+    assert "A response to the right of the dashed threshold counts as a burst, as in the last panel." in page
     assert "before and after training, navigation" in page
     assert {path.stem for path in (finished / "tables").glob("*.csv")} == {
         "scores", "comparisons", "controls", "heuristic", "reflexes", "learning-curves", "optima", "controllability",
@@ -655,8 +655,8 @@ def test_the_numbers_of_the_culture_s_figures_are_those_of_its_recordings(finish
 def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path) -> None:
     parts: dict[tuple[str, str], list[tuple[float, int, float]]] = defaultdict(list)
     for row in rows(finished / "tables/learning-curves.csv"):
-        told = float(row["iterations"]), int(row["episodes"]), float(row["mean_return"] or 0)
-        parts[row["arm"], row["policy"]].append(told)
+        numbers = float(row["iterations"]), int(row["episodes"]), float(row["mean_return"] or 0)
+        parts[row["arm"], row["policy"]].append(numbers)
     learning = rows(finished / "tables/navigation-learning.csv")
     # In 40 iterations of each of eight environments all of them end an episode.
     round_of = 40 * 8
@@ -681,8 +681,8 @@ def test_the_numbers_of_a_robot_s_figures_are_those_of_its_tables(finished: Path
         for each in episodes_in(finished, arm=row["arm"], at_min=row["at_min"], over_time="True"):
             returns[each["actor"]].append(float(each["return"]))
         means = [np.mean(of_policy) for of_policy in returns.values()]
-        told = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
-        assert told == pytest.approx(np.quantile(means, [0.25, 0.5, 0.75]))
+        quartiles = [float(row[name]) for name in ("lower_quartile", "median", "upper_quartile")]
+        assert quartiles == pytest.approx(np.quantile(means, [0.25, 0.5, 0.75]))
         assert int(row["policies"]) == len(means) == 2
 
 
@@ -796,20 +796,23 @@ COMPARED = (
         ),
         ("[robots.cartpole]\niterations = 3", "robots: expected [[robots]] for each, and its name in it, got [robots."),
         ("[[arms]]\nname = 'a/b'", "arms.name: expected letters"),
-        ("[[arms]]\nname = '10'", "which in a table would be a number"),
+        ("[[arms]]\nname = '10'", "which would be read as a number in a table"),
         (
             "[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'",
             "expected each name once, got 'a' 2 times: capitals, and spaces for dashes, make no difference",
         ),
         ("[[arms]]\nname = 'a'\nmapping = '2'", "arms.mapping: expected one of"),
         ("[[arms]]\nname = 'a'\nmapping = '2'", "named by its module:Class; none is without neurons"),
-        ("[tune]\ntrials = 3", "expected a study, got the file of a tuning, with [tune]: give it to animat tune"),
+        ("[tune]\ntrials = 3", "expected a study, got the file of a tuning, with [tune]: use animat tune"),
         (
             "[[arms]]\nname = 'a'\ndelivery = 'none'",
             "arms.delivery: expected 'chosen' or 'shuffled', got 'none'",
         ),
         ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'c'", "comparisons.first: expected one of the arms"),
-        ("[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'", "comparisons.second: expected another arm"),
+        (
+            "[[comparisons]]\nname = 'a'\nfirst = 'b'\nsecond = 'b'",
+            "comparisons.second: expected an arm other than the first",
+        ),
         ("[culture]\nkind = 'alive'", "culture.kind: expected 'virtual' or 'files', got 'alive'"),
         (
             "[culture]\nkind = 'files'",
@@ -879,7 +882,7 @@ COMPARED = (
         (COMPARED.format("-20"), "comparisons.at_min: expected a minute of the recordings, from 0 to 140, got -20"),
     ],
 )
-def test_mistakes_in_a_specification_are_told_in_one_line(
+def test_mistakes_in_a_specification_are_reported_in_one_line(
     toml: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "study.toml"
@@ -892,7 +895,7 @@ def test_mistakes_in_a_specification_are_told_in_one_line(
 
 
 @pytest.mark.parametrize("file", ["/dev/zero", "pipe", "folder", "none.nwb", "a" * 5000])
-def test_files_that_cannot_be_recordings_are_told_in_one_line(
+def test_files_that_cannot_be_recordings_are_reported_in_one_line(
     file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.mkfifo(tmp_path / "pipe")
@@ -939,7 +942,7 @@ def test_comparisons_are_made_at_the_nearest_recording() -> None:
             at([beyond], start_min)
 
 
-def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
+def test_a_comparison_moved_to_another_minute_is_reported(tmp_path: Path) -> None:
     write_synthetic_series(1, tmp_path / "made", sessions=2, interval_min=30.0, patterns=10, channels=16)
     moved = Compared("before and after", "1 threshold", "control", at_min=29.0)
     study = Study(
@@ -949,8 +952,8 @@ def test_a_comparison_moved_to_another_minute_is_told(tmp_path: Path) -> None:
     )
     Record(study, tmp_path).run(tmp_path / "study", Silent())
     kept, _ = Fit(study).run(tmp_path / "study", Silent())
-    (told,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
-    assert told.message == "before and after was asked for at 29 min and is made on the recording at 30 min"
+    (finding,) = [finding for finding in load_timeline(kept).findings if finding.name == "comparison-minute"]
+    assert finding.message == "before and after was requested at 29 min and is made on the recording at 30 min"
     with pytest.raises(InvalidArgument, match="at_min"):
         Fit(replace(study, comparisons=(replace(moved, at_min=99.0),))).run(tmp_path / "study", Silent())
 
@@ -975,7 +978,7 @@ def test_no_two_arms_or_controls_share_a_file(tmp_path: Path) -> None:
     assert len(places) == 2 * len(names) + 2
 
 
-def test_a_missing_file_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_file_is_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["study", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out")]) == 1
     assert capsys.readouterr().err.endswith("none.toml: no such file\n")
     with pytest.raises(InvalidArgument, match="workers"):
@@ -1035,7 +1038,7 @@ def test_a_study_of_files_without_comparisons_runs_on_another_executor(tmp_path:
         policies=1,
         paper=False,
     )
-    ran: Ran = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
+    ran: StudyRun = run_study(study, tmp_path / "study", base=tmp_path, executor=ThreadPoolExecutor(1))
     assert len(ran.done_now) == ran.jobs
     page = ran.report.read_text()
     assert "The study compares no arms" in page

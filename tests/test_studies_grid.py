@@ -1,4 +1,4 @@
-"""Lists in a study's specification: the products, their names, and what is refused."""
+"""Lists in a study's specification: the combinations, their names, and what is refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def study(folder: Path, text: str) -> Study:
     return read_study(folder / "study.toml")
 
 
-def test_the_grid_of_the_docs_is_what_is_written_out(tmp_path: Path) -> None:
+def test_the_grid_of_the_docs_equals_its_entries_written_out(tmp_path: Path) -> None:
     block = re.search(r"### Grids.*?```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
     assert block
     first = '[[arms]]\nname = "first"\n\n'
@@ -35,7 +35,7 @@ def test_the_grid_of_the_docs_is_what_is_written_out(tmp_path: Path) -> None:
     assert study(tmp_path, study_to_toml(got)) == got
 
 
-def test_parameters_of_robots_are_products_too(tmp_path: Path) -> None:
+def test_lists_in_parameters_of_robots_are_expanded(tmp_path: Path) -> None:
     got = study(
         tmp_path,
         '[[robots]]\nname = "pole {pole_mass_kg} {iterations}"\nkind = "cartpole"\niterations = [1000, 2000]\n'
@@ -49,20 +49,20 @@ def test_parameters_of_robots_are_products_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             'name = "a"\nshadowing = [true, false]',
-            r"arms\.name: expected \{shadowing\} in it, as that is a list, got 'a'",
+            r"arms\.name: expected it to contain \{shadowing\}, which is a list, got 'a'",
         ),
-        ("shadowing = [true, false]", r"arms\.name: expected \{shadowing\} in it, as that is a list, got None"),
+        ("shadowing = [true, false]", r"arms\.name: expected it to contain \{shadowing\}, which is a list, got None"),
         ('name = "a {shadowing}"\nshadowing = [true, 3]', r"arms"),
         ('name = "a {shadowing}"\nshadowing = [true, true]', r"arms: expected each name once, got 'a-true' 2 times"),
         ('name = "a {delivery}"\ndelivery = []', r"arms.*delivery"),
         (f'name = "a {{percentiles}}"\npercentiles = [{"1, " * 1001}]', r"arms: expected at most 1,000, got 1,001"),
     ],
 )
-def test_what_is_no_grid_is_a_line(text: str, told: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidFile, match=told) as raised:
+def test_an_invalid_grid_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidFile, match=message) as raised:
         study(tmp_path, f"[[arms]]\n{text}\n")
     assert "\n" not in str(raised.value)

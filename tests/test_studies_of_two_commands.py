@@ -86,7 +86,7 @@ def test_a_study_s_policies_are_those_of_the_same_training_by_hand(tmp_path: Pat
             np.testing.assert_array_equal(one, other)
 
 
-def test_responses_and_controllability_are_told_of_each_readout(tmp_path: Path) -> None:
+def test_responses_and_controllability_are_reported_for_each_readout(tmp_path: Path) -> None:
     timeline = load_timeline(fitted(tmp_path))
     series = extract_series(read_recordings(tmp_path / "recordings"), readouts="halves")
     with (tmp_path / "simulators/responses.csv").open(newline="") as file:
@@ -117,12 +117,12 @@ def test_it_runs_to_its_report(tmp_path: Path) -> None:
     [
         (
             {"simulators": Simulators()},
-            r"simulators.readouts: expected as many as the commands of wheels \(2\), got 'all', which are 1",
+            r"simulators.readouts: expected as many as wheels has commands \(2\), got 'all', which are 1",
         ),
         (
             {"robots": (RobotSpec("wheels"), RobotSpec("cartpole"))},
-            r"simulators.readouts: expected as many as the commands of cartpole \(1\), got 'halves', which are 2; "
-            "robots of more or fewer commands are a study of their own",
+            r"simulators.readouts: expected as many as cartpole has commands \(1\), got 'halves', which are 2; "
+            "robots with more or fewer commands need another study",
         ),
         (
             {"robots": (RobotSpec("wheels", lessons=(Lesson(recordings_min=(0, 5)),)),)},
@@ -130,7 +130,7 @@ def test_it_runs_to_its_report(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_does_not_go_together_is_refused_before_anything_is_recorded(
+def test_inconsistent_settings_are_refused_before_anything_is_recorded(
     changed: dict[str, object], message: str
 ) -> None:
     with pytest.raises(InvalidArgument, match=message):
@@ -138,7 +138,7 @@ def test_what_does_not_go_together_is_refused_before_anything_is_recorded(
 
 
 @pytest.mark.parametrize("readouts", ["thirds", "[1, 2]", '{"left": [1], "left": [2]}', "{"])
-def test_readouts_that_are_none_are_refused(readouts: str) -> None:
+def test_invalid_readouts_are_refused(readouts: str) -> None:
     with pytest.raises(InvalidArgument, match="readouts: expected"):
         Simulators(readouts=readouts)
     with pytest.raises(InvalidArgument, match=r"readouts\.left: expected at least 1, got"):

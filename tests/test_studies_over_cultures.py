@@ -1,4 +1,4 @@
-"""Studies over many cultures: each as if it were alone, one that fails stops no other, and what holds over all."""
+"""Studies over many cultures: each runs as if alone, a failure stops no other, and there are results over all."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, U
 from animat.evaluation.statistics import compare
 from animat.report.results import ComparedReturns, Results, Score
 from animat.studies import cultures
-from animat.studies.cultures import RanCultures, bootstrap_interval, over_cultures, run_over_cultures, studies_of
+from animat.studies.cultures import CulturesRun, bootstrap_interval, over_cultures, run_over_cultures, studies_of
 from animat.studies.cultures_page import write_cultures_page
 from animat.studies.places import results_file
 from animat.studies.results import write_typed
-from animat.studies.run import Ran, run_study
+from animat.studies.run import StudyRun, run_study
 from animat.studies.source import Source, read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import NONE, SECOND, TOO_FEW, outcome_of
@@ -49,7 +49,7 @@ def compared(first: float, second: float, outcome: str) -> ComparedReturns:
 
 
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 30)), min_size=1, max_size=6))
-def test_seeds_are_what_their_ranges_hold(ranges: list[tuple[int, int]]) -> None:
+def test_ranges_of_seeds_are_expanded(ranges: list[tuple[int, int]]) -> None:
     text = ", ".join(f"{first}-{first + more}" if more else f"{first}" for first, more in ranges)
     expected = [seed for first, more in ranges for seed in range(first, first + more + 1)]
     if len(set(expected)) < len(expected):
@@ -60,7 +60,7 @@ def test_seeds_are_what_their_ranges_hold(ranges: list[tuple[int, int]]) -> None
 
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-1", "1;2", "1-2000", "1.5"])
-def test_what_is_no_range_of_seeds_is_refused(text: str) -> None:
+def test_text_other_than_ranges_of_seeds_is_refused(text: str) -> None:
     with pytest.raises(InvalidArgument, match="seeds: expected"):
         Source(seeds=text)
 
@@ -71,16 +71,16 @@ def test_a_seed_of_too_many_digits_is_refused_as_such() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"seeds": "1-3", "seed": 2}, "seeds: expected seed or seeds"),
         ({"kind": "files", "files": ("a",), "folders": ("b",)}, "folders: expected files of one culture"),
-        ({"folders": ("b",)}, "files, folders: expected some for kind = 'files' only, got 1 for 'virtual'"),
+        ({"folders": ("b",)}, "files, folders: expected only with kind = 'files', got 1 for 'virtual'"),
         ({"kind": "files", "folders": ("b",), "seeds": "1-2"}, "seeds: expected only for a culture"),
     ],
 )
-def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], told: str) -> None:
-    with pytest.raises(InvalidArgument, match=told):
+def test_a_culture_is_one_or_many_and_not_both(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidArgument, match=message):
         Source(**given)
 
 
@@ -126,22 +126,22 @@ def test_with_too_few_policies_larger_means_are_still_counted(found: list[tuple[
 
 
 @pytest.mark.parametrize("n", range(1, 12))
-def test_too_few_are_those_who_could_not_be_found_better_at_best(n: int) -> None:
+def test_policies_are_too_few_if_even_the_best_outcome_is_not_significant(n: int) -> None:
     best = mannwhitneyu(np.arange(n), np.arange(n) + n, method="asymptotic").pvalue
-    told = outcome_of(compare(np.arange(n), np.arange(n) + n))
-    assert told == (SECOND if best < 0.01 else TOO_FEW)
+    outcome = outcome_of(compare(np.arange(n), np.arange(n) + n))
+    assert outcome == (SECOND if best < 0.01 else TOO_FEW)
 
 
-def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def ran(study: Study, folder: Path, **_: Any) -> Ran:
+def test_a_culture_that_fails_is_reported_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
         if study.culture.seed == 2:
             raise UnusableData("recording 1: no responses")
-        return told_and_tables(study, folder)
+        return run_with_results(study, folder)
 
     monkeypatch.setattr(cultures, "run_study", ran)
     study = replace(read_study(TINY), culture=Source(seeds="1-3"))
     found = run_over_cultures(study, tmp_path)
-    assert list(found.ran) == ["culture-1", "culture-3"]
+    assert list(found.finished) == ["culture-1", "culture-3"]
     assert found.failed == {"culture-2": "recording 1: no responses"}
     assert json.loads((tmp_path / cultures.MANIFEST).read_text()) == {
         "cultures": ["culture-1", "culture-2", "culture-3"],
@@ -162,18 +162,18 @@ def test_a_culture_that_fails_is_told_and_stops_no_other(tmp_path: Path, monkeyp
     assert (tmp_path / cultures.MANIFEST).read_bytes() == before
 
 
-def told_and_tables(study: Study, folder: Path) -> Ran:
+def run_with_results(study: Study, folder: Path) -> StudyRun:
     results_file(folder).parent.mkdir(parents=True, exist_ok=True)
     rows = (compared(0.0, float(study.culture.seed or 0), SECOND),)
     write_typed(results_file(folder), Results((), rows, (), (), (), ()))
-    return Ran(folder, folder / "report.html", 1, {})
+    return StudyRun(folder, folder / "report.html", 1, {})
 
 
 def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The barrier lets nobody through before two are there; told in order, the whole never goes back."""
+    """The barrier lets nobody through before two are there; reported in order, the whole never goes back."""
     both, at_once, most = threading.Barrier(2, timeout=60), 0, 0
 
-    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> Ran:
+    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> StudyRun:
         nonlocal at_once, most
         at_once += 1
         both.wait()
@@ -181,26 +181,26 @@ def test_cultures_go_on_side_by_side_one_for_each_worker(tmp_path: Path, monkeyp
         for done in range(4):
             progress.update(done, 3)
         at_once -= 1
-        return told_and_tables(study, folder)
+        return run_with_results(study, folder)
 
-    told: list[tuple[float, str]] = []
+    reports: list[tuple[float, str]] = []
     monkeypatch.setattr(cultures, "run_study", ran)
     monkeypatch.setattr(cultures, "find_gpu", lambda: None)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    whole = SimpleNamespace(update=lambda done, total, note="": told.append((done / total, note)))
+    whole = SimpleNamespace(update=lambda done, total, note="": reports.append((done / total, note)))
     found = run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-4")), tmp_path, progress=whole)
-    assert list(found.ran) == ["culture-1", "culture-2", "culture-3", "culture-4"]
+    assert list(found.finished) == ["culture-1", "culture-2", "culture-3", "culture-4"]
     assert most == 2
-    assert [share for share, _ in told] == sorted(share for share, _ in told)
-    assert told[-1] == (1.0, "4 of 4 cultures")
-    assert any(note.startswith("0 of 4 cultures; culture-") for _, note in told)
+    assert [share for share, _ in reports] == sorted(share for share, _ in reports)
+    assert reports[-1] == (1.0, "4 of 4 cultures")
+    assert any(note.startswith("0 of 4 cultures; culture-") for _, note in reports)
 
 
-def test_what_nobody_foresaw_ends_all_cultures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_ends_all_cultures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As Ctrl-C does: the others are stopped at their next report, and no more are begun."""
     begun, running = [], threading.Event()
 
-    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> Ran:
+    def ran(study: Study, folder: Path, *, progress: Any, **_: Any) -> StudyRun:
         begun.append(study.culture.seed)
         if study.culture.seed == 1:
             running.wait(60)
@@ -230,12 +230,12 @@ SCORED: dict[str, Any] = {
 }
 
 
-def run_scored(folder: Path, monkeypatch: pytest.MonkeyPatch) -> RanCultures:
-    def ran(study: Study, folder: Path, **_: Any) -> Ran:
+def run_scored(folder: Path, monkeypatch: pytest.MonkeyPatch) -> CulturesRun:
+    def ran(study: Study, folder: Path, **_: Any) -> StudyRun:
         results_file(folder).parent.mkdir(parents=True, exist_ok=True)
         scores = tuple(Score(**SCORED | {"mean_return": study.culture.seed + i / 3}) for i in range(2))
         write_typed(results_file(folder), Results(scores, (), (), (), (), ()))
-        return Ran(folder, folder / "report.html", 1, {})
+        return StudyRun(folder, folder / "report.html", 1, {})
 
     monkeypatch.setattr(cultures, "run_study", ran)
     return run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1-3")), folder)
@@ -275,9 +275,9 @@ def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     files = 'files = ["data/tiny"]'
     (tmp_path / "many.toml").write_text(TINY.read_text().replace(files, 'folders = ["one", "other"]'))
     assert main(["study", str(tmp_path / "many.toml"), "--out", str(tmp_path / "many"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["cultures"] == ["culture-one", "culture-other"]
-    assert {row["cultures"] for row in told["over_cultures"]} == {2}
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary["cultures"] == ["culture-one", "culture-other"]
+    assert {row["cultures"] for row in summary["over_cultures"]} == {2}
     alone = replace(read_study(TINY), culture=Source("files", files=("other",)))
     run_study(alone, tmp_path / "alone", base=tmp_path)
     both = (tmp_path / "many" / "culture-other", tmp_path / "alone")
@@ -293,7 +293,7 @@ def test_as_a_user_it_ends_with_the_tables_of_each_culture_alone(
     assert "failed: culture-missing" in err and "1 of 2 cultures failed" in err
 
 
-def test_results_that_cannot_be_read_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cultures, "run_study", lambda study, folder, **_: Ran(folder, folder, 1, {}))
+def test_results_that_cannot_be_read_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cultures, "run_study", lambda study, folder, **_: StudyRun(folder, folder, 1, {}))
     with pytest.raises(InvalidFile, match="results"):
         run_over_cultures(replace(read_study(TINY), culture=Source(seeds="1")), tmp_path)

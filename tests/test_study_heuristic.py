@@ -1,4 +1,4 @@
-"""What a study says of its policies beside the heuristic policy, for returns whose order is known."""
+"""How a study compares its policies with the heuristic policy, for returns whose order is known."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from scipy.stats import mannwhitneyu
 
 from animat.evaluation.rollouts import Episodes
 from animat.report.results import Results
-from animat.studies.episodes import RANDOM, tabulated
-from animat.studies.heuristic import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, beside_heuristic, not_outperforming
+from animat.studies.episodes import RANDOM, episode_rows
+from animat.studies.heuristic import HEURISTIC, NOT, OUTPERFORM, TOO_FEW, compare_with_heuristic, not_outperforming
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.tabulating import performances
 
 
-def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
+def test_policies_that_do_not_outperform_the_heuristic_are_named() -> None:
     spec, arm = RobotSpec("cartpole"), Arm("1 threshold")
     without = Arm("without neurons", mapping="none", trained=False)
     study = Study(robots=(spec,), arms=(arm, without))
@@ -23,13 +23,13 @@ def test_policies_that_bring_no_more_than_the_rule_are_named() -> None:
     parts, ours, theirs = [], {}, {}
     for at_min, (episodes, by) in minutes.items():
         ours[at_min], theirs[at_min] = rng.normal(by, 10, (2, episodes)), rng.normal(0, 10, (1, episodes))
-        parts.append(tabulated(episodes_of(ours[at_min]), robot="cartpole", arm=arm.name, at_min=at_min))
+        parts.append(episode_rows(episodes_of(ours[at_min]), robot="cartpole", arm=arm.name, at_min=at_min))
         for agent, returns in ((HEURISTIC, theirs[at_min]), (RANDOM, np.full((1, episodes), -80.0))):
-            told = {"robot": "cartpole", "arm": "1-threshold", "agent": agent, "at_min": at_min}
-            parts.append(tabulated(episodes_of(returns), **told))
+            columns = {"robot": "cartpole", "arm": "1-threshold", "agent": agent, "at_min": at_min}
+            parts.append(episode_rows(episodes_of(returns), **columns))
 
     table = pd.concat(parts)
-    rows = tuple(beside_heuristic(study, table, spec))
+    rows = tuple(compare_with_heuristic(study, table, spec))
     assert [row.outcome for row in rows] == [OUTPERFORM, NOT, NOT, TOO_FEW]
     for row in rows:
         a, b = ours[row.at_min].ravel(), theirs[row.at_min].ravel()

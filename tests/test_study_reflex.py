@@ -1,4 +1,4 @@
-"""A study's policies beside the best coupling: gap and score are what their formulas make of the episodes."""
+"""A study's policies against the best coupling: gap and score follow their formulas."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from animat.report.results import BesideReflex, StudyOptimum
-from animat.studies.episodes import COUPLING, RANDOM, tabulated
-from animat.studies.reflex import beside_reflex, reflexes_told
+from animat.report.results import ReflexComparison, StudyOptimum
+from animat.studies.episodes import COUPLING, RANDOM, episode_rows
+from animat.studies.reflex import compare_with_reflex, describe_reflexes
 from animat.studies.specification import Arm, RobotSpec, Study
 from test_study_results import episodes_of
 
@@ -26,19 +26,19 @@ def optimum(**changed: object) -> StudyOptimum:
     return StudyOptimum("cartpole", "1-threshold", "moving", 0.0, nodes=None, **dict.fromkeys(none), **known | changed)  # type: ignore[arg-type]
 
 
-def found(coupled: np.ndarray, *optima: StudyOptimum) -> list[BesideReflex]:
-    told = {"policy": POLICIES, RANDOM: RANDOMS, COUPLING: coupled}
+def found(coupled: np.ndarray, *optima: StudyOptimum) -> list[ReflexComparison]:
+    returns_of = {"policy": POLICIES, RANDOM: RANDOMS, COUPLING: coupled}
     table = pd.concat(
-        tabulated(
+        episode_rows(
             episodes_of(returns),
             robot="cartpole",
             arm="taught" if agent == "policy" else "1-threshold",
             agent=agent,
             at_min=0.0,
         )
-        for agent, returns in told.items()
+        for agent, returns in returns_of.items()
     )
-    return list(beside_reflex(STUDY, table, STUDY.robots[0], optima))
+    return list(compare_with_reflex(STUDY, table, STUDY.robots[0], optima))
 
 
 def test_gap_and_score_are_those_of_the_formulas() -> None:
@@ -68,10 +68,10 @@ def test_a_task_that_a_reflex_does_has_no_score() -> None:
     assert not row.needs_context and row.score is None
     assert row.gap == pytest.approx(0.0)
     returned = row.coupling
-    assert reflexes_told([row]) == [
+    assert describe_reflexes([row]) == [
         f"cartpole, taught, at 0 min: the best reflex returns {returned:.1f}; the task needs no more than that."
     ]
-    (unsure,) = reflexes_told([replace(row, gap_high_95=0.06)])
+    (unsure,) = describe_reflexes([replace(row, gap_high_95=0.06)])
     assert unsure.endswith("; whether the task needs more is not known.")
 
 
@@ -80,9 +80,9 @@ def test_without_the_optimum_of_all_conditions_there_is_no_row(known: list[Study
     assert found(np.array([[40.0, 50.0]]), *known) == []
 
 
-def test_it_is_told_in_a_sentence() -> None:
-    (told,) = reflexes_told(found(np.array([[45.0, 45.0]]), optimum()))
-    assert told == (
+def test_gap_and_score_are_reported_in_a_sentence() -> None:
+    (sentence,) = describe_reflexes(found(np.array([[45.0, 45.0]]), optimum()))
+    assert sentence == (
         "cartpole, taught, at 0 min: the best reflex returns 45.0; the task needs more; "
         "the policies' context score is 0.62."
     )

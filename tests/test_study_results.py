@@ -1,4 +1,4 @@
-"""What a study's tables say: of returns whose order is known, of episodes run apart, and of a real recording."""
+"""A study's tables: for returns whose order is known, for episodes run separately, and for a real recording."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
 from animat.responses.series import extract_series
 from animat.robots import Navigation
-from animat.studies.episodes import COLUMNS, RANDOM, mean_returns, read_episodes, tabulated, write_episodes
+from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
 from animat.studies.optima import FindOptima, read_optima
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
+from animat.studies.report_tables import optima_table
 from animat.studies.results import read_typed, write_typed
-from animat.studies.shown import optima_shown
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
-from animat.studies.specification import Arm, Compared, RobotSpec, Study, named_mapping
-from animat.studies.tabulating import References, Tabulate, _known
+from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
+from animat.studies.tabulating import References, Tabulate, _finite
 from animat.studies.task import draw_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -67,7 +67,7 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
         for arm in study.arms:
             # A third episode, that no comparison asks for, would turn every order around.
             returns = np.array([[mean - 1.0, mean + 1.0, -4.0 * mean] for mean in RETURNS[arm.name]])
-            table = tabulated(episodes_of(returns), robot=spec.name, arm=arm.name, at_min=0.0)
+            table = episode_rows(episodes_of(returns), robot=spec.name, arm=arm.name, at_min=0.0)
             write_episodes(episodes_file(folder, spec, arm), [table])
         write_random(folder, spec, LIKE, 0.0)
         optimum = StudyOptimum(spec.name, "none", "moving", 0.0, 20.0, None, None, 0.1, 20.0, 0.1, 20.0, 0.1, 100, None)
@@ -81,8 +81,8 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
 
 def write_random(folder: Path, spec: RobotSpec, arm: Arm, *minutes: float) -> None:
     """Controls of which only random is there: one episode a minute, with a return of -80."""
-    ran, through = episodes_of(np.array([[-80.0]])), named_mapping(arm.mapping, arm.percentiles)
-    tables = [tabulated(ran, robot=spec.name, arm=through, agent=RANDOM, at_min=at_min) for at_min in minutes]
+    ran, through = episodes_of(np.array([[-80.0]])), mapping_label(arm.mapping, arm.percentiles)
+    tables = [episode_rows(ran, robot=spec.name, arm=through, agent=RANDOM, at_min=at_min) for at_min in minutes]
     write_episodes(controls_file(folder, spec, arm), tables)
 
 
@@ -95,8 +95,8 @@ def episodes_of(returns: np.ndarray) -> Episodes:
 def test_the_table_of_episodes_has_a_row_for_each(tmp_path: Path) -> None:
     returns, terminated = np.array([[1.0, 2.5], [-3.0, 0.1]]), np.array([[True, False], [False, False]])
     ran = replace(episodes_of(returns), terminated=terminated)
-    parts = [tabulated(ran, robot="cartpole", arm="a b", at_min=at_min) for at_min in (0.0, 10.5)]
-    other = tabulated(ran, robot="cartpole", arm="1-threshold", agent="silent", at_min=0.0, over_time=True)
+    parts = [episode_rows(ran, robot="cartpole", arm="a b", at_min=at_min) for at_min in (0.0, 10.5)]
+    other = episode_rows(ran, robot="cartpole", arm="1-threshold", agent="silent", at_min=0.0, over_time=True)
     files = [write_episodes(tmp_path / "a.npz", parts), write_episodes(tmp_path / "b.npz", [other])]
     table = read_episodes(files)
     assert tuple(table) == COLUMNS and len(table) == 12
@@ -140,12 +140,12 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
 
 
 def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_are_json(tmp_path: Path) -> None:
-    assert [_known(end) for end in (-np.inf, 1.5, np.inf)] == [None, 1.5, None]
+    assert [_finite(end) for end in (-np.inf, 1.5, np.inf)] == [None, 1.5, None]
     score = Score("rover", "one", "none", 0.0, 1, 2, 3.0, None, 3.0, *5 * [None])
     results = Results((score,), (), (), (), (), ())
     write_typed(tmp_path / "results.json", results)
-    told = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
-    assert told["scores"][0]["low_95"] is None
+    data = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+    assert data["scores"][0]["low_95"] is None
     assert read_typed(tmp_path / "results.json", Results) == results
 
 
@@ -223,7 +223,7 @@ def optima_of(folder: Path, name: str = "optima") -> tuple[StudyOptimum, ...]:
 
 
 @pytest.mark.oracle
-def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
+def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_named(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     series = extract_series(read_recordings(recorded / "recordings"))
@@ -254,7 +254,7 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_told(
     rough = optima_of(recorded, "over-time")
     assert [row.left_out for row in rough] == [at_first.left_out, None]
     assert {row.low_95 for row in rough} == {None}
-    note = optima_shown((at_first, at_last, without))
+    note = optima_table((at_first, at_last, without))
     assert "1 of 3 optima leave out conditions with fewer than 30 responses" in note.note
     assert note.rows[0][-1] == at_first.left_out
 
@@ -269,7 +269,7 @@ def test_where_no_condition_has_enough_responses_a_study_has_no_optimum(
         assert row.left_out.count(" Hz (") == 5
         assert set(astuple(row)[4:-1]) == {None}
     assert without.best_return > 0
-    shown = optima_shown((at_first, without))
+    shown = optima_table((at_first, without))
     assert shown.rows[0][shown.head.index("optimum ± grid")] is None and 0 not in shown.marked
 
 

@@ -559,7 +559,7 @@ def test_figures_of_one_name_are_refused(recorded: Path, tmp_path: Path, capsys:
     other = tmp_path / "recording_0000_min.nwb"
     shutil.copy(recorded / other.name, other)
     assert main(["validate", str(recorded), str(other), "--out", str(tmp_path / "figures")]) == 1
-    assert "--out: expected recordings of different names" in capsys.readouterr().err
+    assert "--out: expected recordings with different names" in capsys.readouterr().err
     assert not list((tmp_path / "figures").glob("*"))
 
 

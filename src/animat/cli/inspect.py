@@ -44,7 +44,7 @@ class Inspect(ResponseOptions):
         """Inspect each file."""
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings
-        from animat.report.inspection import expect_unlike_stems
+        from animat.report.inspection import expect_unique_stems
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
@@ -63,8 +63,8 @@ class Inspect(ResponseOptions):
         check_threshold(self.burst_threshold)
         files = list_recordings(self.recordings)
         if self.out is not None:
-            # "series" is the stem of the series' own figures.
-            expect_unlike_stems([file.name for file in files], "series")
+            # The figures of the series have a name of their own.
+            expect_unique_stems([file.name for file in files], "series")
         with Bar("inspecting") as progress:
             return self._inspect(files, by, window_ms, progress)
 

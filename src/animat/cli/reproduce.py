@@ -51,7 +51,7 @@ class Reproduce(JobOptions, StudyOptions):
     def _context(self, cultures: list[int]) -> dict[str, Any]:
         """Run the context study."""
         from animat.studies.context import run_context_study
-        from animat.studies.context_page import in_short, write_context_page
+        from animat.studies.context_page import summarise_robot, write_context_page
         from animat.studies.context_tasks import ContextStudy, quick_context_study
 
         study = (quick_context_study if self.quick else ContextStudy)(cultures=tuple(cultures), seed=self.seed)
@@ -59,7 +59,7 @@ class Reproduce(JobOptions, StudyOptions):
             results = run_context_study(study, self.out, **execution)
         report = write_context_page(study, results)
         for robot in study.robots:
-            print(f"{robot}: {in_short([row for row in results.rows if row.robot == robot])}")
+            print(f"{robot}: {summarise_robot([row for row in results.rows if row.robot == robot])}")
         print(f"report: {report}")
         return {
             "folder": str(results.folder),

@@ -96,18 +96,18 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     if cells:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(lined_up(head, cells)))
-    jobs = sum(len(ran.done_now) for ran in results.ran.values())
-    print(f"{len(results.ran)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
+    jobs = sum(len(each.done_now) for each in results.finished.values())
+    print(f"{len(results.finished)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
     if results.parquet is None:
         print(f"scores.csv only, no Parquet table: {MISSING}")
     for name, why in results.failed.items():
         print(f"failed: {name}: {why}", file=sys.stderr)
     if results.failed:
-        total = len(results.ran) + len(results.failed)
+        total = len(results.finished) + len(results.failed)
         raise AnimatError(f"{len(results.failed)} of {total} cultures failed; the same command tries them again")
     return {
         "folder": str(results.folder),
         "report": str(report),
-        "cultures": list(results.ran),
+        "cultures": list(results.finished),
         "over_cultures": [asdict(row) for row in results.summary],
     }

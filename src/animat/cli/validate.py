@@ -40,7 +40,7 @@ class Validate(ResponseOptions):
         from animat.neurons.validation import correlations, validate
         from animat.progress import Bar
         from animat.recordings.reading import list_recordings, read_source
-        from animat.report.inspection import expect_unlike_stems, figure_stem
+        from animat.report.inspection import expect_unique_stems, figure_stem
         from animat.report.style import save_figure
         from animat.report.validation import correlations_text, draw_validation, validation_text
         from animat.responses.conditions import conditions_named
@@ -56,7 +56,7 @@ class Validate(ResponseOptions):
         readouts = read_readouts(self.readouts)
         files = list_recordings(self.recordings)
         if self.out is not None:
-            expect_unlike_stems([file.name for file in files])
+            expect_unique_stems([file.name for file in files])
         keep_compilations()
         validated = []
         with Bar("validating") as progress:

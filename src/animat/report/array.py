@@ -1,4 +1,4 @@
-"""The array from above: where is recorded, how active each site is, and where is stimulated."""
+"""The array from above: recording sites with their activity, and stimulated electrodes."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _MOST_LABELS = 64
 def draw_array(recording: Recording) -> Figure:
     """Recording sites coloured by their firing rate, and the electrodes that were stimulated.
 
-    A stimulated electrode is drawn where a channel reads it; the title counts those whose position is not known.
+    A stimulated electrode is drawn if a channel reads it; the title counts the others, and channels without position.
     """
     channels, stimuli = recording.channels, recording.stimuli
     rate_hz = rates_of_sites(recording)
     known = np.isfinite(channels.x_um) & np.isfinite(channels.y_um)
-    # In the shape of what is drawn, with room for title, legend and colour bar.
+    # The figure has the array's aspect ratio, with room for title, legend and colour bar.
     places_um = channels.x_um[known], channels.y_um[known]
     width_um, height_um = (max(float(np.ptp(along)), 1.0) if len(along) else 1.0 for along in places_um)
     shape = float(np.clip(width_um / height_um, 0.4, 2.5))
     across_in, down_in = (6.5, 6.5 / shape) if shape > 1.5 else (4.2 * shape, 4.2)
     figure = new_figure(max(across_in + 1.8, 5.0), down_in + 1.4)
     axes = figure.subplots()
-    # A few channels of a very high rate must not leave all others dark.
+    # A few channels with a very high rate must not leave all others dark.
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
     of_rates: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
     drawn = axes.scatter(*places_um, s=9, linewidths=0, **of_rates)
@@ -45,7 +45,7 @@ def draw_array(recording: Recording) -> Figure:
     unplaced = len(stimulated) - len(rows)
     title = f"{np.count_nonzero(known):,} recording sites at {recording.start_min:g} min"
     if np.any(~known):
-        title += f"\n{np.count_nonzero(~known):,} channels of unknown position are not drawn"
+        title += f"\n{np.count_nonzero(~known):,} channels at unknown positions are not drawn"
     if unplaced:
         title += f"\n{unplaced} stimulated electrodes that no channel reads are not drawn"
     _finish(axes, title)
@@ -53,7 +53,7 @@ def draw_array(recording: Recording) -> Figure:
 
 
 def rates_of_sites(recording: Recording) -> Float64[np.ndarray, " channels"]:
-    """Spikes a second on each channel over the whole recording, stimulated time included."""
+    """Spikes per second on each channel over the whole recording, including stimulation."""
     counts = np.bincount(recording.spike_channels, minlength=len(recording.channels))
     return np.asarray(counts / max(recording.duration_s, 1e-9), np.float64)
 
@@ -88,7 +88,7 @@ def _finish(axes: Axes, title: str) -> None:
     # Rows are counted from the top, as on the chip.
     axes.invert_yaxis()
     style_axes(axes, "", "x (µm)", "y (µm)")
-    # Of the whole figure, as axes that are narrow would cut it off.
+    # A title of the whole figure, as narrow axes would cut it off.
     axes.figure.suptitle(title, fontsize=10, x=0.02, ha="left")
     if axes.get_legend_handles_labels()[0]:
         add_legend(axes, loc="upper left", bbox_to_anchor=(0, -0.14), ncols=3)

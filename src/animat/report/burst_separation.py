@@ -1,4 +1,4 @@
-"""The four panels that show whether bursts stand apart from other responses."""
+"""Four panels that show whether bursts are separate from other responses."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _NONE = "no response is set apart as a burst"
 
 
 def draw_burst_separation(responses: Responses) -> Figure:
-    """All x; x against the ratio of active channels; that ratio with the threshold; x against it, labelled.
+    """Panels: all x; x against the ratio of active channels; that ratio with the threshold; x against it, labelled.
 
-    Where no response is a burst, there is no threshold and no fourth panel.
+    If no response is a burst, there is no threshold and no fourth panel.
     """
     n_bursts, n_channels = int(np.count_nonzero(responses.is_burst)), responses.n_channels
     figure = new_figure(9.0, 6.8) if n_bursts else new_figure(12.0, 3.6)
@@ -26,7 +26,7 @@ def draw_burst_separation(responses: Responses) -> Figure:
     style_axes(all_x, f"{len(responses):,} responses", _RATE, "responses (count)")
     _scatter(plain, responses, np.ones(len(responses), dtype=bool), BLUE, None)
     style_axes(plain, "response against active channels", _RATIO, _RATE)
-    # A bar for every possible ratio, k/N, up to 40 bars.
+    # One bar for every possible ratio, k/N, up to 40 bars.
     ratios.hist(responses.active_ratio, even_edges(responses.active_ratio, 1 / n_channels, 40).tolist(), color=BLUE)
     style_axes(ratios, f"separability {responses.separability:.2f}" if n_bursts else _NONE, _RATIO, "responses (count)")
     for labelled in more:
@@ -34,7 +34,7 @@ def draw_burst_separation(responses: Responses) -> Figure:
         _scatter(labelled, responses, responses.is_burst, BURST, f"burst ({n_bursts:,})")
         style_axes(labelled, "bursts set apart", _RATIO, _RATE)
     for axes in (ratios, *more) if n_bursts else ():
-        # Between the largest ratio that is no burst and the next possible one.
+        # Between the largest ratio that is not a burst and the next possible one.
         label = f"threshold {responses.threshold:.3f}"
         axes.axvline(responses.threshold + 0.5 / n_channels, color=BLACK, linestyle="--", linewidth=1, label=label)
         add_legend(axes, loc="best", markerscale=2)

@@ -1,4 +1,4 @@
-"""Box plots of comparisons: every policy a point, with random, the optimum and the significance."""
+"""Box plots of comparisons, with one point per policy, random actions, the optimum and the significance."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from animat.report.style import (
 
 
 class Pair(NamedTuple):
-    """A comparison with what its row does not hold.
+    """A comparison with the data that its row does not have.
 
     Attributes:
         first, second: each policy's mean return, shape (policies,).
-        random_first: mean return of random actions in the first arm; None where not known.
+        random_first: mean return of random actions in the first arm; None if not known.
     """
 
     row: ComparedReturns
@@ -39,15 +39,15 @@ class Pair(NamedTuple):
 
 
 def stars(p: float) -> str:
-    """The usual marks: * below 0.05, ** below 0.01, *** below 0.001; n.s. from 0.05."""
+    """The usual marks: * below 0.05, ** below 0.01, *** below 0.001; otherwise n.s."""
     return "***" if p < 0.001 else "**" if p < 0.01 else "*" if p < 0.05 else "n.s."
 
 
 def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
-    """A column a comparison: above with random actions (dotted) and the optimal return (dashed), below close up.
+    """One column per comparison: above with random actions (dotted) and the optimal return (dashed), below enlarged.
 
-    Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; policies are
-    points. All pairs are of one robot; at least one is given.
+    Boxes reach from the first to the third quartile with the median, whiskers to 1.5 times that range; points are
+    policies. `pairs` has at least one comparison, all on one robot.
     """
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
     figure.suptitle(title, fontsize=10)
@@ -65,21 +65,21 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         low, high = whole.get_ylim()
         room = high - low
         whole.plot([0, 0, 1, 1], high + room * np.array([0.03, 0.06, 0.06, 0.03]), color=BLACK, linewidth=0.9)
-        words = f"{stars(row.p_holm)}  p corrected = {cell(row.p_holm)}, U = {row.u:g}"
-        whole.text(0.5, high + 0.08 * room, words, ha="center", va="bottom", fontsize=8)
+        label = f"{stars(row.p_holm)}  p corrected = {cell(row.p_holm)}, U = {row.u:g}"
+        whole.text(0.5, high + 0.08 * room, label, ha="center", va="bottom", fontsize=8)
         whole.set_ylim(low, high + 0.2 * room)
-        for axes, words in ((whole, f"at {row.at_min:g} min"), (close, "close up")):
+        for axes, title in ((whole, f"at {row.at_min:g} min"), (close, "enlarged")):
             axes.set_xlim(-0.6, 1.6)
             axes.set_xticks([0, 1], [_name(row.first, row.score_first), _name(row.second, row.score_second)])
-            style_axes(axes, words, "", "mean return of a policy")
+            style_axes(axes, title, "", "mean return of a policy")
     add_common_legend(figure, list(rows[0]), columns=2)
     return figure
 
 
 def _name(arm: str, score: float | None) -> str:
-    """The arm in two lines, and its score in a third."""
+    """The arm on two lines, and its score on a third."""
     name = arm if " " in arm else f"{arm} "
-    # Adding 0 takes the sign off a zero.
+    # Adding 0 turns -0 into 0.
     scored = "" if score is None else f"\nscore {round(score, 2) + 0.0:.2f}"
     return with_minus(name.replace(" ", "\n", 1) + scored)
 
@@ -94,7 +94,7 @@ def _draw_boxes(axes: Axes, returns: Float64[np.ndarray, " policies"], place: in
         boxprops={"facecolor": colour, "alpha": 0.35, "linewidth": 0.8},
         medianprops={"color": BLACK, "linewidth": 1.2},
     )
-    # Spread by rank, not at random: the same figure each time.
+    # Spread by rank, not at random, so that the figure is the same each time.
     sideways = np.zeros(len(returns))
     sideways[np.argsort(returns)] = 0.12 * np.resize([-1.0, 1.0, 0.0], len(returns))
     axes.scatter(place + sideways, returns, s=12, color=colour, edgecolors=BLACK, linewidths=0.4, zorder=3)

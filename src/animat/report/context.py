@@ -1,32 +1,38 @@
-"""What a task asks for beyond a reflex, what policies do beyond one, and what they lose by interventions."""
+"""What a task needs beyond a reflex, what policies do beyond one, and what they lose by interventions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from animat.report.results import ADMITTED, ContextRow
+from animat.report.results import CONTEXT_GAP_LEVEL, ContextRow
 from animat.report.style import BLACK, BLUE, GREY, ORANGE, Axes, Figure, add_common_legend, new_figure, style_axes
 
-_APART = 0.11
-"""Between two cultures of a row, in rows."""
+_SPACING = 0.11
+"""Distance between two cultures on a row, in rows."""
 
 
 def draw_context(rows: Mapping[str, Sequence[ContextRow]]) -> Figure:
-    """Context gaps of tasks beside context scores of policies: a row a robot, a point a culture with its interval.
+    """Context gaps of tasks and context scores of policies: one row per robot, one point with interval per culture.
 
     Args:
-        rows: by the robot's name, of each culture.
+        rows: one row per culture, by the robot's name.
     """
     figure = new_figure(9.2, 1.7 + 0.55 * len(rows))
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "The task: is a reflex enough?", "context gap (0: a reflex does it all, 1: it does nothing)", "")
     style_axes(right, "The policies: more than a reflex?", "context score (0: the best reflex, 1: optimal)", "")
-    left.axvline(ADMITTED, color=ORANGE, linewidth=1, linestyle="--", label=f"from {ADMITTED:g} on: needs context")
+    left.axvline(
+        CONTEXT_GAP_LEVEL,
+        color=ORANGE,
+        linewidth=1,
+        linestyle="--",
+        label=f"from {CONTEXT_GAP_LEVEL:g} on: needs context",
+    )
     for axes, name, colour in ((left, "gap", BLUE), (right, "score", BLACK)):
         axes.axvline(0, color=GREY, linewidth=0.8)
         nothing = "not known" if axes is left else "none: no task beyond a reflex, or not known"
         _points(axes, rows, name, colour, nothing)
-        # An interval of two policies can be as wide as it likes; what matters is on which side of 0 it ends.
+        # An interval of two policies can be arbitrarily wide; only the side of 0 on which it ends matters.
         low, high = axes.get_xlim()
         values = [value for of_robot in rows.values() for row in of_robot if (value := getattr(row, name)) is not None]
         low, high = max(min(low, -0.05), -1.0), min(max(high, 1.05), 2.0)
@@ -43,26 +49,26 @@ def _points(axes: Axes, rows: Mapping[str, Sequence[ContextRow]], name: str, col
         if not known:
             axes.text(0.02, i, nothing, fontsize=8, color=GREY, va="center")
         for j, row in enumerate(known):
-            place = i + _APART * (j - (len(known) - 1) / 2)
+            place = i + _SPACING * (j - (len(known) - 1) / 2)
             value, low, high = (getattr(row, each) for each in (name, f"{name}_low_95", f"{name}_high_95"))
             ends = [end for end in (low, high) if end is not None]
             axes.plot(ends, [place] * len(ends), color=colour, linewidth=1.2)
-            marker, label = (">", "at least") if row.is_least else ("o", "a culture, 95 % interval")
+            marker, label = (">", "lower bound") if row.is_least else ("o", "a culture, 95 % interval")
             axes.plot([value], [place], marker, color=colour, markersize=4, label=label)
 
 
 def draw_whose_work(lost: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """What policies lose by each intervention, in parts of what they have over random stimuli: a panel a robot.
+    """Return lost by each intervention, as a fraction of the advantage over random stimuli: one panel per robot.
 
     Args:
-        lost: by robot and intervention, of each culture; 1: all that they have over random stimuli.
+        lost: this fraction on each culture, by robot and intervention.
     """
     most = max(len(each) for each in lost.values())
     figure = new_figure(2.6 * len(lost) + 1.6, 1.5 + 0.34 * most)
     names = list(dict.fromkeys(name for each in lost.values() for name in each))
     panels = figure.subplots(1, len(lost), squeeze=False, sharey=True)[0]
     for axes, (robot, each) in zip(panels, lost.items(), strict=True):
-        style_axes(axes, robot, "return lost (1: all over random stimuli)", "")
+        style_axes(axes, robot, "return lost (1: whole advantage)", "")
         for at in (0, 1):
             axes.axvline(at, color=GREY, linewidth=0.8)
         for name, values in each.items():

@@ -1,4 +1,4 @@
-"""Controls beside the trained policies: is it the culture that does the work?"""
+"""Controls and trained policies: is it the culture that does the work?"""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from animat.report.html import with_minus
 from animat.report.results import TRAINED, ControlReturns
 from animat.report.style import BLUE, GREY, OPTIMUM, ORANGE, Figure, add_common_legend, grid_of_panels, style_axes
 
-_MOST_LETTERS = 36
-"""Of a title over a panel."""
+_TITLE_WIDTH = 36
+"""Characters per line of a panel's title."""
 
 
 def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], title: str) -> Figure:
-    """A panel a mapping and recording: mean returns with their standard errors, random actions and the optimum.
+    """One panel per mapping and recording: mean returns with standard errors, random actions and the optimum.
 
     Args:
-        panels_of: a title each, with the trained policies and then the controls of one mapping at one recording.
+        panels_of: for each panel a title, and the trained policies followed by the controls.
     """
     most = max(len(rows) for _, rows in panels_of)
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)
@@ -32,7 +32,7 @@ def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], tit
             axes.axvline(rows[0].optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
         if rows[0].random is not None:
             axes.axvline(rows[0].random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
-        style_axes(axes, fill(through, _MOST_LETTERS), "mean return and its standard error", "")
+        style_axes(axes, fill(through, _TITLE_WIDTH), "mean return and its standard error", "")
         axes.locator_params(axis="x", nbins=5)
         axes.grid(axis="y", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=4)

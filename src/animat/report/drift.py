@@ -12,14 +12,14 @@ from animat.report.style import BLACK, BURST, GREY, Figure, add_legend, conditio
 from animat.responses.responses import Responses
 
 PERCENTILES = (10, 25, 50, 75, 90)
-"""Of the responses, that are drawn."""
+"""Percentiles of the responses that are drawn."""
 
 _MOST_CONDITIONS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What changes from recording to recording; NaN where there are no responses.
+    """Changes from recording to recording; NaN if there are no responses.
 
     Attributes:
         minutes: starts of the recordings, shape (recordings,).
@@ -35,7 +35,7 @@ class Drift:
 
 
 def drift_of(series: Sequence[Responses]) -> Drift:
-    """The numbers of the figure, of responses with the same conditions in the order of time."""
+    """The numbers of the figure, from responses with the same conditions in order of time."""
     pooled = [responses.non_burst_rate_hz for responses in series]
     return Drift(
         np.array([responses.start_min for responses in series]),
@@ -46,9 +46,9 @@ def drift_of(series: Sequence[Responses]) -> Drift:
 
 
 def draw_drift(series: Sequence[Responses]) -> Figure:
-    """Against the minutes: the pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts.
+    """Pooled percentiles, P(x >= P50) of at most 12 conditions, and the share of bursts, all over time.
 
-    The responses are those of `drift_of`.
+    `series` is as for `drift_of`.
     """
     drift = drift_of(series)
     minutes, percentiles = drift.minutes, drift.percentiles_hz

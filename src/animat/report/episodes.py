@@ -1,4 +1,4 @@
-"""Episodes as paths and as frames, one arm beside the other."""
+"""Episodes as paths and as frames, arm by arm."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _FRAMES = 7
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
-    """A panel for each arm with one episode of each policy, as a robot with a method `draw_paths` draws them.
+    """One panel per arm with one episode of each policy, drawn by the robot's method `draw_paths`.
 
-    The observations are in the robot's own units.
+    Observations are in the robot's units.
     """
     draw = capability(robot, "draw_paths")
     figure, panels = grid_of_panels(len(paths), 3, 3.1, 2.5, title)
@@ -30,9 +30,9 @@ def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: st
 
 
 def draw_frames(robot: Robot[Any], episodes: Mapping[str, tuple[Path, Sequence[float]]], title: str) -> Figure:
-    """A row for each arm: pictures of the robot from the start of an episode to its end, evenly spread.
+    """One row per arm: pictures of the robot from the start of an episode to its end, evenly spaced.
 
-    Of each arm's episode the observations and the commands are given.
+    `episodes` has the observations and commands of one episode of each arm.
     """
     first = draw_robot(robot, next(iter(episodes.values()))[0][0])
     wide = first.shape[1] / first.shape[0]

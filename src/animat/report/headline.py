@@ -12,13 +12,13 @@ from animat.report.style import BLUE, GREY, OPTIMUM, SKY, Figure, add_common_leg
 
 
 def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]], *, narrow: bool = False) -> Figure:
-    """A panel a robot, a line an arm: the policies with their interval, random actions, the optimal return.
+    """One panel per robot, one row per arm: the policies with their interval, random actions, the optimal return.
 
-    The axis reaches as far as returns do; an interval that goes on beyond it ends in an arrow. A narrow figure is as
-    wide as a telephone, with the panels below each other.
+    The axis covers all returns; an interval that extends beyond it ends in an arrow. A narrow figure is as wide as a
+    phone, with the panels below each other.
 
     Args:
-        rows: an arm on a robot each, with the mean return of each of its policies.
+        rows: for each arm and robot the scores, and the mean return of each policy.
     """
     robots = list(dict.fromkeys(row.robot for row, _ in rows))
     most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
@@ -31,7 +31,7 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
         style_axes(axes, robot, "mean return of an episode", "")
         every = [(row.interquartile_mean, row.random, row.optimum, *policies.tolist()) for row, policies in own]
         known = [value for of_arm in every for value in of_arm if value is not None]
-        # Every return, with some room for intervals on either side.
+        # All returns, with some room for intervals on either side.
         room = 0.08 * (max(known) - min(known)) or 1.0
         left, right = min(known) - room, max(known) + room
         for place, (row, policies) in enumerate(own):

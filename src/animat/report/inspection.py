@@ -25,19 +25,18 @@ _MARK = {"refuse": "!!", "warning": "! ", "note": "- "}
 
 
 def inspection_text(inspection: Inspection) -> str:
-    """Lines for a terminal: what the recording holds, its responses, the conditions, the findings, the verdict."""
+    """Lines for a terminal: the verdict, the recording's contents, its responses, the conditions, and the findings."""
     responses = inspection.responses
     start_ms, end_ms = responses.window_ms
-    # As far as it is known.
-    spikes = "rates" if inspection.n_spikes is None else _many(inspection.n_spikes, "spike")
-    of_s = inspection.duration_s
-    span = f" in {of_s:,.1f} s ({of_s / 60:.1f} min)" if math.isfinite(of_s) else ""
+    spikes = "rates" if inspection.n_spikes is None else _count(inspection.n_spikes, "spike")
+    duration_s = inspection.duration_s
+    span = f" in {duration_s:,.1f} s ({duration_s / 60:.1f} min)" if math.isfinite(duration_s) else ""
     start = f"from {inspection.start_min:g} min on the culture's clock"
     lines = [
         f"{inspection.name}: {inspection.verdict}",
-        f"  {spikes} on {_many(inspection.n_channels, 'channel')}{span}, {start}",
+        f"  {spikes} on {_count(inspection.n_channels, 'channel')}{span}, {start}",
         f"  {inspection.n_stimuli:,} {'stimulus' if inspection.n_stimuli == 1 else 'stimuli'}"
-        + (f" in {_many(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
+        + (f" in {_count(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
         + (f", {inspection.presentation}" if inspection.presentation else ""),
     ]
     if inspection.network_bursts is not None:
@@ -60,23 +59,23 @@ def inspection_text(inspection: Inspection) -> str:
     return "\n".join(lines)
 
 
-def _many(n: int, what: str) -> str:
-    return f"{n:,} {what}{'' if n == 1 else 's'}"
+def _count(n: int, noun: str) -> str:
+    return f"{n:,} {noun}{'' if n == 1 else 's'}"
 
 
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:
-    """The activity of a culture that nobody stimulated."""
+    """The activity without stimulation."""
     lines = [f"  {inspection.spontaneous_rate_hz:.3g} Hz per channel"] if inspection.duration_s else []
     if len(bursts):
-        a_minute = 60 * len(bursts) / inspection.duration_s
+        per_min = 60 * len(bursts) / inspection.duration_s
         lines.append(
-            f"  {_many(len(bursts), 'network burst')} ({a_minute:.3g} a minute) of {bursts.median_s:.2f} s (median) "
-            f"{'holds' if len(bursts) == 1 else 'hold'} {100 * bursts.share:.0f} % of all spikes"
+            f"  {_count(len(bursts), 'network burst')} ({per_min:.3g} per minute) of {bursts.median_s:.2f} s (median) "
+            f"{'contains' if len(bursts) == 1 else 'contain'} {100 * bursts.share:.0f} % of all spikes"
         )
     elif inspection.n_spikes:
         lines.append("  no network bursts")
     if (bin_s := float(bursts.edges_s[1] - bursts.edges_s[0])) > 1.01 * BIN_S:
-        lines[-1] += f"; looked for in bins of {bin_s:.3g} s, as the recording is so long"
+        lines[-1] += f"; detected in bins of {bin_s:.3g} s, as the recording is long"
     return lines
 
 
@@ -88,8 +87,8 @@ def draw_inspection(
 ) -> list[Path]:
     """Draw raster, post-stimulus histogram, burst separation and response histograms into a folder.
 
-    Files, in `FORMATS`, are named after the inspection's name. A recording without stimuli has a raster and its bursts
-    only, a table of responses no raster and no post-stimulus histogram.
+    Files are named after the inspection; `file_format` is one of `FORMATS`. For a recording without stimuli only a
+    raster with its bursts is drawn, for a table of responses neither raster nor post-stimulus histogram.
 
     Raises:
         InvalidFile: if a file cannot be written.
@@ -110,23 +109,23 @@ def draw_inspection(
 
 
 def figure_stem(name: str) -> str:
-    """What the figures' names of a recording begin with: its file's name without ending."""
+    """How the names of a recording's figures begin: with its file's name without suffix."""
     return Path(name).name.removesuffix(".gz").rsplit(".", 1)[0]
 
 
-def expect_unlike_stems(names: Sequence[str], *others: str) -> None:
-    """Refuse recordings whose figures would have the same names, or one of these others (InvalidArgument)."""
+def expect_unique_stems(names: Sequence[str], *others: str) -> None:
+    """Raise InvalidArgument if figures of several recordings, or one of `others`, would have the same name."""
     stems = [*others, *map(figure_stem, names)]
     for stem in stems:
         if stems.count(stem) > 1:
             raise InvalidArgument(
-                f"--out: expected recordings of different names, got figures that would all be called {stem}-...; "
-                "give them apart, or rename one"
+                f"--out: expected recordings with different names, got figures that would all be called {stem}-...; "
+                "pass them separately, or rename one"
             )
 
 
 def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHistogram:
-    """Wide enough for the window, and for the response where that lies elsewhere."""
+    """A histogram that includes the window, and also the response if that comes later."""
     end_ms = inspection.responses.window_ms[1]
     response = inspection.response
     if response is not None and response.start_ms >= end_ms:
@@ -137,7 +136,7 @@ def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHist
 
 def _table(inspection: Inspection) -> list[str]:
     conditions = inspection.conditions
-    chosen = " (chosen, as none were asked for)" if inspection.by_default else ""
+    chosen = " (chosen by default)" if inspection.by_default else ""
     shown = conditions[:_MOST_CONDITIONS]
     width = max([len("condition"), *(len(c.label) for c in shown)])
     lines = [

@@ -1,4 +1,4 @@
-"""What comparisons came to on each culture, and over all of them."""
+"""The results of comparisons on each culture, and over all of them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from animat.report.style import BLACK, BLUE, GREY, Figure, add_common_legend, ne
 
 
 def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> Figure:
-    """A panel a robot, a line a comparison: a point for each culture, their mean with its interval.
+    """One panel per robot, one row per comparison: a point for each culture, and their mean with its interval.
 
     Args:
-        rows: comparisons, each with the difference on every culture, second arm less first.
+        rows: comparisons, each with the difference on every culture, second arm minus first.
     """
     robots = list(dict.fromkeys(row.robot for row, _ in rows))
     most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
@@ -20,7 +20,7 @@ def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> 
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=True):
         own = [each for each in rows if each[0].robot == robot]
-        style_axes(axes, robot, "difference of the mean returns,\nsecond arm less first", "")
+        style_axes(axes, robot, "difference of the mean returns,\nsecond arm minus first", "")
         axes.axvline(0, color=GREY, linewidth=0.8)
         for place, (row, differences) in enumerate(own):
             places = [place + 0.16] * len(differences)

@@ -1,4 +1,4 @@
-"""Returns at every recording of a culture: what drift does to policies, with and without shadowing."""
+"""Returns at every recording of a culture: the effect of drift on policies, with and without shadowing."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from jaxtyping import Float64
 from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes
 
 MOST = len(PALETTE)
-"""Arms that a panel has colours for."""
+"""The most arms in a panel, as there are no more colours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """One arm's returns.
+    """The returns of one arm.
 
     Attributes:
-        name: the arm.
+        name: of the arm.
         minutes: of the recordings, shape (recordings,).
-        returns: mean return of each policy at each, shape (policies, recordings).
+        returns: mean return of each policy at each recording, shape (policies, recordings).
     """
 
     name: str
@@ -36,15 +36,15 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """The arms of one mapping, which share random actions and the optimal return.
+    """The arms of one mapping, with their common return of random actions and optimal return.
 
     Attributes:
         title: the mapping.
-        courses: with the same minutes, at most `MOST` to be drawn.
-        random: of random actions at the same minutes; None where not known.
-        optimum: the optimal return on a rough grid at the same minutes; None where not known.
-        fine_optimum: minutes and the optimal return on a fine grid at some of them.
-        left_out: arms that there is no room for.
+        courses: of the arms, with the same minutes; at most `MOST` are drawn.
+        random: return of random actions at the same minutes; None if not known.
+        optimum: optimal return on a rough grid at the same minutes; None if not known.
+        fine_optimum: pairs of a minute and the optimal return on a fine grid, for some minutes.
+        left_out: number of arms that are not drawn.
     """
 
     title: str
@@ -56,7 +56,7 @@ class Courses:
 
 
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
-    """A panel a mapping: median over policies of each arm with its quartiles, against the recording's minute.
+    """One panel per mapping: median and quartiles over policies of each arm, against the recording's minute.
 
     The end of training on the culture's clock is marked.
     """
@@ -80,6 +80,6 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
         if trained_until_min is not None:
             axes.axvline(trained_until_min, color=GREY, linewidth=1.0, label="end of training")
         more = f" ({of.left_out} more arms in the tables)" if of.left_out else ""
-        style_axes(axes, f"{of.title}{more}", "recording that answers (min)", "return")
+        style_axes(axes, f"{of.title}{more}", "recording (min)", "return")
     add_common_legend(figure, panels, columns=3)
     return figure

@@ -1,4 +1,4 @@
-"""The post-stimulus time histogram, with the window that responses are read in."""
+"""The post-stimulus time histogram, with the response window."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from animat.report.style import BLUE, GREY, RED, WINDOW, Figure, add_legend, new
 from animat.responses.psth import PostStimulusHistogram
 
 _ARTEFACT_MS = 5.0
-"""Bins nearer to the stimulus than this do not set the height of the axis when they would dwarf all others."""
+"""Bins closer to the stimulus do not set the height of the axis if they would dwarf all others."""
 
 
 def draw_psth(
     histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float | None = None
 ) -> Figure:
-    """Mean rate per channel against the time from the stimulus; what is lost in the artefact stands out as empty.
+    """Mean rate per channel against the time from the stimulus; a stretch lost in the artefact is empty.
 
-    The response window is marked, and the spontaneous rate, per channel too, is a line.
+    The response window is marked, and the spontaneous rate per channel is a line.
     """
     figure = new_figure(7.5, 3.8)
     axes = figure.subplots()
@@ -31,7 +31,7 @@ def draw_psth(
     width_ms = histogram.edges_ms[1] - histogram.edges_ms[0]
     title = f"{histogram.n_stimuli:,} stimuli, {histogram.n_channels:,} channels, bins of {width_ms:g} ms"
     centres_ms = 0.5 * (histogram.edges_ms[1:] + histogram.edges_ms[:-1])
-    # What lies in the window is read as the response, however near to the stimulus that is.
+    # Bins inside the response window always count, however close to the stimulus they are.
     inside = (histogram.edges_ms[:-1] >= window_ms[0] - 1e-9) & (histogram.edges_ms[1:] <= window_ms[1] + 1e-9)
     clear = (np.abs(centres_ms) > _ARTEFACT_MS) | inside
     highest_hz = 1.1 * float(max(rate_hz[clear].max(initial=0.0), 2 * np.nan_to_num(spontaneous_hz or 0.0)))

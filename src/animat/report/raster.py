@@ -1,4 +1,4 @@
-"""The raster: every spike as a dot, over a stretch of the recording and around its stimuli."""
+"""The raster: every spike as a dot, in a stretch of the recording and around its stimuli."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from animat.tables import evenly
 _MOST_STIMULI = 300
 _MOST_LABELS = 12
 _MOST_DOTS = 3000
-"""Spikes around stimuli that can be told apart as dots."""
+"""The most spikes around stimuli that can be told apart as dots."""
 _MOST_BINS = 100
 
 
 def draw_raster(recording: Recording, responses: Responses) -> Figure:
-    """Spikes by channel in a stretch of the recording, and by stimulus around it, sorted by condition.
+    """Spikes by channel in a stretch of the recording, and around each stimulus, sorted by condition.
 
-    From 20 ms before a stimulus to 50 ms after it, or to twice the window's end if that is later. The responses are
-    made from this recording.
+    The latter are shown from 20 ms before a stimulus to 50 ms after it, or to twice the window's end if that is later.
+    The responses are those of this recording.
     """
     to_ms = max(50.0, 2 * responses.window_ms[1])
     figure = new_figure(8.0, 7.0)
@@ -47,7 +47,7 @@ def draw_raster(recording: Recording, responses: Responses) -> Figure:
 
 
 def _draw_stretch(axes: Axes, recording: Recording) -> None:
-    """All channels over the time of the recording's middle six stimuli; without any, over the whole recording."""
+    """All channels during the middle six stimuli of the recording; without stimuli, during the whole recording."""
     from matplotlib.ticker import MaxNLocator
 
     times_s = recording.stimuli.time_s[~recording.stimuli.is_rest]
@@ -60,7 +60,7 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
     axes.scatter(
         recording.spike_times_s[spike], recording.spike_channels[spike], s=4, color=BLACK, linewidths=0, rasterized=True
     )
-    # Whatever else falls into it.
+    # Other stimuli can fall into the stretch.
     inside = times_s[(times_s >= from_s) & (times_s <= to_s)]
     for time_s in inside:
         axes.axvline(time_s, color=RED, linewidth=1)
@@ -72,7 +72,7 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
 
 
 def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_ms: float, to_ms: float) -> None:
-    """Stimuli as rows, sorted by condition and then in time; evenly thinned where there are too many to see."""
+    """One row per stimulus, sorted by condition and then in time; evenly thinned if there are too many to see."""
     start_ms, end_ms = responses.window_ms
     times_s = np.empty(0) if responses.time_s is None else responses.time_s
     chosen = evenly(len(times_s), _MOST_STIMULI)
@@ -85,7 +85,7 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     band = 0.25 if are_dots else 0.12
     axes.axvspan(start_ms, end_ms, color=WINDOW, alpha=band, linewidth=0, label=f"window {start_ms:g}-{end_ms:g} ms")
     for edge_ms in (start_ms, end_ms):
-        # On top of the spikes, which can hide the band.
+        # Drawn over the spikes, which can hide the band.
         axes.axvline(edge_ms, color=WINDOW, linewidth=1.2, zorder=3)
     axes.axvline(0, color=RED, linewidth=1, label="stimulus", zorder=3)
     drawn = np.unique(condition).tolist()
@@ -96,18 +96,17 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     else:
         _draw_rates(axes, row, lag_ms, len(chosen), len(recording.channels), from_ms, to_ms)
         each = f"all {len(recording.channels):,} channels together"
-    # The rows of each condition are named beside them.
     first = np.searchsorted(condition, drawn)
     middle = [(a + b - 1) / 2 for a, b in pairwise([*first, len(chosen)])]
     every = max(1, -(-len(drawn) // _MOST_LABELS))
     axes.set_yticks(middle[::every], [responses.conditions[i].label for i in drawn[::every]])
     for edge in first[1:].tolist():
-        # Not black, as a row of a burst is.
+        # Not black, which would look like the row of a burst.
         axes.axhline(edge - 0.5, color=BLUE, linewidth=0.8)
     axes.set_xlim(from_ms, to_ms)
     axes.set_ylim(-0.5, max(len(chosen), 1) - 0.5)
     thinned = "" if len(chosen) == len(times_s) else f"{len(chosen)} of "
-    title = f"{thinned}{len(times_s):,} stimuli, a row each; {each}"
+    title = f"{thinned}{len(times_s):,} stimuli, one row each; {each}"
     style_axes(axes, title, "time from stimulus (ms)", "stimulus (row)")
 
 
@@ -120,7 +119,7 @@ def _draw_rates(
     from_ms: float,
     to_ms: float,
 ) -> None:
-    """The rate in each row and bin as a shade: dots of so many spikes would run into one."""
+    """The rate in each row and bin as a shade, as so many dots would merge."""
     edges_ms = np.linspace(from_ms, to_ms, 1 + min(_MOST_BINS, round(to_ms - from_ms)))
     count, *_ = np.histogram2d(row, lag_ms, bins=[np.arange(rows + 1) - 0.5, edges_ms - 1e3 * HALF_NS_S])
     rate_hz = 1e3 * count / channels / (edges_ms[1] - edges_ms[0])

@@ -1,4 +1,4 @@
-"""Histograms of the response of each condition: what the neuron simulator draws from."""
+"""Histograms of the responses to each condition, from which the neuron simulator draws."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _BINS = 30
 
 
 def draw_response_histograms(responses: Responses, last: Responses | None = None) -> Figure:
-    """Non-burst responses of every condition on one axis of rates, with the median P50 of all together.
+    """Non-burst responses to every condition on a common axis, with P50, the median of all of them.
 
-    At most 16 conditions are drawn, those with the most responses; the title says so. Those of the last recording of a
-    series, which has the same conditions, are outlines.
+    At most 16 conditions are drawn, those with the most responses; the title says so. The last recording of a series,
+    which has the same conditions, is drawn as outlines.
     """
     n = [len(responses.rates_of(i)) for i in range(len(responses.conditions))]
     drawn = sorted(sorted(range(len(n)), key=lambda i: -n[i])[:_MOST_PANELS])
@@ -49,7 +49,7 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
     for axes in panels[len(drawn) :]:
         axes.set_visible(False)
     for column in range(columns):
-        # The lowest panel of a column that is not full shows its ticks too.
+        # The lowest panel has labels even if its column is not full.
         panels[min((column + 1) * rows, max(len(drawn), 1)) - 1].tick_params(labelbottom=True)
     figure.supxlabel("response x (Hz per channel)", fontsize=9)
     left_out = len(n) - len(drawn)
@@ -62,17 +62,17 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
 def rate_edges(
     responses: Responses, rates_hz: Float64[np.ndarray, " some"], n_bins: int
 ) -> Float64[np.ndarray, " edges"]:
-    """Edges of at most n_bins bins that each hold equally many of the possible rates.
+    """Edges of at most n_bins bins that each contain equally many of the possible rates.
 
-    x is a whole number of spikes over (window x channels); bins of any other width would hold now one more of its
-    values and now one less, and show a comb that is not in the data.
+    x is an integer number of spikes over (window x channels). Bins of any other width would contain varying numbers of
+    its possible values, and show a comb that is not in the data.
     """
     start_ms, end_ms = responses.window_ms
     return even_edges(rates_hz, 1 / ((end_ms - start_ms) * 1e-3 * responses.n_channels), n_bins)
 
 
 def even_edges(values: Float64[np.ndarray, " some"], step: float, n_bins: int) -> Float64[np.ndarray, " edges"]:
-    """Edges of at most n_bins bins that each hold equally many of the multiples of a step, which all values are."""
+    """Edges of at most n_bins bins that each contain equally many multiples of `step`, as all values are."""
     most = round(float(values.max()) / step) if len(values) else 1
-    together = max(1, math.ceil((most + 1) / n_bins))
-    return (np.arange(0, most + 1 + together, together) - 0.5) * step
+    per_bin = max(1, math.ceil((most + 1) / n_bins))
+    return (np.arange(0, most + 1 + per_bin, per_bin) - 0.5) * step

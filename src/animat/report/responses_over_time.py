@@ -1,4 +1,4 @@
-"""The responses from recording to recording: fatigue, seen as a shift of each condition's whole distribution."""
+"""The responses from recording to recording: fatigue shows as a shift of each condition's distribution."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ _MOST_CONDITIONS = 8
 
 
 def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
-    """A column a condition, a row a recording, the first at the top: its non-burst responses, and their median.
+    """One column per condition, one row per recording, the first at the top: non-burst responses and their median.
 
-    At most 20 recordings, evenly over the series, and 8 conditions are drawn, up to one and a half times the 99th
-    percentile of all responses; the title says what is not. All recordings, in the order of time, have the same
-    conditions.
+    At most 20 recordings, evenly over the series, and 8 conditions are drawn, up to 1.5 times the 99th percentile of
+    all responses; the title states what is left out. Recordings are in order of time and have the same conditions.
     """
     shown = [series[row] for row in evenly(len(series), _MOST_ROWS)]
     conditions = shown[0].conditions[:_MOST_CONDITIONS]
     rates = [[responses.rates_of(i) for responses in shown] for i in range(len(conditions))]
     all_hz = np.concatenate([x for of in rates for x in of])
-    # A few bursts that no threshold set apart must not squeeze all others into one bin.
+    # A few bursts that were not separated must not squeeze all others into one bin.
     reach_hz = 1.5 * float(np.quantile(all_hz, 0.99)) if len(all_hz) else 0.0
     edges_hz = rate_edges(shown[0], all_hz[all_hz <= reach_hz], _BINS)
     beyond = int(np.count_nonzero(all_hz > edges_hz[-1]))
@@ -38,7 +37,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     colours = condition_colours([condition.unit for condition in shown[0].conditions])
     for i, (axes, condition, of) in enumerate(zip(panels, conditions, rates, strict=False)):
         shares = [np.histogram(x, edges_hz)[0] / max(len(x), 1) for x in of]
-        # As high as the highest of its condition.
+        # All recordings of a condition have the same scale.
         height = 0.92 / max(max(share.max() for share in shares), 1e-9)
         for row, (share, x) in enumerate(zip(shares, of, strict=True)):
             base = -float(row)

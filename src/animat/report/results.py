@@ -1,4 +1,4 @@
-"""What studies come to, as typed records: tables, figures and the page are made of them."""
+"""The results of studies as typed records, from which tables, figures and the page are made."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from animat.evaluation.optimum import bracket_findings
 from animat.recordings.findings import Finding
 
 TRAINED = "trained: "
-"""In front of an arm's name among the controls."""
-ADMITTED = 0.5
-"""The context gap of a task that needs more than a reflex, on every culture."""
+"""Precedes an arm's name among the controls."""
+CONTEXT_GAP_LEVEL = 0.5
+"""The context gap from which a task counts as needing more than a reflex."""
 
 
 @dataclass(frozen=True)
 class StudyOptimum:
-    """The optimal return on a robot, as in `animat.evaluation.optimum.Optimum`; None for what is not known.
+    """The optimal return on a robot, as in `animat.evaluation.optimum.Optimum`; None for unknown values.
 
     Attributes:
-        at_min: the recording that answers.
-        low_95, high_95: of the interval that few responses leave.
-        left_out: the conditions that have too few responses to count, with their number.
+        at_min: the recording whose simulator responds.
+        low_95, high_95: ends of the interval due to the number of responses.
+        left_out: the conditions that have too few responses, with their number.
     """
 
     robot: str
@@ -39,15 +39,15 @@ class StudyOptimum:
     left_out: str | None
 
     def findings(self) -> tuple[Finding, ...]:
-        """Where the value and its controller's return part."""
-        known = (self.best_return, self.grid_error, self.monte_carlo, self.standard_error)
-        told = [value for value in known if value is not None]
-        return bracket_findings(*told) if len(told) == len(known) else ()
+        """A finding if the value and its controller's return differ."""
+        bracket = (self.best_return, self.grid_error, self.monte_carlo, self.standard_error)
+        known = [value for value in bracket if value is not None]
+        return bracket_findings(*known) if len(known) == len(bracket) else ()
 
 
 @dataclass(frozen=True)
 class Score:
-    """An arm at a minute: means over policies, beside random actions and the optimum."""
+    """An arm at a minute: means over policies, with random actions and the optimum."""
 
     robot: str
     arm: str
@@ -67,7 +67,7 @@ class Score:
 
 @dataclass(frozen=True)
 class ComparedReturns:
-    """Two arms on a robot: the test, its outcome, and the paper's where it printed one."""
+    """Two arms on a robot: the test, its outcome, and the paper's result if it printed one."""
 
     comparison: str
     robot: str
@@ -100,7 +100,7 @@ class ComparedReturns:
 
 @dataclass(frozen=True)
 class ControlReturns:
-    """A control, or trained policies beside it, at a minute."""
+    """A control, or trained policies with the same mapping, at a minute."""
 
     robot: str
     mapping: str
@@ -116,8 +116,8 @@ class ControlReturns:
 
 
 @dataclass(frozen=True)
-class BesideHeuristic:
-    """Trained policies beside the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
+class HeuristicComparison:
+    """Trained policies and the heuristic policy: mean returns, Mann-Whitney over episodes, share of pairs won."""
 
     robot: str
     arm: str
@@ -130,13 +130,13 @@ class BesideHeuristic:
 
 
 @dataclass(frozen=True)
-class BesideReflex:
-    """Trained policies beside the best coupling, as in `animat.evaluation.coupling`; None for what is not known.
+class ReflexComparison:
+    """Trained policies and the best coupling, as in `animat.evaluation.coupling`; None for unknown values.
 
     Attributes:
-        coupling: its mean return.
+        coupling: mean return of the best coupling.
         gap: the context gap of the task, with the ends of its 95 % interval.
-        needs_context: whether the task surely needs more than a reflex.
+        needs_context: whether the task significantly needs more than a reflex.
         score: the context score of the policies, with the ends of its 95 % interval.
     """
 
@@ -157,11 +157,11 @@ class BesideReflex:
 
 @dataclass(frozen=True)
 class ObjectiveMet:
-    """How far episodes of an arm's policies or of a control met an objective of a robot's goal, and all of the goal.
+    """How far an arm's policies or a control met an objective of a robot's goal, and the whole goal.
 
     Attributes:
         success_share, margin: of the goal, the same for all of its objectives.
-        objective: as a text.
+        objective: as text.
         satisfaction: of the objective, %.
     """
 
@@ -178,16 +178,16 @@ class ObjectiveMet:
 
 @dataclass(frozen=True)
 class Results:
-    """All that was found."""
+    """All results of a study."""
 
     scores: tuple[Score, ...]
     comparisons: tuple[ComparedReturns, ...]
     controls: tuple[ControlReturns, ...]
-    heuristic: tuple[BesideHeuristic, ...]
+    heuristic: tuple[HeuristicComparison, ...]
     optima: tuple[StudyOptimum, ...]
     findings: tuple[Finding, ...]
     goals: tuple[ObjectiveMet, ...] = ()
-    reflexes: tuple[BesideReflex, ...] = ()
+    reflexes: tuple[ReflexComparison, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -195,14 +195,13 @@ class OverCultures:
     """A comparison on a robot, over cultures.
 
     Attributes:
-        cultures: how many.
+        cultures: number of cultures.
         mean_first, mean_second: mean returns of the arms, each culture counting the same.
-        difference: mean of the cultures' differences, second less first.
-        low_95, high_95: of its percentile bootstrap over cultures; None of fewer than two. Of few cultures it is too
-            narrow.
-        larger_in: cultures in which the second arm's mean return is the larger one.
-        holds_in: cultures in which the second arm was found to be better.
-        tested: cultures with enough policies that a difference could be found.
+        difference: mean of the cultures' differences, second minus first.
+        low_95, high_95: its percentile bootstrap interval over cultures, too narrow with few; None with fewer than two.
+        larger_in: number of cultures in which the second arm's mean return is larger.
+        holds_in: number of cultures in which the second arm was found to be better.
+        tested: number of cultures with enough policies to find a difference.
     """
 
     comparison: str
@@ -219,18 +218,18 @@ class OverCultures:
 
     @property
     def found_better(self) -> str:
-        """In how many cultures the second arm was found to be better, in words."""
+        """In how many cultures the second arm was found to be better, as text."""
         return f"{self.holds_in} of {self.tested}" if self.tested else "too few policies"
 
 
 @dataclass(frozen=True)
 class ContextRow:
-    """A task on a culture: mean returns on the simulator and, measured, on the culture; None for what is not known.
+    """A task on a culture: mean returns on the simulator, and measured on the culture; None for unknown values.
 
     Attributes:
-        best_known: where there is no optimal return, that of the best of the policies and the heuristic.
-        gap, score: the context gap of the task and the context score of the policies, on the simulator; the least that
-            they can be where there is no optimal return.
+        best_known: if there is no optimal return, that of the best of the policies and the heuristic.
+        gap, score: the context gap of the task and the context score of the policies, on the simulator; lower bounds if
+            there is no optimal return.
         bits: goal information; None for a robot with only one goal.
     """
 
@@ -257,13 +256,13 @@ class ContextRow:
 
     @property
     def is_least(self) -> bool:
-        """Whether gap and score are the least that they can be."""
+        """Whether gap and score are lower bounds."""
         return self.best_known is not None
 
     @property
     def needs_context(self) -> bool:
         """Whether a reflex leaves half of the task undone."""
-        return self.gap is not None and self.gap >= ADMITTED
+        return self.gap is not None and self.gap >= CONTEXT_GAP_LEVEL
 
     @property
     def has_context(self) -> bool:
@@ -273,7 +272,7 @@ class ContextRow:
 
 @dataclass(frozen=True)
 class LostRow:
-    """What the policies lose by an intervention, with its 95 % interval over policies, on a culture's simulator."""
+    """The return that policies lose by an intervention on a culture's simulator, with its 95 % interval over them."""
 
     culture: int
     robot: str

@@ -18,10 +18,10 @@ from animat.responses.responses import Responses
 def draw_series(
     first: Recording | None, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
 ) -> list[Path]:
-    """Draw a series: `series-array`, `series-over-time`, `series-drift`, in one of `FORMATS`.
+    """Draw a series: `series-array`, `series-over-time`, `series-drift`; `file_format` is one of `FORMATS`.
 
-    The array is that of the first recording, where its positions are known; the others, of responses in any order, are
-    drawn for two recordings or more.
+    The array is drawn if the positions of the first recording are known, the other figures if there are two recordings
+    or more. `series` may be in any order.
 
     Raises:
         InvalidArgument: for no responses.
@@ -35,7 +35,7 @@ def draw_series(
         if [c.label for c in responses.conditions] != [c.label for c in ordered[0].conditions]:
             raise Mismatch(
                 f"conditions: expected the same in all recordings of a series, but those at {responses.start_min:g} "
-                f"min are others than those at {ordered[0].start_min:g} min: inspect them apart"
+                f"min differ from those at {ordered[0].start_min:g} min: inspect them separately"
             )
     figures = {}
     if first is not None and first.channels.has_positions:

@@ -1,4 +1,4 @@
-"""A culture that nobody stimulates: every spike of the recording, and the rate of all channels with its bursts."""
+"""Activity without stimulation: every spike of the recording, and the rate of all channels with its bursts."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
     upper.set_ylim(-1, len(recording.channels))
     thinned = f"{len(shown):,} of " if len(shown) < n else ""
     style_axes(upper, f"{thinned}{n:,} spikes, no stimuli", "", "channel (row)")
-    # Bins as wide as they can be told apart; a burst is shorter than a line is wide and keeps its height.
+    # No more bins than can be told apart; each shows its highest rate, so that a short burst keeps its height.
     together = max(1, -(-len(bursts.count) // _MOST_BINS))
     rows = np.arange(0, len(bursts.count), together)
     width_s = bursts.edges_s[1] - bursts.edges_s[0]
     highest_hz = np.maximum.reduceat(bursts.count, rows) / (width_s * len(recording.channels))
     lower.plot(bursts.edges_s[rows], highest_hz, color=BLACK, linewidth=0.8, label="highest in 50 ms")
     threshold_hz = bursts.threshold / (width_s * len(recording.channels))
-    lower.axhline(threshold_hz, color=WINDOW, linewidth=1, label="a network burst is above")
+    lower.axhline(threshold_hz, color=WINDOW, linewidth=1, label="threshold of network bursts")
     lower.set_ylim(bottom=0)
     style_axes(lower, f"{len(bursts):,} network bursts", "time (s)", "rate (Hz per channel)")
     add_legend(lower, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0)

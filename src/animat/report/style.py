@@ -1,4 +1,4 @@
-"""How every figure of animat looks, and how it is written to a file."""
+"""The style of all figures, and writing them to files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
 else:
-    # For annotations alone: matplotlib is loaded where something is drawn.
+    # For annotations alone: matplotlib is loaded only to draw.
     Axes = Figure = Any
 
 FORMATS = ("png", "svg", "pdf")
@@ -27,16 +27,16 @@ PNG_DPI = 160
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, RED, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, RED)
-"""In the order in which they are taken."""
+"""In the order of use."""
 WINDOW, OPTIMUM = ORANGE, BLACK
 NON_BURST, BURST, MEDIAN = BLUE, RED, RED
 
-# Text stays text in an SVG. Without the salt, element names are random: the same figure, another file each time.
+# Text stays text in an SVG. Without the salt, element names are random, and the same figure gives different files.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure in the house style, of a size in inches; it needs no display and touches no global state."""
+    """An empty figure of a size in inches; it needs no display and changes no global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -46,7 +46,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
-    """Title and labels (with units), without the upper and right frame."""
+    """Set title and labels (with units), and hide the upper and right frame."""
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)
@@ -55,31 +55,31 @@ def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 
 
 def add_legend(axes: Axes, **place: Any) -> None:
-    """A legend without a frame; `place` as in `Axes.legend`."""
+    """Add a legend without a frame; `place` as for `Axes.legend`."""
     axes.legend(fontsize=8, frameon=False, **place)
 
 
 def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -> None:
-    """One legend under a figure for all its panels: what has a name in any of them, once, in as many columns as fit."""
+    """Add one legend under a figure for all its panels: each label once, in as many columns as fit."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        while columns > 1 and _legend_in(list(entries), columns) > figure.get_figwidth():
+        while columns > 1 and _legend_width_in(list(entries), columns) > figure.get_figwidth():
             columns -= 1
         place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
         figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
 
 
-def _legend_in(labels: Sequence[str], columns: int) -> float:
-    """About how wide a legend in letters of 8 points is, in inches: of each column its longest label and a sample."""
+def _legend_width_in(labels: Sequence[str], columns: int) -> float:
+    """The approximate width of a legend in 8-point type, in inches: each column has a sample and its longest label."""
     parts = np.array_split(np.array([len(label) for label in labels]), columns)
     return sum(0.53 + 0.062 * float(part.max()) for part in parts if len(part))
 
 
 def condition_colours(units: Sequence[str]) -> list[str]:
-    """A colour for each condition: rising along cividis for frequencies, which are ordered; Okabe-Ito for others."""
+    """A colour for each condition: along cividis for frequencies, which are ordered; Okabe-Ito for others."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
@@ -91,10 +91,10 @@ def condition_colours(units: Sequence[str]) -> list[str]:
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure as PNG, SVG or PDF, by the path's ending; the file is complete or absent.
+    """Write a figure atomically as PNG, SVG or PDF, by the path's suffix.
 
     Raises:
-        InvalidArgument: for another ending.
+        InvalidArgument: for another suffix.
         InvalidFile: if the file cannot be written.
     """
     import matplotlib
@@ -102,7 +102,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if path.suffix[1:].lower() not in FORMATS:
         raise InvalidArgument(f"{path}: expected a figure's name to end in .png, .svg or .pdf, got {path.suffix!r}")
-    # A date in the file would make the same figure another file each time; PNG holds none.
+    # With a date, the same figure would give different files; PNG has none.
     metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower())
     with atomic_write(path) as beside, matplotlib.rc_context(_SAVING):
         figure.savefig(beside, format=path.suffix[1:].lower(), dpi=PNG_DPI, metadata=metadata)
@@ -112,7 +112,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
 def grid_of_panels(
     n: int, columns: int, width_in: float, height_in: float, title: str, *, share_x: bool = False, share_y: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of n panels in rows, each of a size in inches, and its panels; places left over stay empty."""
+    """A figure with n panels in rows, each of a size in inches, and the panels."""
     columns = min(columns, max(n, 1))
     rows = max(1, -(-n // columns))
     figure = new_figure(max(width_in * columns, 4.5), height_in * rows + 0.35)
@@ -121,6 +121,6 @@ def grid_of_panels(
     for axes in panels[n:]:
         axes.set_visible(False)
     for axes in panels[:n]:
-        # A shared axis has its numbers at every panel all the same.
+        # Numbers at every panel, although axes are shared.
         axes.tick_params(labelbottom=True, labelleft=True)
     return figure, list(panels[:n])

@@ -1,4 +1,4 @@
-"""Learning curves for TensorBoard, through the extra `[tensorboard]`; imported only when asked for."""
+"""Learning curves for TensorBoard, with the extra `[tensorboard]`; imported only on request."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from animat.training.callbacks import CurveRow
 
 
 class TensorBoard:
-    """A callback of `train` that writes each policy's curve as a run of its own, a scalar each of `CurveRow`'s numbers.
+    """A callback of `train` that writes each policy's curve as a run, with one scalar per number of `CurveRow`.
 
         with TensorBoard("runs") as board:
             train(training, timeline, "policies", callbacks=[board])
 
     Args:
-        folder: for the runs, `p0`, `p1` and so on; made where it is missing.
+        folder: for the runs, `p0`, `p1` and so on; created if it is missing.
 
     Raises:
         AnimatError: if tensorboardX is not installed.
-        InvalidFile: when it is entered or called, if the folder cannot be written to.
+        InvalidFile: on entry or call, if the folder cannot be written to.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -35,18 +35,18 @@ class TensorBoard:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InvalidFile(f"{self._folder}: cannot be made: {error.strerror or error}") from error
+            raise InvalidFile(f"{self._folder}: cannot be created: {error.strerror or error}") from error
         return self
 
     def __call__(self, row: CurveRow) -> None:
-        """Write a row; what is not known is left out."""
+        """Write a row without its NaNs."""
         try:
             if row.policy not in self._writers:
                 self._writers[row.policy] = self._make(str(self._folder / row.policy))
             writer = self._writers[row.policy]
-            told = {"episodes": row.episodes, "return": row.mean_return}
-            told |= {"entropy": row.entropy, "alpha": row.alpha, "critic_loss": row.critic_loss}
-            for name, number in told.items():
+            scalars = {"episodes": row.episodes, "return": row.mean_return}
+            scalars |= {"entropy": row.entropy, "alpha": row.alpha, "critic_loss": row.critic_loss}
+            for name, number in scalars.items():
                 if not math.isnan(number):
                     writer.add_scalar(name, number, row.iterations)
         except OSError as error:

@@ -1,4 +1,4 @@
-"""A search: its history, what every trial got and how far it was trained, and the importance of each setting."""
+"""A search: its history, with the return and training of every trial, and the importance of each setting."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def draw_history(
     own: tuple[float, float | None] | None,
     title: str,
 ) -> Figure:
-    """A point a trial at what it got last, by how far it was trained; the best of whole trainings so far; the finals.
+    """One point per trial at its last mean return, by how far it was trained; the best full training so far; finals.
 
     Args:
-        trials: number, and of each rung that it reached the chunks done then and the mean return; none if it diverged
-            before.
-        rungs: chunks done at the end of each rung, the whole training the last.
-        best: trial that won, its mean return trained anew and the standard error of that.
-        own: the same of the settings that the search began with; None where these learned no finite number.
+        trials: number of each trial, and for each rung that it reached the chunks done and the mean return; none if it
+            diverged before.
+        rungs: chunks done at the end of each rung; the last is the full training.
+        best: number of the best trial, its mean return when retrained, and the standard error.
+        own: mean return and standard error of the initial settings, retrained; None if they diverged.
         title: of the figure.
     """
     from matplotlib.ticker import MaxNLocator
@@ -75,7 +75,7 @@ def draw_history(
 
 
 def draw_importance(shares: Mapping[str, float], title: str) -> Figure:
-    """A bar a setting, by the shares of settings, which come the largest first and together are 1."""
+    """One bar per setting; `shares` are in descending order and sum to 1."""
     figure = new_figure(6.0, 1.1 + 0.27 * len(shares))
     axes = figure.subplots()
     places = range(0, -len(shares), -1)

@@ -17,7 +17,7 @@ _HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':
 
 
 def validation_text(name: str, validation: Validation) -> str:
-    """Lines for a terminal: the verdict, what was predicted and what was recorded."""
+    """Lines for a terminal: the verdict, the predictions and the recording."""
     v = validation
     lines = [
         f"{name}: {v.verdict}",
@@ -35,7 +35,7 @@ def validation_text(name: str, validation: Validation) -> str:
         )
     lines.append(f"  {'recorded':<47}{v.autocorrelation[0]:>8.2f}{f'{v.run_length:.2f}':>25}")
     gains = [("conditions bring", v.gain("empirical", MARGINAL)), ("memory brings", v.gain("memory", "empirical"))]
-    lines.append("  " + "; ".join(f"{what} {gain.value:.3f} ± {gain.error:.3f} bits per trial" for what, gain in gains))
+    lines.append("  " + "; ".join(f"{name} {gain.value:.3f} ± {gain.error:.3f} bits per trial" for name, gain in gains))
     width = max(len("condition"), *map(len, v.labels))
     lines += ["", f"  {'condition':<{width}}  {'responses':>13}  {'median x (Hz)':>16}  P(x >= P50) {v.kind}, recorded"]
     for c, label in enumerate(v.labels):
@@ -46,7 +46,7 @@ def validation_text(name: str, validation: Validation) -> str:
 
 
 def correlations_text(names: Sequence[str], correlations: Float64[np.ndarray, "2 pairs"]) -> str:
-    """Spearman's correlation of every two readouts, in the half that simulators keep it of and in the held-out one."""
+    """Spearman's correlation of each pair of readouts, in the half to which simulators are fitted and the other one."""
     lines = ["  readouts, Spearman's correlation within conditions: first half, second half"]
     for (one, other), (first, second) in zip(itertools.combinations(names, 2), correlations.T, strict=True):
         lines.append(f"  {one}, {other}: {first:.2f}, {second:.2f}")
@@ -54,13 +54,13 @@ def correlations_text(names: Sequence[str], correlations: Float64[np.ndarray, "2
 
 
 def draw_validation(name: str, validation: Validation) -> Figure:
-    """Three panels: the transforms' histograms, the autocorrelation, and how long runs above P50 last."""
+    """Three panels: histograms of the transforms, the autocorrelation, and the lengths of runs above P50."""
     v = validation
     figure = new_figure(10.5, 3.7)
     n = f"{sum(v.n_held):,} held-out responses"
     figure.suptitle(f"{name}: {n}; shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators", fontsize=10)
     calibration, correlation, runs = figure.subplots(1, 3)
-    # The empirical kind lies on the histogram.
+    # The empirical kind would coincide with the histogram.
     shown = [v.of(kind) for kind in dict.fromkeys(("histogram", v.kind, "memory"))]
 
     style_axes(calibration, "calibration", "probability integral transform (-)", "share of responses (-)")
@@ -73,21 +73,21 @@ def draw_validation(name: str, validation: Validation) -> Figure:
 
     lags = np.arange(1, LAGS + 1)
     style_axes(correlation, "successive responses", "lag (trials)", "autocorrelation (-)")
-    style_axes(runs, "runs of x ≥ P50 (command above 0)", "run length (trials)", "share that last as long (-)")
+    style_axes(runs, "runs of x ≥ P50 (command above 0)", "run length (trials)", "share at least as long (-)")
     for axes, of in ((correlation, "autocorrelation"), (runs, "lasting")):
         for s in shown:
             band: Band = getattr(s, of)
             axes.fill_between(lags, band.low, band.high, color=_COLOURS[s.kind], alpha=0.2, linewidth=0)
             axes.plot(lags, band.mean, color=_COLOURS[s.kind], linewidth=1.2)
         recorded = getattr(v, of)
-        # A share of 0 has no place on an axis of logarithms.
+        # A share of 0 cannot be drawn on a logarithmic axis.
         recorded = np.where(recorded > 0, recorded, np.nan) if of == "lasting" else recorded
         axes.plot(lags, recorded, "o-", color=BLACK, markersize=4, linewidth=1.2, label="recorded")
         axes.set_xticks(lags)
     correlation.axhline(0, color=GREY, linewidth=0.6)
     runs.set_yscale("log")
-    if len(there := v.lasting[v.lasting > 0]):
-        runs.set_ylim(there.min() / 3, 1.2)
+    if len(positive := v.lasting[v.lasting > 0]):
+        runs.set_ylim(positive.min() / 3, 1.2)
     runs.yaxis.set_major_formatter("{x:g}")
     add_common_legend(figure, [calibration, correlation], columns=6)
     return figure

@@ -1,4 +1,4 @@
-"""The arms of a study in words: how a response becomes a command in each, and how it is trained."""
+"""Descriptions of a study's arms: how a response becomes a command in each, and how each is trained."""
 
 from __future__ import annotations
 
@@ -7,70 +7,70 @@ from collections.abc import Iterator
 from animat.report.html import Table
 from animat.studies.specification import Arm, Study
 
-_MAPPED = {
+_MAPPINGS = {
     "1-threshold": "a response above the median gives the motor command +1, and one below it −1.",
     "9-thresholds": "a response gives one of ten motor commands from −1 to +1, depending on how many of nine "
-    "thresholds it passes.",
-    "linear": "the motor command rises with the response along a straight line, from −1 for the smallest response "
-    "recorded to +1 for the largest.",
+    "thresholds it exceeds.",
+    "linear": "the motor command rises linearly with the response, from −1 for the smallest response recorded to +1 "
+    "for the largest.",
     "none": "there are no neurons, and policies give the motor commands themselves.",
 }
-REFRESHED = "with shadowing: during training, each newer recording replaces the simulator of the neurons."
-_SHADOWED: dict[bool | str, str] = {
-    True: f"Trained {REFRESHED}",
+_REFRESHED = "with shadowing: during training, each newer recording replaces the simulator of the neurons."
+_SHADOWING: dict[bool | str, str] = {
+    True: f"Trained {_REFRESHED}",
     False: "Trained without shadowing: on the simulator of the first recording throughout.",
-    "drawn": "In training, each episode draws one of the recordings, whose simulator is used.",
+    "drawn": "In training, each episode draws one of the recordings and uses its simulator.",
 }
-FIXED = "percentiles are those of the first recording throughout."
-SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy chooses."
+_FIXED = "percentiles are those of the first recording throughout."
+_SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy chooses."
 
 
-def many_arms(study: Study) -> str:
-    """What an arm is, and how many there are: a sentence and the beginning of one."""
+def summarise_arms(study: Study) -> str:
+    """What an arm is, then how many arms and policies there are; the second sentence is left open."""
     arms = f"There {'is 1 arm' if len(study.arms) == 1 else f'are {len(study.arms)} arms'}"
     policies = "1 policy" if study.policies == 1 else f"{study.policies} policies"
     return f"An arm is one way to train policies. {arms} with {policies} each"
 
 
-def mapped(arm: Arm) -> str:
+def describe_mapping(arm: Arm) -> str:
     """How a response becomes a command in an arm: a sentence without its capital."""
-    return _MAPPED.get(arm.mapping, f"responses become motor commands by the mapping {arm.mapping}.")
+    return _MAPPINGS.get(arm.mapping, f"responses become motor commands by the mapping {arm.mapping}.")
 
 
-def what_parts(first: Arm, second: Arm) -> Iterator[str]:
-    """What two arms differ in, where a name does not say it: a sentence each."""
+def arm_differences(first: Arm, second: Arm) -> Iterator[str]:
+    """A sentence for each setting in which two arms differ."""
     for arm, other in ((first, second), (second, first)):
         if arm.shadowing is True is not other.shadowing:
-            yield f"“{arm.name}” is trained {REFRESHED}"
+            yield f"“{arm.name}” is trained {_REFRESHED}"
         if arm.shadowing == "drawn" != other.shadowing:
-            yield f"In “{arm.name}” each episode of training draws one of the recordings, whose simulator is used."
+            yield f"In “{arm.name}” each episode of training draws one of the recordings and uses its simulator."
         if arm.percentiles == "first" != other.percentiles:
-            yield f"In “{arm.name}” {FIXED}"
+            yield f"In “{arm.name}” {_FIXED}"
         if arm.delivery == "shuffled" != other.delivery:
-            yield f"In “{arm.name}” {SHUFFLED}"
+            yield f"In “{arm.name}” {_SHUFFLED}"
         if arm.mapping != other.mapping:
-            yield f"In “{arm.name}” {mapped(arm)}"
+            yield f"In “{arm.name}” {describe_mapping(arm)}"
 
 
-def arms_shown(study: Study) -> Table:
-    """The arms and what each of them is."""
+def arms_table(study: Study) -> Table:
+    """Each arm with its description."""
     return Table(
         "The arms",
-        ("arm", "what it is"),
-        tuple((arm.name, " ".join(_in_words(arm))) for arm in study.arms),
+        ("arm", "description"),
+        tuple((arm.name, " ".join(_describe(arm))) for arm in study.arms),
         note="Commands are the robot's, from −1 to +1. Medians and thresholds are percentiles of the recorded "
         "responses.",
     )
 
 
-def _in_words(arm: Arm) -> Iterator[str]:
+def _describe(arm: Arm) -> Iterator[str]:
     if not arm.trained:
         yield "New networks, as they are before training."
-    said = mapped(arm)
-    yield said[:1].upper() + said[1:]
+    mapping = describe_mapping(arm)
+    yield mapping[:1].upper() + mapping[1:]
     if arm.through_neurons and arm.trained:
-        yield _SHADOWED[arm.shadowing]
+        yield _SHADOWING[arm.shadowing]
     if arm.delivery == "shuffled":
-        yield f"{SHUFFLED[:1].upper()}{SHUFFLED[1:-1]}, in training and in evaluation."
+        yield f"{_SHUFFLED[:1].upper()}{_SHUFFLED[1:-1]}, in training and in evaluation."
     if arm.percentiles == "first":
-        yield f"{FIXED[:1].upper()}{FIXED[1:]}"
+        yield f"{_FIXED[:1].upper()}{_FIXED[1:]}"

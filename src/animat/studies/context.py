@@ -1,4 +1,4 @@
-"""The context study: on several cultures and tasks, whether more than a reflex is asked for, and whose work it is."""
+"""The context study: whether tasks need more than a reflex, and whose work it is, on several cultures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from animat.progress import Progress, Silent
 from animat.report.results import ContextRow, LostRow
 from animat.robots.registry import robot_named
 from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
-from animat.studies.folder import MANIFEST, held
+from animat.studies.folder import MANIFEST, claim_folder
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
 from animat.training.settings import LEARNER
@@ -27,8 +27,8 @@ TABLE, WHOSE_WORK = "context.csv", "whose-work.csv"
 
 
 @dataclass(frozen=True)
-class RanContext:
-    """What a run of the study came to: rows of each culture and robot, and what was lost by each intervention.
+class ContextRun:
+    """Results of the study: rows of each culture and robot, and what was lost by each intervention.
 
     Attributes:
         done_now: processor seconds of each job that this run did.
@@ -47,25 +47,25 @@ def run_context_study(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> RanContext:
-    """Run the study into a folder, or go on with one: what is done is not done again.
+) -> ContextRun:
+    """Run the study in a folder, or resume it there: finished jobs are not run again.
 
     Args:
         study: the specification.
-        folder: where everything goes; made if it is missing.
-        workers, executor, progress: as of `animat.studies.run.run_study`.
+        folder: for all files; created if it is missing.
+        workers, executor, progress: as for `animat.studies.run.run_study`.
 
     Raises:
-        Mismatch: if the folder is another study's, holds other files, or another run is at work in it.
+        Mismatch: if the folder belongs to another study, holds other files, or is in use by another run.
         InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer workers than one, or any beside an executor.
+        InvalidArgument: for fewer than one worker, or workers together with an executor.
         AnimatError: if a job failed; its message names the job.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     manifest = _describe(study)
     cultures = [f"culture-{culture}" for culture in study.cultures]
-    with held(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
+    with claim_folder(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
         left = Jobs(plan_context_study(study), folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s = {}
         if left.waiting:
@@ -76,7 +76,7 @@ def run_context_study(
         lost = tuple(row for pair in pairs for row in _lost(folder, *pair))
         write_records(folder / TABLE, ContextRow, rows)
         write_records(folder / WHOSE_WORK, LostRow, lost)
-    return RanContext(folder, rows, lost, took_s)
+    return ContextRun(folder, rows, lost, took_s)
 
 
 def _describe(study: ContextStudy) -> dict[str, Any]:
@@ -107,13 +107,13 @@ def plan_context_study(study: ContextStudy) -> list[Job]:
 
 
 def _row(folder: Path, culture: int, robot: str) -> ContextRow:
-    told = _read(folder, culture, robot, SIMULATED)
-    in_turn = _read(folder, culture, robot, MEASURED)["rows"]
-    simulated = {row["name"]: row["mean_return"] for row in told["rows"]}
-    measured = {row["name"]: row["measured"] for row in in_turn}
-    context = told["context"] or {}
-    gap, score = context.get("context_gap") or {}, told["context_score"] or {}
-    information = told["whose_work"]["rows"][0]["goal_information"]
+    evaluation = _read(folder, culture, robot, SIMULATED)
+    session_rows = _read(folder, culture, robot, MEASURED)["rows"]
+    simulated = {row["name"]: row["mean_return"] for row in evaluation["rows"]}
+    measured = {row["name"]: row["measured"] for row in session_rows}
+    context = evaluation["context"] or {}
+    gap, score = context.get("context_gap") or {}, evaluation["context_score"] or {}
+    information = evaluation["whose_work"]["rows"][0]["goal_information"]
     return ContextRow(
         culture=culture,
         robot=robot,
@@ -121,7 +121,7 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
         heuristic=simulated.get("heuristic"),
         coupling=simulated.get("coupling"),
         policies=simulated["policies"],
-        optimum=None if told["optimum"] is None else told["optimum"]["value"],
+        optimum=None if evaluation["optimum"] is None else evaluation["optimum"]["value"],
         best_known=context.get("best_known"),
         gap=gap.get("value"),
         gap_low_95=gap.get("low"),
@@ -133,17 +133,17 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
         measured_random=measured.get("random"),
         measured_heuristic=measured.get("heuristic"),
         measured_coupling=measured.get("coupling"),
-        # All of them together; of one alone its own row.
-        measured_policies=in_turn[0]["measured"],
-        predicted_policies=in_turn[0]["predicted"],
+        # The first row is that of all policies, or of the only one.
+        measured_policies=session_rows[0]["measured"],
+        predicted_policies=session_rows[0]["predicted"],
     )
 
 
 def _lost(folder: Path, culture: int, robot: str) -> list[LostRow]:
-    told = _read(folder, culture, robot, SIMULATED)["whose_work"]["rows"]
+    _, *interventions = _read(folder, culture, robot, SIMULATED)["whose_work"]["rows"]
     return [
         LostRow(culture, robot, row["name"], row["mean_return"], *(row["lost"][of] for of in ("value", "low", "high")))
-        for row in told[1:]
+        for row in interventions
     ]
 
 

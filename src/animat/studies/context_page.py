@@ -1,4 +1,4 @@
-"""The page of the context study: figures first, then what holds on how many cultures, then every number."""
+"""The page of the context study: figures, then a summary over cultures, then every number."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from animat.report.context import draw_context, draw_whose_work
 from animat.report.html import Columns, Picture, Section, Table, cell, columns_of, table_of, write_page
 from animat.report.results import ContextRow, LostRow
 from animat.report.style import FORMATS, save_figure
-from animat.studies.context import TABLE, WHOSE_WORK, RanContext
+from animat.studies.context import TABLE, WHOSE_WORK, ContextRun
 from animat.studies.context_tasks import ContextStudy
 from animat.studies.places import REPORT
 
 _GAPS, _LOST = "context", "whose-work"
 
 
-def write_context_page(study: ContextStudy, found: RanContext) -> Path:
-    """Write the page and its figures beside it."""
+def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
+    """Write the page and its figures."""
     by_robot = {robot: [row for row in found.rows if row.robot == robot] for robot in study.robots}
     lost = _shares_lost(found.rows, found.lost)
     figures = {_GAPS: draw_context(by_robot)} | ({_LOST: draw_whose_work(lost)} if lost else {})
@@ -27,42 +27,38 @@ def write_context_page(study: ContextStudy, found: RanContext) -> Path:
         for ending in FORMATS:
             save_figure(figure, found.folder / f"{name}.{ending}")
     sections = [
-        Section("Results in short", (on_every_culture(by_robot),),
-                points=tuple((robot, in_short(rows)) for robot, rows in by_robot.items()),
+        Section("Results in short", (summarise_cultures(by_robot),),
+                points=tuple((robot, summarise_robot(rows)) for robot, rows in by_robot.items()),
                 pictures=(_context_picture(study, found.folder),)),
         _whose_work(study, found, lost),
         Section("Every culture", tables=(_on_the_simulator(found.rows), _on_the_culture(found.rows))),
     ]  # fmt: skip
-    cultures = ", ".join(map(str, study.cultures))
-    named = f"Virtual culture{'' if len(study.cultures) == 1 else 's'} {cultures}"
-    lead = (
-        f"{named}; {study.policies} policies of each robot on every one, on the simulator and in closed loop on the "
-        "culture."
-    )
+    cultures = f"Virtual culture{'' if len(study.cultures) == 1 else 's'} {', '.join(map(str, study.cultures))}"
+    lead = f"{cultures}; {study.policies} policies of each robot on each, on the simulator and in closed loop."
     return write_page(
         found.folder / REPORT, "Does it need context, and whose work is it?", lead, sections, [f"Seed {study.seed}."]
     )
 
 
-def _whose_work(study: ContextStudy, found: RanContext, lost: dict[str, dict[str, list[float]]]) -> Section:
-    """What the policies lose, on cultures on which they have something to lose."""
-    left_out = [f"{row.robot} on culture {row.culture}" for row in found.rows if not _has_something(row)]
-    told = (f"Left out, as the policies are hardly above random stimuli: {', '.join(left_out)}.",) if left_out else ()
+def _whose_work(study: ContextStudy, found: ContextRun, lost: dict[str, dict[str, list[float]]]) -> Section:
+    """What the policies lose, on cultures on which they are clearly better than random stimuli."""
+    left_out = [f"{row.robot} on culture {row.culture}" for row in found.rows if not _beats_random(row)]
+    note = (f"Left out, as the policies are hardly above random stimuli: {', '.join(left_out)}.",) if left_out else ()
     if not lost:
-        return Section("Whose work is it?", told)
+        return Section("Whose work is it?", note)
     return Section(
-        "Whose work is it?", told, pictures=(_lost_picture(study, found.folder),), tables=(_lost_table(lost),)
+        "Whose work is it?", note, pictures=(_lost_picture(study, found.folder),), tables=(_lost_table(lost),)
     )
 
 
-def _has_something(row: ContextRow) -> bool:
-    """Whether the policies are above random stimuli by a tenth of the way to the best that is known."""
+def _beats_random(row: ContextRow) -> bool:
+    """Whether the policies are above random stimuli by a tenth of the way to the best known return."""
     best = max(each for each in (row.optimum, row.best_known, row.policies, row.coupling) if each is not None)
     return row.policies - row.random > 0.1 * (best - row.random) > 0
 
 
-def on_every_culture(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
-    """In two sentences, of all robots: which tasks ask for more than a reflex, and where the policies do more."""
+def summarise_cultures(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
+    """Two sentences on all robots: which tasks need more than a reflex, and where the policies do more."""
     needs = [robot for robot, rows in by_robot.items() if rows and all(row.needs_context for row in rows)]
     has = [robot for robot, rows in by_robot.items() if rows and all(row.has_context for row in rows)]
     return (
@@ -71,8 +67,8 @@ def on_every_culture(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
     )
 
 
-def in_short(rows: Sequence[ContextRow]) -> str:
-    """In two sentences, of one robot on all cultures: what the task asks for, and what the policies do."""
+def summarise_robot(rows: Sequence[ContextRow]) -> str:
+    """Two sentences on one robot on all cultures: what the task needs, and what the policies do."""
     n, needs = sum(row.gap is not None for row in rows), sum(row.needs_context for row in rows)
     if not n:
         return "The context gap is not known."
@@ -81,10 +77,10 @@ def in_short(rows: Sequence[ContextRow]) -> str:
     least = "at least " if any(row.is_least for row in rows) else ""
     between = f" (context gap {least}{_range(gaps)})" if gaps else ""
     cultures = "culture" if n == 1 else "cultures"
-    asked = f"A reflex leaves half of the task or more undone on {needs} of {n} {cultures}{between}."
+    task = f"A reflex leaves half of the task or more undone on {needs} of {n} {cultures}{between}."
     scores = [row.score for row in rows if row.score is not None]
     scored = f" (context score {least}{_range(scores)})" if scores else ""
-    return f"{asked} The policies do significantly more than the best reflex on {has} of {n}{scored}."
+    return f"{task} The policies do significantly more than the best reflex on {has} of {n}{scored}."
 
 
 def _range(values: Sequence[float]) -> str:
@@ -93,13 +89,13 @@ def _range(values: Sequence[float]) -> str:
 
 
 def _hundredths(value: float) -> str:
-    # Adding 0 takes the minus from a zero.
+    # Adding 0 turns -0 into 0.
     return f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
 
 
 def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[str, dict[str, list[float]]]:
-    """By robot and intervention: what was lost in parts of what the policies have over random stimuli."""
-    over_random = {(row.culture, row.robot): row.policies - row.random for row in rows if _has_something(row)}
+    """By robot and intervention: the return lost, as a fraction of the policies' advantage over random stimuli."""
+    over_random = {(row.culture, row.robot): row.policies - row.random for row in rows if _beats_random(row)}
     shares: dict[str, dict[str, list[float]]] = {}
     for row in lost:
         span = over_random.get((row.culture, row.robot))
@@ -113,10 +109,10 @@ def _context_picture(study: ContextStudy, folder: Path) -> Picture:
         folder / f"{_GAPS}.png",
         "Context gaps and context scores",
         "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
-        f"random); from the dashed line on a task is taken to need context. Right: how far the {study.policies} "
-        "policies come from that reflex to the optimum. A point is a culture, with its 95 % interval on the culture's "
-        "simulator; one that reaches the frame goes on beyond it. Triangles: at least so much, as the optimal return "
-        "is not known.",
+        f"random); from the dashed line on, a task counts as needing context. Right: how far the {study.policies} "
+        "policies get from that reflex to the optimum. Each point is a culture, with its 95 % interval on the "
+        "culture's simulator; an interval that reaches the frame extends beyond it. Triangles: lower bounds, as the "
+        "optimal return is not known.",
         (*(f"{_GAPS}.{ending}" for ending in FORMATS[1:]), TABLE),
     )
 
@@ -125,9 +121,9 @@ def _lost_picture(study: ContextStudy, folder: Path) -> Picture:
     return Picture(
         folder / f"{_LOST}.png",
         "Return lost by each intervention",
-        "The same policies with the culture, what it is given, or what is made of its answer changed. 0: nothing is "
-        "lost; 1: all that the policies have over random stimuli; below 0: something is gained. A point is a culture: "
-        f"the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator.",
+        "The same policies with a change to the culture, to its stimuli, or to how its responses are used. 0: nothing "
+        "is lost; 1: the policies' whole advantage over random stimuli is lost; below 0: something is gained. Each "
+        f"point is a culture: the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator.",
         (*(f"{_LOST}.{ending}" for ending in FORMATS[1:]), WHOSE_WORK),
     )
 
@@ -135,8 +131,8 @@ def _lost_picture(study: ContextStudy, folder: Path) -> Picture:
 def _lost_table(lost: dict[str, dict[str, list[float]]]) -> Table:
     names = list(dict.fromkeys(name for each in lost.values() for name in each))
     rows = [(name, *(float(np.mean(each[name])) if name in each else None for each in lost.values())) for name in names]
-    note = "Mean over cultures of the return lost, in parts of what the policies have over random stimuli."
-    return Table("Lost", ("", *lost), tuple(rows), note=note, beside=WHOSE_WORK)
+    note = "Mean over cultures of the return lost, as a fraction of the policies' advantage over random stimuli."
+    return Table("Return lost", ("", *lost), tuple(rows), note=note, beside=WHOSE_WORK)
 
 
 def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
@@ -150,9 +146,9 @@ def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:
         ("bits", "bits"),
     ]
     note = (
-        "Mean returns on the simulator of the last recording. Bits: goal information, of robots with several goals. ≥: "
-        "no optimal return is known. The gap is then with the best of policies and heuristic in its place, and the "
-        "score with the highest return of any episode: both are at least that."
+        "Mean returns on the simulator of the last recording. Bits: goal information, for robots with several goals. "
+        "≥: no optimal return is known. The gap is then computed with the best of policies and heuristic in its place, "
+        "and the score with the highest return of any episode: both are lower bounds."
     )
     return table_of("On the simulator", rows, columns, note=note, beside=TABLE)
 
@@ -167,7 +163,7 @@ def _on_the_culture(rows: Sequence[ContextRow]) -> Table:
         ("policies, predicted", "predicted_policies"),
     ]
     note = (
-        "Mean returns measured in closed loop on the culture, from where its recordings ended, beside the returns "
+        "Mean returns measured in closed loop on the culture, starting where its recordings ended, and the returns "
         "predicted for the same policies."
     )
     return table_of("On the culture, in closed loop", rows, columns, note=note, beside=TABLE)

@@ -1,4 +1,4 @@
-"""Parts of the context study as tasks: record a culture, train on it, judge the policies, and run them on it."""
+"""The context study's tasks: record a culture, train on it, evaluate the policies, and run them on it."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ SIMULATED, MEASURED = "simulated.json", "measured.json"
 
 @record
 class ContextStudy:
-    """Which tasks, on which virtual cultures, and how much of everything.
+    """The specification of a context study: its tasks, its virtual cultures, and its size.
 
     Attributes:
         cultures: seeds of virtual cultures, each recorded as it will run (`animat.stimulation.protocol`: `CLOSED_LOOP`,
             and for robots with two commands `TWO_COMMANDS`).
-        robots: by name; each in JAX, with one or two commands. Where one has no optimal return, its context gap is the
-            least that it can be (`animat.evaluation.coupling.least_context_gap`).
-        policies: trained for each robot and culture.
-        iterations_share: of the robot's own number of iterations.
+        robots: names of robots in JAX with one or two commands. Where a robot has no optimal return, its context gap is
+            a lower bound (`animat.evaluation.coupling.least_context_gap`).
+        policies: number trained for each robot and culture.
+        iterations_share: of the robot's default number of iterations.
         episodes: of each policy and control, on the simulator.
         episodes_measured: of each policy, on the culture.
         optimum_resolution: of the grid of the optimal return (`animat.evaluation.optimum`).
@@ -54,18 +54,18 @@ class ContextStudy:
         from animat.robots.host import HostRobot
         from animat.robots.registry import robot_named
 
-        for what in ("cultures", "robots"):
-            given = getattr(self, what)
-            if not given or len(set(given)) < len(given):
-                raise InvalidArgument(f"{what}: expected at least one, each once, got {given}")
+        for name in ("cultures", "robots"):
+            values = getattr(self, name)
+            if not values or len(set(values)) < len(values):
+                raise InvalidArgument(f"{name}: expected at least one, each once, got {values}")
         for name in self.robots:
             robot = robot_named(name)
             if robot.n_commands not in (1, 2) or isinstance(robot, HostRobot):
-                raise InvalidArgument(f"robots: expected ones in JAX with one or two commands, got {name!r}")
+                raise InvalidArgument(f"robots: expected JAX robots with one or two commands, got {name!r}")
 
 
 def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
-    """Every step, with less of everything: a first look, no results."""
+    """All steps at a small scale: a first look, not a result."""
     return ContextStudy(
         cultures=tuple(cultures),
         policies=2,
@@ -88,19 +88,19 @@ class ContextTask(Task):
     def grows_with(self) -> Mapping[str, object]:
         return {"policies": self.study.policies, "episodes": self.study.episodes}
 
-    def at(self, folder: Path) -> Path:
-        """The culture's folder."""
+    def culture_folder(self, folder: Path) -> Path:
         return folder / f"culture-{self.culture}"
 
     def recordings(self, folder: Path, n_commands: int) -> Path:
-        """The folder of its recordings for robots with so many commands."""
-        return self.at(folder) / (RECORDINGS if n_commands == 1 else f"{RECORDINGS}-{n_commands}-commands")
+        """The folder of the culture's recordings for robots with this number of commands."""
+        name = RECORDINGS if n_commands == 1 else f"{RECORDINGS}-{n_commands}-commands"
+        return self.culture_folder(folder) / name
 
 
 @final
 @dataclass(frozen=True)
 class RecordCulture(ContextTask):
-    """Record the culture twice, ten minutes apart, for robots with so many commands."""
+    """Record the culture twice, ten minutes apart, for robots with this number of commands."""
 
     n_commands: int = 1
 
@@ -111,7 +111,7 @@ class RecordCulture(ContextTask):
         out = self.recordings(folder, self.n_commands)
         files = record_series(
             lambda: VirtualCulture(self.culture),
-            presented_for(self.n_commands),
+            protocol_for(self.n_commands),
             out,
             sessions=2,
             progress=progress,
@@ -121,13 +121,12 @@ class RecordCulture(ContextTask):
 
 @dataclass(frozen=True)
 class RobotTask(ContextTask):
-    """A part of the study with the robot of one name."""
+    """A part of the study with one robot."""
 
     robot: str
 
     @property
     def n_commands(self) -> int:
-        """Of the robot."""
         from animat.robots.registry import robot_named
 
         return robot_named(self.robot).n_commands
@@ -140,19 +139,19 @@ class RobotTask(ContextTask):
         recordings = read_sources([self.recordings(folder, self.n_commands)])
         return extract_series(recordings, readouts=USUAL_READOUTS[self.n_commands])
 
-    def drawn(self, what: str) -> int:
-        """A seed of its own for each culture and robot: else sessions of all begin at the same few starts."""
-        return draw_seed(what, self.study.seed, self.robot, str(self.culture))
+    def seed_for(self, purpose: str) -> int:
+        """A seed for each culture and robot; otherwise sessions of all would begin at the same few starts."""
+        return draw_seed(purpose, self.study.seed, self.robot, str(self.culture))
 
-    def beside(self, folder: Path, name: str) -> Path:
+    def path(self, folder: Path, name: str) -> Path:
         """A file or folder of this robot on this culture."""
-        return self.at(folder) / self.robot / name
+        return self.culture_folder(folder) / self.robot / name
 
 
 @final
 @dataclass(frozen=True)
 class TrainPolicies(RobotTask):
-    """Train the policies as `animat train` does by default, going on from where a killed run stopped."""
+    """Train the policies as `animat train` does by default, resuming where a killed run stopped."""
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         from animat.coding.mapping import mapping_named
@@ -167,18 +166,18 @@ class TrainPolicies(RobotTask):
             mapping=mapping_named("9-thresholds"),
             policies=self.study.policies,
             iterations=int(self.study.iterations_share * robot.paper_iterations),
-            seed=self.drawn("context"),
+            seed=self.seed_for("context"),
             shadowing=True,
         ).over(timeline)
         checkpoint = folder / UNFINISHED / f"culture-{self.culture}" / f"{self.robot}.npz"
         members = tuple(range(training.policies))
-        return train_alone(work_on(training, members, timeline, self.beside(folder, POLICIES), checkpoint), progress)
+        return train_alone(work_on(training, members, timeline, self.path(folder, POLICIES), checkpoint), progress)
 
 
 @final
 @dataclass(frozen=True)
 class Judge(RobotTask):
-    """On the simulator: policies, controls, best coupling, optimum, context gap and score, and whose work it is."""
+    """Evaluate on the simulator: policies, controls, coupling, optimum, context gap and score, and whose work it is."""
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         from animat.evaluation.table import evaluate
@@ -186,21 +185,21 @@ class Judge(RobotTask):
         from animat.training.policy import load_policies
 
         evaluation = evaluate(
-            load_policies(self.beside(folder, POLICIES)),
+            load_policies(self.path(folder, POLICIES)),
             fit_timeline(self.series(folder)),
             episodes=self.study.episodes,
-            seed=self.drawn("judge"),
+            seed=self.seed_for("judge"),
             optimum_resolution=self.study.optimum_resolution,
             interventions=True,
             progress=InTurn(progress, 3),
         )
-        return [write_json(self.beside(folder, SIMULATED), evaluation.to_dict())]
+        return [write_json(self.path(folder, SIMULATED), evaluation.to_dict())]
 
 
 @final
 @dataclass(frozen=True)
 class Measure(RobotTask):
-    """In closed loop on the culture, from where its recordings ended, with controls between the policies' episodes."""
+    """Run in closed loop on the culture from where its recordings ended, controls between the policies' episodes."""
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         from animat.cultures.series import STATE_FILE
@@ -208,14 +207,14 @@ class Measure(RobotTask):
         from animat.reality_gap import Calibration, run_policies
         from animat.training.policy import load_policies
 
-        policies = load_policies(self.beside(folder, POLICIES))
+        policies = load_policies(self.path(folder, POLICIES))
         calibration = Calibration.of_series(self.series(folder), next(iter(policies.values())))
-        session = self.beside(folder, SESSION)
-        # Of a run that was killed: its culture is gone with it.
+        session = self.path(folder, SESSION)
+        # A killed run cannot be resumed, as its culture is gone with it.
         shutil.rmtree(session, ignore_errors=True)
         culture = VirtualCulture(self.culture)
         culture.restore_state(self.recordings(folder, self.n_commands) / STATE_FILE)
-        protocol = presented_for(self.n_commands)
+        protocol = protocol_for(self.n_commands)
         with culture:
             gap = run_policies(
                 policies,
@@ -224,22 +223,22 @@ class Measure(RobotTask):
                 session,
                 episodes=self.study.episodes_measured,
                 with_coupling=True,
-                seed=self.drawn("measure"),
+                seed=self.seed_for("measure"),
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
                 # Best coupling, prediction, closed loop, optimal return.
                 progress=InTurn(progress, 4),
             )
         if gap.session.ending.by != "plan":
-            raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to go on")
-        told = gap.to_dict()
-        # The session is told by its folder, with the times at which it ran.
-        kept = {name: told[name] for name in ("robot", "mapping", "rows", "optimum", "verdict", "reasons")}
-        return [write_json(self.beside(folder, MEASURED), kept)]
+            raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to continue")
+        fields = gap.to_dict()
+        # Left out: the session, whose folder and times differ from run to run.
+        kept = {name: fields[name] for name in ("robot", "mapping", "rows", "optimum", "verdict", "reasons")}
+        return [write_json(self.path(folder, MEASURED), kept)]
 
 
-def presented_for(n_commands: int) -> Protocol:
-    """How a culture is stimulated in recordings for robots with so many commands, as by `animat record`."""
+def protocol_for(n_commands: int) -> Protocol:
+    """The protocol of recordings for robots with this number of commands, as in `animat record`."""
     from animat.stimulation import protocol
 
     return protocol.CLOSED_LOOP if n_commands == 1 else protocol.TWO_COMMANDS

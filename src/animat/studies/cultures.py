@@ -1,4 +1,4 @@
-"""A study over many cultures: the same study of each in a folder of its own, and what holds over all of them."""
+"""A study over many cultures: the same study of each in its own folder, and results over all of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from animat.progress import Progress, Silent
 from animat.report.results import ComparedReturns, OverCultures, Results, Score
 from animat.studies.places import results_file
 from animat.studies.results import read_typed, write_named_records, write_parquet, write_records
-from animat.studies.run import Ran, run_study
+from animat.studies.run import StudyRun, run_study
 from animat.studies.source import read_seeds
 from animat.studies.specification import Study
 from animat.studies.tabulating import SECOND, TOO_FEW
@@ -33,27 +33,27 @@ from animat.writing import exclusive_lock, write_whole
 
 RESAMPLES = 10_000
 MOST_AT_ONCE = 64
-"""Cultures: each has a thread here, which looks after its jobs."""
+"""Cultures: each has a thread here, which manages its jobs."""
 COMPARISONS, SUMMARY, SCORES = "comparisons.csv", "over-cultures.csv", "scores.csv"
 MANIFEST = "cultures.json"
-"""Names the folders of the cultures."""
+"""Lists the folders of the cultures."""
 
 
 @dataclass(frozen=True)
-class RanCultures:
-    """What a run over cultures did.
+class CulturesRun:
+    """Results of a run over cultures.
 
     Attributes:
-        folder: with a folder for each culture.
-        ran: the cultures that are finished, by the name of their folder.
-        failed: why the others are not.
+        folder: contains a folder for each culture.
+        finished: the finished cultures, by the name of their folder.
+        failed: the errors of the others.
         comparisons: of each finished culture, by name.
-        summary: over all of them.
-        parquet: the scores as a Parquet table; None where fastparquet is missing.
+        summary: each comparison over all finished cultures.
+        parquet: the scores as a Parquet table; None if fastparquet is missing.
     """
 
     folder: Path
-    ran: dict[str, Ran]
+    finished: dict[str, StudyRun]
     failed: dict[str, str]
     comparisons: dict[str, tuple[ComparedReturns, ...]]
     summary: tuple[OverCultures, ...]
@@ -61,21 +61,16 @@ class RanCultures:
 
 
 def studies_of(study: Study) -> dict[str, Study]:
-    """The study of each culture by the name of its folder; none if the study is of one culture alone.
-
-    Raises:
-        InvalidArgument: for two folders of recordings of the same name.
-    """
+    """The study of each culture by the name of its folder; empty for a study of a single culture."""
     culture = study.culture
     if culture.seeds is not None:
         return {
             f"culture-{seed}": replace(study, culture=replace(culture, seed=seed, seeds=None))
             for seed in read_seeds(culture.seeds)
         }
-    folders = culture.folders or ()
     return {
         f"culture-{Path(each).name}": replace(study, culture=replace(culture, files=(each,), folders=None))
-        for each in folders
+        for each in culture.folders or ()
     }
 
 
@@ -87,52 +82,51 @@ def run_over_cultures(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> RanCultures:
-    """Run a study of many cultures, or go on with one: each culture as `run_study` does, one for each core at a time.
+) -> CulturesRun:
+    """Run or resume a study of many cultures: each culture as in `run_study`, one per core at a time.
 
-    A culture is recorded on one core, whatever there is. Beside it the jobs of other cultures are done.
-
-    A culture whose study fails is told in the end, and the others go on. More cultures may be added later: what is done
-    is not done again.
+    Recording a culture uses one core only; meanwhile the others do jobs of other cultures. If the study of a culture
+    fails, the others continue, and the failure is reported at the end. More cultures may be added later; finished jobs
+    are not run again.
 
     Args:
         study: with `seeds` or `folders` in its culture.
-        folder: where everything goes; made if it is missing.
-        base, workers, executor, progress: as of `run_study`.
+        folder: for all files; created if it is missing.
+        base, workers, executor, progress: as for `run_study`.
 
     Raises:
-        AnimatError: if the study of every culture failed, with what each failed of.
-        Mismatch: if the folder holds work of another kind, or another run is at work in it.
-        InvalidArgument: for fewer workers than one, or any beside an executor.
+        AnimatError: if the study of every culture failed, with the error of each.
+        Mismatch: if the folder holds other work, or is in use by another run.
+        InvalidArgument: for fewer than one worker, or workers together with an executor.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
     studies = studies_of(study)
-    # Seen before it is touched: somebody else's folder stays as it is.
+    # Checked first, so that a folder with other work is not touched.
     expect_no_other(folder, "cultures")
     with exclusive_lock(folder):
-        _name_cultures(folder, studies, {})
-        with _room(workers, executor) as (room, at_once):
-            here = workers if room is None else None
+        _write_manifest(folder, studies, {})
+        with _choose_executor(workers, executor) as (shared, at_once):
+            own_workers = workers if shared is None else None
             runs = {
-                name: partial(run_study, each, folder / name, base=base, workers=here, executor=room)
+                name: partial(run_study, each, folder / name, base=base, workers=own_workers, executor=shared)
                 for name, each in studies.items()
             }
-            ran, failed = _side_by_side(runs, min(at_once, MOST_AT_ONCE), room, progress or Silent())
-        _name_cultures(folder, studies, failed)
-        return _over_those_that_ran(folder, ran, failed)
+            finished, failed = _run_side_by_side(runs, min(at_once, MOST_AT_ONCE), shared, progress or Silent())
+        _write_manifest(folder, studies, failed)
+        return _write_tables(folder, finished, failed)
 
 
-def _name_cultures(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
-    """Say which folders there are, and which of them failed of what."""
+def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
+    """Write the names of the cultures' folders, and the errors of those that failed."""
     write_whole(folder / MANIFEST, json.dumps({"cultures": list(names), "failed": failed}, indent=1) + "\n")
 
 
-def _over_those_that_ran(folder: Path, ran: dict[str, Ran], failed: dict[str, str]) -> RanCultures:
-    """Write the tables over the cultures that are finished."""
-    if not ran:
-        raise AnimatError("; ".join(f"{which}: {why}" for which, why in failed.items()))
-    results = {name: read_typed(results_file(each.folder), Results) for name, each in ran.items()}
+def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str, str]) -> CulturesRun:
+    """Write the tables over the finished cultures."""
+    if not finished:
+        raise AnimatError("; ".join(f"{name}: {error}" for name, error in failed.items()))
+    results = {name: read_typed(results_file(each.folder), Results) for name, each in finished.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
     compared = [(name, row) for name, rows in comparisons.items() for row in rows]
@@ -142,101 +136,97 @@ def _over_those_that_ran(folder: Path, ran: dict[str, Ran], failed: dict[str, st
     write_named_records(folder / SCORES, scores, Score, "culture")
     parquet = (folder / SCORES).with_suffix(".parquet")
     is_written = write_parquet(parquet, scores, Score, "culture")
-    return RanCultures(folder, ran, failed, comparisons, summary, parquet if is_written else None)
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet if is_written else None)
 
 
 @contextmanager
-def _room(workers: int | None, executor: Executor | None) -> Iterator[tuple[Executor | None, int]]:
-    """Where the jobs of all cultures are run, and how many cultures at once keep that busy."""
+def _choose_executor(workers: int | None, executor: Executor | None) -> Iterator[tuple[Executor | None, int]]:
+    """The executor that all cultures share, and how many cultures at a time keep it busy."""
     if executor is not None:
         yield executor, executor.cores() if isinstance(executor, Cluster) else MOST_AT_ONCE
     elif find_gpu() is not None:
-        # It trains all policies of a culture at once.
+        # The GPU trains all policies of a culture at once.
         yield None, 1
     else:
         cores = own_cores(workers)
-        with PinnedProcesses(cores) as ours:
-            yield ours, len(cores)
+        with PinnedProcesses(cores) as processes:
+            yield processes, len(cores)
 
 
-def _side_by_side(
-    runs: Mapping[str, Callable[..., Ran]], at_once: int, room: Executor | None, progress: Progress
-) -> tuple[dict[str, Ran], dict[str, str]]:
-    """Run studies, so many at a time: those that are finished, and why the others are not."""
-    ran: dict[str, Ran] = {}
+def _run_side_by_side(
+    runs: Mapping[str, Callable[..., StudyRun]], at_once: int, shared: Executor | None, progress: Progress
+) -> tuple[dict[str, StudyRun], dict[str, str]]:
+    """Run studies, `at_once` at a time; returns the finished ones and the errors of the others, in their order."""
+    finished: dict[str, StudyRun] = {}
     failed: dict[str, str] = {}
-    together = _Together(progress, len(runs))
+    total = _TotalProgress(progress, len(runs))
     with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:
-        futures = {threads.submit(run, progress=together.of(name)): name for name, run in runs.items()}
+        futures = {threads.submit(run, progress=_StudyProgress(total, name)): name for name, run in runs.items()}
         try:
             for future in as_completed(futures):
                 name = futures[future]
                 try:
-                    ran[name] = future.result()
+                    finished[name] = future.result()
                 except AnimatError as error:
                     failed[name] = str(error)
-                together.end(name)
+                total.end(name)
         except BaseException:
-            together.stop()
+            total.is_stopped = True
             threads.shutdown(wait=False, cancel_futures=True)
-            if isinstance(room, PinnedProcesses):
-                # Else the studies would wait for what runs.
-                room.kill_workers()
+            if isinstance(shared, PinnedProcesses):
+                # Otherwise the studies would wait for their running jobs.
+                shared.kill_workers()
             raise
-    return {name: ran[name] for name in runs if name in ran}, {name: failed[name] for name in runs if name in failed}
+    ordered = {name: finished[name] for name in runs if name in finished}
+    return ordered, {name: failed[name] for name in runs if name in failed}
 
 
-class _Together:
-    """The progress of many studies, each of which is told of its own; stopped, it stops them at their next report."""
+class _TotalProgress:
+    """The progress of many studies together.
 
-    def __init__(self, whole: Progress, studies: int) -> None:
-        self._whole, self._studies = whole, studies
+    Attributes:
+        is_stopped: once set, each study is stopped at its next report.
+    """
+
+    def __init__(self, progress: Progress, studies: int) -> None:
+        self.is_stopped = False
+        self._progress, self._studies = progress, studies
         self._shares: dict[str, float] = {}
         self._ended = 0
         self._lock = threading.Lock()
-        self._is_stopped = False
-
-    def of(self, name: str) -> Progress:
-        """That of one study."""
-        return _OfOne(partial(self._see, name))
 
     def end(self, name: str) -> None:
-        """It is finished, or has failed."""
+        """Count a study that has finished or failed."""
         with self._lock:
             self._shares.pop(name, None)
             self._ended += 1
-        self._tell()
+            self._report()
 
-    def stop(self) -> None:
-        """Stop them all."""
-        self._is_stopped = True
-
-    def _see(self, name: str, share: float) -> None:
-        if self._is_stopped:
+    def update(self, name: str, share: float) -> None:
+        """Set the share of a study that is done."""
+        if self.is_stopped:
             raise AnimatError("stopped")
         with self._lock:
             self._shares[name] = share
-        self._tell()
+            self._report()
 
-    def _tell(self) -> None:
-        with self._lock:
-            running = "; ".join(f"{name} {100 * share:.0f} %" for name, share in self._shares.items())
-            note = f"{self._ended} of {self._studies} cultures" + (f"; {running}" if running else "")
-            self._whole.update(self._ended + sum(self._shares.values()), self._studies, note)
+    def _report(self) -> None:
+        running = "; ".join(f"{name} {100 * share:.0f} %" for name, share in self._shares.items())
+        note = f"{self._ended} of {self._studies} cultures" + (f"; {running}" if running else "")
+        self._progress.update(self._ended + sum(self._shares.values()), self._studies, note)
 
 
-class _OfOne:
-    def __init__(self, see: Callable[[float], None]) -> None:
-        self._see = see
+class _StudyProgress:
+    def __init__(self, total: _TotalProgress, name: str) -> None:
+        self._total, self._name = total, name
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Tell the others of it."""
-        self._see(done / total)
+        self._total.update(self._name, done / total)
 
 
-def over_cultures(found: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
-    """Each comparison over cultures, of which all have the same ones in the same order."""
-    return tuple(_over(rows) for rows in zip(*found, strict=True))
+def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
+    """Each comparison over cultures, all of which have the same comparisons in the same order."""
+    return tuple(_over(rows) for rows in zip(*comparisons, strict=True))
 
 
 def _over(rows: tuple[ComparedReturns, ...]) -> OverCultures:
@@ -258,7 +248,7 @@ def _over(rows: tuple[ComparedReturns, ...]) -> OverCultures:
 
 
 def bootstrap_interval(values: Float64[np.ndarray, " cultures"]) -> tuple[float, float]:
-    """The 95 % percentile interval of the mean, by drawing as many values with replacement; the same always."""
+    """The 95 % percentile bootstrap interval of the mean; deterministic."""
     drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
     low, high = np.quantile(values[drawn].mean(axis=1), (0.025, 0.975))
     return float(low), float(high)

@@ -1,4 +1,4 @@
-"""The page of a study over many cultures: what holds over all of them, then each, with the way to its own report."""
+"""The page of a study over many cultures: results over all of them, then a link to the report of each."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from animat.report.html import Picture, Section, cell, columns_of, table_of, wri
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import OverCultures
 from animat.report.style import FORMATS, save_figure
-from animat.studies.arms import arms_shown, many_arms, what_parts
-from animat.studies.cultures import COMPARISONS, SUMMARY, RanCultures
+from animat.studies.arms import arm_differences, arms_table, summarise_arms
+from animat.studies.cultures import COMPARISONS, SUMMARY, CulturesRun
 from animat.studies.places import REPORT
 from animat.studies.specification import Compared, Study
 from animat.studies.tabulating import LEVEL
 
 
-def write_cultures_page(study: Study, found: RanCultures) -> Path:
-    """Write the page and its figure beside it."""
+def write_cultures_page(study: Study, found: CulturesRun) -> Path:
+    """Write the page and its figure."""
     sections = []
     if found.summary:
         # Every culture has the same comparisons in the same order.
@@ -25,25 +25,25 @@ def write_cultures_page(study: Study, found: RanCultures) -> Path:
         figure = draw_over_cultures([*zip(found.summary, differences, strict=True)])
         for ending in FORMATS:
             save_figure(figure, found.folder / f"over-cultures.{ending}")
-        sections.append(_in_short(study, found))
-    pages = tuple(f"{name}/{REPORT}" for name in found.ran)
-    points = [(name, f"finished: {page}") for name, page in zip(found.ran, pages, strict=True)]
+        sections.append(_summary(study, found))
+    pages = tuple(f"{name}/{REPORT}" for name in found.finished)
+    points = [(name, f"finished: {page}") for name, page in zip(found.finished, pages, strict=True)]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
     sections.append(Section("Each culture", points=tuple(points), links=pages))
-    cultures = f"{len(found.ran)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
-    lead = f"{cultures}. {many_arms(study)} on every culture."
+    cultures = f"{len(found.finished)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
+    lead = f"{cultures}. {summarise_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
 
 
-def _in_short(study: Study, found: RanCultures) -> Section:
+def _summary(study: Study, found: CulturesRun) -> Section:
     points, explained = [], set[str]()
     for row in found.summary:
         compared = next(each for each in study.comparisons if each.name == row.comparison)
-        parts = list(what_parts(study.arm(compared.first), study.arm(compared.second)))
-        # Each where it comes first.
-        words = " ".join([_told(compared, row), *(each for each in parts if each not in explained)])
-        points.append((f"{row.robot}, {row.comparison}", words))
-        explained |= set(parts)
+        differences = list(arm_differences(study.arm(compared.first), study.arm(compared.second)))
+        # Each difference is explained only once.
+        text = " ".join([_describe(compared, row), *(each for each in differences if each not in explained)])
+        points.append((f"{row.robot}, {row.comparison}", text))
+        explained |= set(differences)
     table = table_of(
         "Over cultures",
         found.summary,
@@ -54,22 +54,22 @@ def _in_short(study: Study, found: RanCultures) -> Section:
             ("significantly better in", "found_better"),
         ],
         note="Mean returns; each culture counts the same. Intervals are percentile bootstraps over cultures, too "
-        "narrow of fewer than ten. Second mean larger in: cultures in which the second arm's mean return is the larger "
-        f"one. Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
+        "narrow with fewer than ten. Second mean larger in: cultures in which the second arm's mean return is larger. "
+        f"Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
         beside=SUMMARY,
     )
     picture = Picture(
         found.folder / "over-cultures.png",
         "Differences on each culture",
-        "A point is a culture: the mean return of the second arm's policies less that of the first's; right of 0 the "
-        "second arm is better. Above each row of points their mean with its 95 % interval, of "
+        "Each point is a culture: the mean return of the second arm's policies minus that of the first's; to the right "
+        "of 0 the second arm is better. Above each row of points: their mean with its 95 % interval, of "
         f"{len(found.comparisons)} cultures.",
         ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
     )
-    return Section("Results in short", (), tuple(points), (arms_shown(study), table), (picture,))
+    return Section("Results in short", (), tuple(points), (arms_table(study), table), (picture,))
 
 
-def _told(compared: Compared, row: OverCultures) -> str:
+def _describe(compared: Compared, row: OverCultures) -> str:
     larger = (
         f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of {row.cultures} "
         "cultures"

@@ -1,4 +1,4 @@
-"""Where the study departs from the paper: decisions taken, and comparisons that came out otherwise."""
+"""Differences between a study and the paper: decisions taken, and comparisons with another outcome."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ PAPER_POLICIES = 10
 """Per arm. Source: Sawada et al. 2022."""
 
 _CULTURES = {
-    "virtual": "This one is simulated, grown from a seed, calibrated to published figures of cortical cultures and not "
-    "to the paper's results. How large its responses are and how they tire differ from the paper's.",
-    "files": "Here recordings at hand are used.",
+    "virtual": "This one is simulated, grown from a seed, and calibrated to published figures of cortical cultures, "
+    "not to the paper's results. The size of its responses and their fatigue differ from the paper's.",
+    "files": "Here existing recordings are used.",
 }
 
 
 def decisions(study: Study, series: Sequence[Responses] = ()) -> tuple[tuple[str, str], ...]:
-    """What the paper leaves open or contradicts, and what this study does about it, with these responses."""
+    """Where the paper is silent or contradicts itself, and what this study does instead; `series` gives the numbers."""
     return (
-        *_of_size(study),
-        *_of_culture(study),
-        *_of_commands(study),
-        *_of_simulators(study, series),
-        *_of_learning(study),
+        *_size_decisions(study),
+        *_culture_decisions(study),
+        *_command_decisions(study),
+        *_simulator_decisions(study, series),
+        *_learning_decisions(study),
     )
 
 
-def _of_size(study: Study) -> Iterator[tuple[str, str]]:
-    """Where there are more or fewer recordings, policies or iterations."""
-    here, papers = study.culture, Source()
-    if here.kind == "virtual" and _recorded(here) != _recorded(papers):
-        yield "Recordings", f"The paper has {_recorded(papers)}. Here there are {_recorded(here)}."
+def _size_decisions(study: Study) -> Iterator[tuple[str, str]]:
+    """Where the numbers of recordings, policies or iterations differ."""
+    culture, paper = study.culture, Source()
+    if culture.kind == "virtual" and _recorded(culture) != _recorded(paper):
+        yield "Recordings", f"The paper has {_recorded(paper)}. Here there are {_recorded(culture)}."
     if study.policies != PAPER_POLICIES:
         yield "Policies", f"The paper has {PAPER_POLICIES} per arm. Here there are {study.policies}."
-    trained = [spec for spec in study.robots if (spec.kind or spec.name) in {robot for _, robot in PRINTED}]
-    for spec in trained:
-        if spec.trained_for != (papers_own := spec.robot().paper_iterations):
+    in_paper = {robot for _, robot in PRINTED}
+    for spec in study.robots:
+        if (spec.kind or spec.name) in in_paper and spec.trained_for != (iterations := spec.robot().paper_iterations):
             yield (
                 f"Iterations on {spec.name}",
-                f"The paper trains a policy for {papers_own:,}. Here it is trained for {spec.trained_for:,}.",
+                f"The paper trains a policy for {iterations:,}. Here it is trained for {spec.trained_for:,}.",
             )
 
 
@@ -65,17 +65,17 @@ def _recorded(culture: Source) -> str:
     )
 
 
-def _of_culture(study: Study) -> Iterator[tuple[str, str]]:
+def _culture_decisions(study: Study) -> Iterator[tuple[str, str]]:
     yield "The culture", f"The paper's was alive. {_CULTURES[study.culture.kind]}"
     if study.culture.kind == "virtual":
         yield (
             "Pulse",
-            "As published the pulse's phases do not balance (100 against 80 mV ms). The virtual culture takes it as "
-            "it is; hardware would not.",
+            "As published, the pulse's phases do not balance (100 against 80 mV ms). The virtual culture accepts it "
+            "unchanged; hardware would not.",
         )
 
 
-def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
+def _command_decisions(study: Study) -> Iterator[tuple[str, str]]:
     if any(arm.mapping == "9-thresholds" for arm in study.arms):
         yield (
             "Ten levels without zero",
@@ -86,130 +86,121 @@ def _of_commands(study: Study) -> Iterator[tuple[str, str]]:
         yield from spec.robot().departures()
 
 
-def _of_simulators(study: Study, series: Sequence[Responses]) -> Iterator[tuple[str, str]]:
+def _simulator_decisions(study: Study, series: Sequence[Responses]) -> Iterator[tuple[str, str]]:
     simulators = study.simulators
-    yield "Bursts", f"In the paper Otsu's threshold always cuts. {_cut(simulators.burst_threshold, series)}"
-    papers = "The paper's 20 bins reach from 0 to 120 Hz, chosen for its culture. "
+    yield (
+        "Bursts",
+        f"In the paper Otsu's threshold is always applied. {_burst_rule(simulators.burst_threshold, series)}",
+    )
+    paper = "The paper's 20 bins range from 0 to 120 Hz, chosen for its culture. "
     if simulators.kind == "empirical":
-        yield "Histogram", papers + "Here there are none: one of the measured responses is drawn."
+        yield "Histogram", paper + "Here there are no bins: one of the measured responses is drawn."
     elif simulators.kind == "memory":
         yield (
             "Memory",
-            "The paper's histogram answers the same whatever was before. Here one of the measured responses that had a "
-            "similar history is drawn, so what a culture remembers is in it.",
+            "The response of the paper's histogram does not depend on the past. Here one of the measured responses "
+            "with a similar history is drawn, so the simulator includes the culture's memory.",
         )
     else:
         if simulators.range_hz is None:
-            here = (
+            bins = (
                 f"Here the edges of the {simulators.bins} bins are percentiles of each recording's own responses, all "
-                "conditions together: where responses are small, or become smaller, equally wide bins erase the "
+                "conditions together: where responses are small, or become smaller, bins of equal width erase the "
                 "differences between conditions."
             )
         else:
-            here = (
+            bins = (
                 f"Here {simulators.bins} bins of equal width reach to {simulators.range_hz:g} Hz. Controllability of "
-                "every recording shows how often responses pass the median in the data and in the simulator: what "
-                "parts the two is taken by binning."
+                "every recording shows how often responses exceed the median in the data and in the simulator: the "
+                "difference is lost by binning."
             )
-        yield "Histogram range", papers + here
+        yield "Histogram range", paper + bins
         yield (
             "Drawing from a histogram",
-            "A bin is drawn by its share, then a response evenly within it. What lies above the range counts into "
-            "the last bin, and is reported.",
+            "A bin is drawn with the probability of its share, then a response uniformly within it. Responses above "
+            "the range count in the last bin, and are reported.",
         )
     fixed = any(arm.percentiles == "first" for arm in study.arms)
     yield (
         "Percentiles",
-        "The paper does not say which recording the thresholds are taken from. Here they come from the recording whose "
+        "The paper does not say from which recording the thresholds are taken. Here they come from the recording whose "
         "simulator is in use, so "
         + ("they move, except in the arms with those of the first recording." if fixed else "they move with it."),
     )
 
 
-def _cut(threshold: float | None, series: Sequence[Responses]) -> str:
-    """What sets bursts apart here, and how many responses stay that would not in the paper."""
+def _burst_rule(threshold: float | None, series: Sequence[Responses]) -> str:
+    """How bursts are separated here, and how many responses are kept that the paper would leave out."""
     if threshold is not None:
-        return f"Here the threshold is given: {threshold:g} of the channels."
-    here = (
-        "Here its cut is kept only where the ratios of active channels form two groups; elsewhere no response is set "
+        return f"Here the threshold is set to {threshold:g} of the channels."
+    rule = (
+        "Here it is applied only where the ratios of active channels form two groups; elsewhere no response is set "
         "apart."
     )
     if not series:
-        return here
+        return rule
     uncut = [of.active_ratio for of in series if not of.is_burst.any()]
     above = [n for ratios in uncut if (n := int(np.count_nonzero(ratios > otsu_threshold(ratios))))]
     return (
-        f"{here} That is so in {len(above)} of {len(series)} recordings, which keep {sum(above):,} of "
+        f"{rule} That is so in {len(above)} of {len(series)} recordings, which keep {sum(above):,} of "
         f"{sum(map(len, series)):,} responses that the paper's rule would leave out."
     )
 
 
-def _of_learning(study: Study) -> Iterator[tuple[str, str]]:
+def _learning_decisions(study: Study) -> Iterator[tuple[str, str]]:
     yield (
         "Learning",
         "The paper's hosted platform is retired; it chose networks and settings by itself and took up to 60 minutes. "
-        "Here it is discrete soft actor-critic with one set of settings for all, and the progress of training stands "
-        f"for {study.training_min:g} minutes of the culture's clock. The critics, which only training has, see how "
+        "Here discrete soft actor-critic is used with one set of settings for all, and training is taken to last "
+        f"{study.training_min:g} minutes on the culture's clock. The critics, which are used only in training, see how "
         "much of the episode is left, so that a time limit ends the return they learn; policies do not.",
     )
     if study.actions == "most probable":
-        yield (
-            "Most probable actions",
-            "The paper does not say whether policies draw their actions when they are evaluated. Here they take the "
-            "most probable one.",
-        )
+        actions, here = "Most probable actions", "take the most probable one"
+        untrained = "Taking the most probable one turns each into a fixed rule, which can do worse than random actions."
     else:
-        yield (
-            "Drawn actions",
-            "The paper does not say whether policies draw their actions when they are evaluated. Here they do.",
-        )
+        actions, here, untrained = "Drawn actions", "do", "They act almost at random."
+    yield actions, f"The paper does not say whether policies draw their actions in evaluation. Here they {here}."
     if any(not arm.trained for arm in study.arms):
         yield (
             "Before training",
-            "The policies before training are networks as training starts from them, drawn at random: all actions are "
-            "nearly equally probable. "
-            + (
-                "Taking the most probable one makes a fixed rule of each, which can do worse than random actions."
-                if study.actions == "most probable"
-                else "They act as good as at random."
-            ),
+            "The policies before training are networks with random initial weights: all actions are nearly equally "
+            f"probable. {untrained}",
         )
 
 
-def came_out_otherwise(
+def differing_comparisons(
     rows: Sequence[ComparedReturns], lost: Mapping[float, float] | None = None
 ) -> tuple[tuple[str, str], ...]:
-    """For each comparison that differs from the paper or cannot tell: what came out, and what its optimum says to it.
+    """For each comparison that differs from the paper or is undecided: its outcome, and what the optima say about it.
 
-    By the recording's minute it is given how far binning moved P(x >= P50) of any condition.
+    `lost` is by how much binning moved P(x >= P50) of any condition, at most, by the recording's minute.
     """
-    told = []
+    described = []
     for row in rows:
         if row.as_in_paper not in ("no", "cannot tell"):
             continue
-        words = (
+        text = (
             f"The paper found {row.second} better than {row.first} (p = {row.paper_p:.3g}, which implies U = "
             f"{row.paper_u:g}). Here: {row.outcome} (U = {row.u:g}, p = {row.p_normal:.3g}; mean returns "
             f"{row.mean_first:.1f} and {row.mean_second:.1f}). {explain(row)}"
         )
         loss = (lost or {}).get(row.at_min, 0.0)
         if loss > LARGEST_LOSS:
-            words += (
+            text += (
                 f" In this recording binning moves P(x ≥ P50) by up to {loss:.2f}: policies and optimum are those of "
                 "the simulator, and not all that the culture would allow."
             )
-        told.append((f"{row.comparison}, {row.robot}", words))
-    return tuple(told)
+        described.append((f"{row.comparison}, {row.robot}", text))
+    return tuple(described)
 
 
 def explain(row: ComparedReturns) -> str:
-    """What the optima say to a comparison's outcome."""
+    """What the optima say about a comparison's outcome."""
     n = row.n
     smallest = p_of_u(0.0, n, n)
     if smallest >= LEVEL:
-        return (
-            f"With {n} policies per side p cannot fall below {smallest:.2g}, however they differ: take more policies."
-        )
+        return f"With {n} policies per side p cannot fall below {smallest:.2g}, however they differ: use more policies."
     first, second, random = row.optimum_first, row.optimum_second, row.random_second
     if second is None or random is None:
         return "There is no optimum to compare with."
@@ -221,7 +212,7 @@ def explain(row: ComparedReturns) -> str:
         )
     optima = f"The optimal return is {second:.1f} for {row.second}"
     if first is None:
-        # A control has no optimum of its own: whatever it chooses, another condition is delivered.
+        # A control has no optimum: whatever it chooses, a random condition is delivered.
         optima += f"; {row.first} cannot do better than random actions, {random:.1f}"
     else:
         optima = f"The optimal return is {first:.1f} for {row.first} and {second:.1f} for {row.second}"
@@ -230,16 +221,16 @@ def explain(row: ComparedReturns) -> str:
             return f"{optima}: with these responses the order of the optima is itself the other way round."
         if abs(first - second) <= error:
             optima += ", which is the same within their errors"
-    # How much more than the first arm the second could have, as a part of all there is to learn.
+    # How far the second arm could exceed the first, as a fraction of all there is to learn.
     room = (second - row.mean_first) / (second - random)
     if room <= 1 - AIM:
         return (
-            f"{optima}, and {row.first} has all but {100 * max(room, 0.0):.1f} % of what lies between random "
-            "actions and that: no room is left."
+            f"{optima}, and {row.first} achieves all but {100 * max(room, 0.0):.1f} % of the range from random actions "
+            "to it: no room is left."
         )
     score = row.score_second
     if score is not None and score >= AIM:
-        return f"{optima}; {row.second} is at its optimum (score {score:.2f}), so more cannot be had from it."
+        return f"{optima}; {row.second} is at its optimum (score {score:.2f}), so it cannot improve."
     scores = " and ".join("unknown" if s is None else f"{s:.2f}" for s in (row.score_first, score))
     return (
         f"{optima}, random {random:.1f}; scores are {scores}. The optimum leaves room, {second - row.mean_first:.1f} "

@@ -1,4 +1,4 @@
-"""The one table of episodes: a row an episode, whoever acted; returns of every kind are summarised from it."""
+"""The table of episodes, one row per episode, from which all returns are summarised."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ if TYPE_CHECKING:
     from pandas import DataFrame as DataFrame
     from pandas import Series
 else:
-    # For annotations alone: pandas is loaded where tables are worked with.
+    # For annotations alone: pandas is loaded only where tables are used.
     DataFrame = Any
 
 COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "return", "iterations", "ended")
-"""Of the table:
+"""Columns of the table:
 
 - robot: its name in the study.
-- arm: what it was run in: an arm's name, or of controls what they act through (`named_mapping`).
+- arm: the arm's name; for controls the mapping they act through (`mapping_label`).
 - agent: `POLICY`, or the control's name.
-- actor: which of several, from 0: of policies p0, p1, ...
-- at_min: the recording that answers.
+- actor: which of several, from 0; for policies p0, p1, ...
+- at_min: the recording whose simulator responds.
 - over_time: whether it is one of the few episodes at every recording.
 - episode: from 0.
 - return, iterations: of the episode.
 - ended: `terminated` by itself, or `truncated` at the episode limit.
 
-And of robots with a goal (`animat.goals.tally.Outcome`): `SUCCEEDED`, 1 or 0; `MARGIN`; and of each objective, from 0,
-the `SATISFACTION` in %.
+For robots with a goal (`animat.goals.tally.Outcome`) also: `SUCCEEDED`, 1 or 0; `MARGIN`; and the `SATISFACTION` of
+each objective, from 0, in %.
 """
 SUCCEEDED, MARGIN, SATISFACTION = "succeeded", "margin", "satisfaction_"
 POLICY = "policy"
@@ -41,14 +41,14 @@ RANDOM = "random"
 COUPLING = "coupling"
 
 
-def tabulated(
+def episode_rows(
     ran: Episodes, *, robot: str, arm: str, at_min: float, agent: str = POLICY, over_time: bool = False
 ) -> DataFrame:
     """Episodes that were run together, as rows of the table."""
     from pandas import DataFrame
 
     actor, episode = (index.ravel() for index in np.indices(ran.returns.shape))
-    told = {
+    columns = {
         "robot": robot,
         "arm": arm,
         "agent": agent,
@@ -61,16 +61,16 @@ def tabulated(
         "ended": np.where(ran.terminated, "terminated", "truncated").ravel(),
     }
     if (outcome := ran.outcome) is not None:
-        told |= {SUCCEEDED: outcome.succeeded.astype(float).ravel(), MARGIN: outcome.margin.ravel()}
-        told |= {
+        columns |= {SUCCEEDED: outcome.succeeded.astype(float).ravel(), MARGIN: outcome.margin.ravel()}
+        columns |= {
             f"{SATISFACTION}{i}": of.ravel()
             for i, of in enumerate(np.moveaxis(np.asarray(outcome.satisfaction), -1, 0))
         }
-    return DataFrame(told)
+    return DataFrame(columns)
 
 
 def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
-    """Write parts of the table as one file, complete or absent: each column an array, and the same bytes always."""
+    """Write parts of the table to one file, each column as an array; atomic, and always the same bytes."""
     import pandas as pd
 
     table = pd.concat(parts)
@@ -81,12 +81,12 @@ def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
 
 
 def read_episodes(paths: Iterable[Path]) -> DataFrame:
-    """The table, put together from its files; raises InvalidFile if one cannot be read."""
+    """The table, read from its files; raises InvalidFile if one cannot be read."""
     import pandas as pd
 
     files = [read_arrays(path) for path in paths]
-    of_goals = [name for arrays in files for name in arrays if name.startswith((SUCCEEDED, MARGIN, SATISFACTION))]
-    parts = [pd.DataFrame(arrays, columns=list(dict.fromkeys((*COLUMNS, *of_goals)))) for arrays in files]
+    goal_columns = [name for arrays in files for name in arrays if name.startswith((SUCCEEDED, MARGIN, SATISFACTION))]
+    parts = [pd.DataFrame(arrays, columns=list(dict.fromkeys((*COLUMNS, *goal_columns)))) for arrays in files]
     return pd.concat(parts, ignore_index=True)
 
 

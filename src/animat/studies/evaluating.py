@@ -1,4 +1,4 @@
-"""Evaluation as jobs: an arm's policies on one robot, and the controls that ask whether the culture does it."""
+"""Evaluation jobs: an arm's policies on one robot, and the controls that test what the culture contributes."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
-from animat.studies.episodes import COUPLING, RANDOM, tabulated, write_episodes
+from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.simulating import load_timeline
-from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask, draw_seed
 from animat.studies.training import training_of
 from animat.training.policy import Policy
 
-_DRAWN_BY = {"heuristic": "made by hand"}
-"""Names that random numbers are drawn by where controls have been renamed since: a seed's numbers stay as they are."""
+_SEED_NAMES = {"heuristic": "made by hand"}
+"""Former names of renamed controls, from which their seeds are still made, so that a seed's results do not change."""
 
 
 @final
 @dataclass(frozen=True)
 class Evaluate(StudyTask):
-    """Run an arm's policies at the minutes of its comparisons, at every recording, and once for their paths."""
+    """Run an arm's policies at the minutes of its comparisons, at every recording, and once to record paths."""
 
     sizes = ("policies", "episodes", "episodes_over_time")
 
@@ -46,13 +46,13 @@ class Evaluate(StudyTask):
         parts = []
         for at_min, episodes in study.minutes_of(self.arm, first, last).items():
             ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
-            parts.append(tabulated(ran, robot=robot, arm=self.arm.name, at_min=at_min))
+            parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min))
         if self.arm.through_neurons and timeline is not None:
             for i, at_min in enumerate(timeline.start_min.tolist()):
                 progress.update(i, len(timeline), "over time")
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
                 ran = setting.run(networks, n, at_min, study.episodes_over_time, seed)
-                parts.append(tabulated(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
+                parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
         seed = draw_seed(study.seed, robot, slug, last, "paths")
         paths = record_paths(setting.environment, setting.simulator(last), networks, n, seed)
         return [
@@ -64,12 +64,12 @@ class Evaluate(StudyTask):
 @final
 @dataclass(frozen=True)
 class Control(StudyTask):
-    """Run the controls of a mapping on a robot: random, constant, heuristic; with policies silent and shuffled too.
+    """Run the controls of a mapping on a robot: random, constant, heuristic; with policies also silent and shuffled.
 
-    And the best coupling, at the last recording alone, as the search takes as long as all others together.
+    The best coupling is run at the last recording only, as its search takes as long as all other controls together.
 
     Attributes:
-        plain: arm that gives the mapping; the one whose policies are used, if it is trained as usual.
+        plain: arm that gives the mapping; its policies are used if it `is_usual`.
     """
 
     sizes = ("policies", "episodes", "episodes_over_time")
@@ -82,53 +82,52 @@ class Control(StudyTask):
         arm, robot = replace(self.plain, delivery="chosen"), self.spec.name
         setting = setting_of(study, self.spec, arm, timeline)
         name = f"controls-{arm.thresholds}"
-        through = named_mapping(*arm.kind)
+        through = mapping_label(*arm.kind)
         networks = _networks(study, folder, self.spec, self.plain) if is_usual(self.plain) else None
         parts = []
         first, last = span_min(timeline)
         minutes = study.optimum_minutes(first, last) if arm.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
-            answering = setting.simulator(at_min)
-            for each in controls_of(setting.environment, answering, setting.action_labels, networks, study.policies):
-                drawn_by = _DRAWN_BY.get(each.name, each.name)
-                seed = draw_seed(study.seed, robot, name, at_min, drawn_by)
-                within = each.within(setting.environment, answering)
+            simulator = setting.simulator(at_min)
+            for each in controls_of(setting.environment, simulator, setting.action_labels, networks, study.policies):
+                seed = draw_seed(study.seed, robot, name, at_min, _SEED_NAMES.get(each.name, each.name))
+                within = each.within(setting.environment, simulator)
                 ran = roll_out(*within, each.actor, each.n_actors, episodes=study.episodes, seed=seed)
-                parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
+                parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:
             if networks is not None and not isinstance(setting.environment.robot, HostRobot):
                 progress.update(len(minutes), len(minutes) + 1, "best coupling")
                 seeds = [draw_seed(study.seed, robot, name, last, COUPLING, part) for part in ("search", "episodes")]
                 coupling = best_coupling(setting.environment, setting.simulator(last), seed=seeds[0])
                 ran = setting.run(coupling, 1, last, study.episodes, seeds[1])
-                parts.append(tabulated(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
+                parts.append(episode_rows(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
                 ran = setting.run(Uniform(), 1, at_min, study.episodes, seed)
-                parts.append(tabulated(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
+                parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
         return [write_episodes(controls_file(folder, self.spec, arm), parts)]
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What policies are run in: an environment, the neurons of every minute (None without), labels of its actions."""
+    """What policies run in: an environment, the simulators of every minute (None without neurons), action labels."""
 
     environment: Environment[Any]
     timeline: SimulatorTimeline | None
     action_labels: tuple[str, ...]
 
     def simulator(self, at_min: float) -> NeuronSimulator | None:
-        """The neurons at a minute."""
+        """The simulator at a minute."""
         return None if self.timeline is None else self.timeline.at(at_min)
 
     def run(self, actor: Actor, n: int, at_min: float, episodes: int, seed: int) -> Episodes:
-        """Episodes at a minute."""
+        """Run episodes at a minute."""
         return roll_out(self.environment, self.simulator(at_min), actor, n, episodes=episodes, seed=seed)
 
 
 def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimeline | None) -> Setting:
-    """What an arm's policies are evaluated in."""
+    """The setting in which an arm's policies are evaluated."""
     # Lessons are for training alone.
     training = training_of(study, replace(spec, lessons=()), arm)
     if not arm.through_neurons or timeline is None:
@@ -141,18 +140,18 @@ def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimel
 
 
 def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | None]:
-    """The study with its comparisons at the minutes of its recordings, and their simulators; None without neurons."""
+    """The study with comparisons at the minutes of its recordings, and their simulators; None without neurons."""
     timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
     return study.at_recordings([] if timeline is None else timeline.start_min.tolist()), timeline
 
 
 def is_usual(arm: Arm) -> bool:
-    """Whether its policies are trained, and get what they choose."""
+    """Whether an arm's policies are trained, have neurons, and receive the stimulus that they choose."""
     return arm.trained and arm.delivery == "chosen" and arm.through_neurons
 
 
 def span_min(timeline: SimulatorTimeline | None) -> tuple[float, float]:
-    """The minutes of the first recording and of the last; 0 without any."""
+    """The minutes of the first and the last recording; 0 without recordings."""
     return (0.0, 0.0) if timeline is None else (float(timeline.start_min[0]), float(timeline.start_min[-1]))
 
 

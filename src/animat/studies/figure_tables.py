@@ -1,4 +1,4 @@
-"""The numbers of figures that no other table holds, from the arrays that are drawn: `tables/` by the figure's name."""
+"""Tables of the numbers that only figures show, from the arrays that are drawn: in `tables/` by the figure's name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from animat.tables import UNKNOWN
 def write_psth(
     folder: Path, histogram: PostStimulusHistogram, window_ms: tuple[float, float], spontaneous_hz: float
 ) -> Path:
-    """The post-stimulus time histogram of the first recording, a line a bin, from the stimulus.
+    """The post-stimulus time histogram of the first recording, one row per bin.
 
     `in_window` is the share of the bin that lies in the response window.
     """
@@ -41,14 +41,13 @@ def write_psth(
 
 
 def write_bursts(folder: Path, series: Sequence[Responses]) -> Path:
-    """How bursts stand apart in every recording; above the threshold, a ratio of active channels, is a burst."""
+    """Burst separation in every recording; a response whose ratio of active channels is above the threshold is one."""
     head = ("at_min", "responses", "bursts", "burst_share", "threshold_active_ratio", "separability", "channels")
     rows = []
     for responses in series:
         n, bursts = len(responses), int(np.count_nonzero(responses.is_burst))
-        share = bursts / n if n else None
-        told = (responses.threshold, responses.separability, responses.n_channels)
-        rows.append((responses.start_min, n, bursts, share, *told))
+        counts = (responses.start_min, n, bursts, bursts / n if n else None)
+        rows.append((*counts, responses.threshold, responses.separability, responses.n_channels))
     return _write(folder, "culture-bursts", head, rows)
 
 
@@ -79,8 +78,8 @@ def write_array(folder: Path, recording: Recording) -> Path:
     stimulated = set(electrodes[electrodes != UNKNOWN].tolist())
     columns = (channels.label, channels.electrode, channels.x_um, channels.y_um, rates_of_sites(recording))
     rows: list[tuple[Any, ...]] = [
-        (label, None if electrode == UNKNOWN else electrode, *told, int(electrode in stimulated))
-        for label, electrode, *told in zip(*(column.tolist() for column in columns), strict=True)
+        (label, None if electrode == UNKNOWN else electrode, *numbers, int(electrode in stimulated))
+        for label, electrode, *numbers in zip(*(column.tolist() for column in columns), strict=True)
     ]
     unread = sorted(stimulated - set(channels.electrode.tolist()))
     rows += [(None, electrode, None, None, None, 1) for electrode in unread]
@@ -88,46 +87,46 @@ def write_array(folder: Path, recording: Recording) -> Path:
 
 
 def write_learning(folder: Path, robot: str, curves: Sequence[LearningCurve]) -> Path:
-    """Learning curves as means over policies with their 95 % intervals, random actions and the optimum beside."""
+    """Learning curves as means over policies with their 95 % intervals, with random actions and the optimum."""
     head = ("arm", "iterations", "policies", "mean_return", "low_95", "high_95", "random", "optimum")
     rows: list[tuple[Any, ...]] = []
     for curve in curves:
         ended = np.count_nonzero(np.isfinite(curve.returns), axis=0).tolist()
         interval = (column.tolist() for column in mean_with_interval(curve.returns))
-        beside = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.optimum))
+        levels = ([None] * len(ended) if each is None else each.tolist() for each in (curve.random, curve.optimum))
         iterations = (int(done) for done in curve.iterations)
-        rows += [(curve.name, *told) for told in zip(iterations, ended, *interval, *beside, strict=True)]
+        rows += [(curve.name, *row) for row in zip(iterations, ended, *interval, *levels, strict=True)]
     return _write(folder, f"{robot}-learning", head, rows)
 
 
 def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
-    """Quartiles over policies of every arm at every recording, random actions and the optima beside."""
+    """Quartiles over policies of every arm at every recording, with random actions and the optima."""
     head = ("mapping", "arm", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
     rows = []
     for panel in panels:
         fine = dict(panel.fine_optimum)
         for course in panel.courses:
             for i, at_min in enumerate(course.minutes.tolist()):
-                beside = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
+                levels = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
                 quartiles = course.quartiles[:, i].tolist()
                 rows.append(
-                    (panel.title, course.name, at_min, len(course.returns), *quartiles, *beside, fine.get(at_min))
+                    (panel.title, course.name, at_min, len(course.returns), *quartiles, *levels, fine.get(at_min))
                 )
     return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
 
 
 def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[str, Paths]) -> Path:
-    """One episode of each policy of every arm: what is observed, and the command that led there."""
+    """One episode of each policy of every arm: observations, and the command that led to each."""
     rows = (
         (arm, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
         for arm, of in paths.items()
-        for actor, (observations, commands) in enumerate(of.whole())
+        for actor, (observations, commands) in enumerate(of.episodes())
         for i, observed in enumerate(observations)
     )
     return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, "command"), rows)
 
 
 def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """What is not known is an empty cell."""
+    """Write a table with NaN as empty cells."""
     known = ([None if isinstance(cell, float) and math.isnan(cell) else cell for cell in row] for row in rows)
     return write_table(table_file(folder, name), head, known)

@@ -1,4 +1,4 @@
-"""A study's or a tuning's folder: whose it is, and that no two runs work in it at once."""
+"""The folder of a study or a tuning: to which work it belongs, and that only one run uses it at a time."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ _PACKAGES = (
     "animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "pandas", "pillow", "matplotlib",
     "jinja2",
 )  # fmt: skip
-_ABOUT_FILES = "# files: as seen from where the specification lay. To run it from here: files = ['recordings']\n"
+_ABOUT_FILES = "# files: relative to the original specification. To run it from here: files = ['recordings']\n"
 
 
 def describe_study(study: Study, sources: dict[str, str], device: str | None = None) -> dict[str, Any]:
-    """What decides how a study comes out, with a fingerprint over all of it.
+    """Everything that decides a study's results, with a fingerprint of it.
 
     Args:
         study: the specification.
-        sources: SHA-256 of each file of recordings, by its place.
-        device: the kind of GPU that trains, which rounds otherwise; None for cores, which are not told.
+        sources: SHA-256 of each recording's file, by its path.
+        device: the kind of GPU that trains, as GPUs round differently; None for CPU cores, which are not recorded.
     """
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     if study.culture.kind == "virtual":
         from animat.cultures.tissue.parameters import REVISION
 
-        # Another one gives other spikes, also within one version of animat.
+        # Another revision gives other spikes, even within one version of animat.
         versions["virtual tissue"] = f"revision {REVISION}"
     for spec in study.robots:
         if isinstance(robot := without_goal(spec.robot()), HostRobot):
@@ -56,7 +56,7 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
         {
             "study": asdict(study),
             "sources": sources,
-            # Another version may round otherwise, or draw other figures.
+            # Another version may round differently, or draw other figures.
             "versions": {"python": platform.python_version(), "learner": f"revision {LEARNER}", **versions},
             "seeds": {"culture": study.culture.seed, "training and evaluation": study.seed},
         }
@@ -64,7 +64,7 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
 
 
 def source_files(study: Study, base: Path) -> list[Path]:
-    """The files of recordings that a study names, relative to `base`.
+    """The files of a study's recordings; their names are relative to `base`.
 
     Raises:
         InvalidFile: if one is missing.
@@ -79,36 +79,35 @@ def source_files(study: Study, base: Path) -> list[Path]:
     return list_recordings([base / name for name in study.culture.files])
 
 
-def sums_of(files: list[Path], base: Path) -> dict[str, str]:
-    """SHA-256 of each file, by its place as seen from `base`; stimuli beside CSV spikes belong to them.
+def hash_files(files: list[Path], base: Path) -> dict[str, str]:
+    """SHA-256 of each file, by its path relative to `base`; CSV spikes include the file of their stimuli.
 
     Raises:
         InvalidFile: if one is missing or cannot be read.
         InvalidArgument: if one is named twice.
     """
-    sums: dict[str, str] = {}
+    hashes: dict[str, str] = {}
     for file in files:
-        place = _place(file, base)
-        if place in sums:
+        if _relative(file, base) in hashes:
             raise InvalidArgument(f"culture.files: expected each file once, got {file} twice")
-        beside = stimuli_beside(file)
-        for each in [file, *([] if beside is None else [beside])]:
+        stimuli = stimuli_beside(file)
+        for each in [file] if stimuli is None else [file, stimuli]:
             try:
-                sums[_place(each, base)] = sha256(each)
+                hashes[_relative(each, base)] = sha256(each)
             except FileNotFoundError as error:
                 raise InvalidFile(f"{each}: no such file") from error
             except OSError as error:
                 raise InvalidFile(f"{each}: cannot be read: {error.strerror or error}") from error
-    return dict(sorted(sums.items()))
+    return dict(sorted(hashes.items()))
 
 
-def _place(file: Path, base: Path) -> str:
-    """So that a study and its files can be moved together."""
+def _relative(file: Path, base: Path) -> str:
+    """The path relative to `base` where possible, so that a study and its files can be moved together."""
     return (file.relative_to(base) if file.is_relative_to(base) else file).as_posix()
 
 
 @contextmanager
-def held(
+def claim_folder(
     folder: Path,
     what: str,
     manifest: dict[str, Any],
@@ -116,61 +115,61 @@ def held(
     beside: Mapping[str, str],
     own_folders: Iterable[str] = OWN_FOLDERS,
 ) -> Iterator[None]:
-    """Make the folder this work's, or see that it is; keep other runs out; clear away what a killed one was writing.
+    """Claim a folder for some work: lock out other runs, and delete what a killed run left unfinished.
 
-    Nothing in the folder is touched before it is known to be this work's.
+    Nothing in the folder is touched before it is known to be free or to belong to this work.
 
     Args:
         folder: of the work.
-        what: it is, for messages: a `study`.
-        manifest: its description, with a fingerprint.
-        file: in which that lies.
-        beside: what is written beside it, by the files' names.
-        own_folders: all that it makes in its folder.
+        what: kind of work for messages, such as `study`.
+        manifest: description of the work, with a fingerprint.
+        file: name of the file for the manifest.
+        beside: text of further files, by their names.
+        own_folders: every folder that the work makes in its folder.
 
     Raises:
-        Mismatch: if it is another one's, holds other files, or another run is at work in it.
-        InvalidFile: if it cannot be read or made.
+        Mismatch: if the folder belongs to other work, holds other files, or is in use by another run.
+        InvalidFile: if it cannot be read or created.
     """
     expect_no_file(folder, f"the {what}")
     files = {file: json.dumps(manifest, indent=1, sort_keys=True) + "\n", **beside}
-    _is_ours(folder, what, manifest, [*files])
+    _is_claimed(folder, what, manifest, [*files])
     with exclusive_lock(folder):
-        if not _is_ours(folder, what, manifest, [*files]):
-            for name, words in files.items():
-                write_whole(folder / name, words)
+        if not _is_claimed(folder, what, manifest, [*files]):
+            for name, text in files.items():
+                write_whole(folder / name, text)
         for leftover in [*folder.iterdir(), *(path for name in own_folders for path in (folder / name).rglob("*"))]:
             if is_unfinished(leftover):
                 clear_away(leftover)
         yield
 
 
-def described_beside(study: Study) -> dict[str, str]:
-    """What lies beside a study's description: its specification, to be changed and run."""
+def specification_files(study: Study) -> dict[str, str]:
+    """A study's specification as a file to edit and run, by its name."""
     return {SPECIFICATION: _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)}
 
 
-def _is_ours(folder: Path, what: str, manifest: dict[str, Any], files: list[str]) -> bool:
-    """Whether the work is already in the folder; not if it is free for it.
+def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[str]) -> bool:
+    """True if the folder already belongs to this work, False if it is free.
 
     Raises:
-        Mismatch: if it is another one's, or holds other files.
+        Mismatch: if it belongs to other work, or holds other files.
         InvalidFile: if its description, the first of its files, cannot be read.
     """
     found = description_in(folder / files[0], what)
     if found is None:
-        if folder.is_dir() and not all(map(_is_passing, folder.iterdir())):
+        if folder.is_dir() and not all(map(_is_hidden, folder.iterdir())):
             raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
         return False
     if found["fingerprint"] == manifest["fingerprint"]:
         return all((folder / name).exists() for name in files)
-    # What stopped at its first step left these and no more.
-    begun = (path for path in folder.rglob("*") if not path.is_dir() and not _is_passing(path))
-    if any(path.name not in files for path in begun):
+    # Work that stopped at its first step left only these files, and may be replaced.
+    left = (path for path in folder.rglob("*") if not path.is_dir() and not _is_hidden(path))
+    if any(path.name not in files for path in left):
         raise of_another(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
 
 
-def _is_passing(path: Path) -> bool:
-    """Whether a file is nobody's: half written by a killed run, there to be locked, or hidden by another program."""
+def _is_hidden(path: Path) -> bool:
+    """Whether a file may be ignored: half written by a killed run, a lock, or hidden by another program."""
     return path.name.startswith(".")

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 
 from animat.goals.robot import RobotWithGoal
-from animat.report.html import Table
+from animat.report.html import Table, table_of
 from animat.report.results import ObjectiveMet
 from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame
 from animat.studies.specification import Study
 
 
 def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
-    """Of each robot with a goal: what its policies and controls came to at each minute, by the table of episodes."""
+    """How far policies and controls met the goal of each robot at each minute, from the table of episodes."""
     for spec in study.robots:
         robot = spec.robot()
         if not isinstance(robot, RobotWithGoal):
@@ -25,14 +26,14 @@ def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
                 yield ObjectiveMet(spec.name, arm, agent, at_min, *met, str(objective), satisfaction)
 
 
-def goals_shown(rows: Sequence[ObjectiveMet]) -> Table:
-    """An objective of each arm and control a row."""
-    names = ("robot", "arm", "agent", "at_min", "episodes", "success_share", "margin", "objective", "satisfaction")
-    return Table(
+def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
+    """One row for each objective, arm and control."""
+    names = ("robot", "arm", "agent", "at (min)", "episodes", "success", "margin", "objective", "satisfied (%)")
+    return table_of(
         "Goals",
-        ("robot", "arm", "agent", "at (min)", "episodes", "success", "margin", "objective", "satisfied (%)"),
-        tuple(tuple(getattr(row, name) for name in names) for row in rows),
+        rows,
+        [*zip(names, (field.name for field in fields(ObjectiveMet)), strict=True)],
         note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
-        "goal, or from success, in scales of the quantities: above 0 it succeeded.",
+        "goal, or from meeting it, in scales of the quantities; above 0 it succeeded.",
         beside="tables/goals.csv",
     )

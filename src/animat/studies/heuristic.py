@@ -1,39 +1,38 @@
-"""A study's policies beside the heuristic policy: whether learning did more than steering by a formula."""
+"""A study's policies against the heuristic policy: whether learning did more than a formula."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from animat.evaluation.verdict import compare_episodes, is_worse
-from animat.report.results import BesideHeuristic, Results
+from animat.report.results import HeuristicComparison, Results
 from animat.studies.episodes import POLICY, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
-from animat.studies.specification import RobotSpec, Study, named_mapping
+from animat.studies.specification import RobotSpec, Study, mapping_label
 
 HEURISTIC = "heuristic"
 OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few episodes to tell"
 
 
-def beside_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[BesideHeuristic]:
-    """Each arm that is trained as usual, at each minute at which the rule was run too, by the table of episodes."""
+def compare_with_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[HeuristicComparison]:
+    """Compare each arm that `is_usual` at each minute at which the heuristic was run too; `table` is of episodes."""
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     for arm in filter(is_usual, study.arms):
-        through = named_mapping(*arm.kind)
+        through = mapping_label(*arm.kind)
         heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
         policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")
-        rule = {at_min: returns.to_numpy() for at_min, returns in heuristic}
+        heuristic_returns = {at_min: returns.to_numpy() for at_min, returns in heuristic}
         for at_min, episodes in policies:
-            if at_min in rule:
-                ours, theirs = episodes["return"].to_numpy(), rule[at_min]
-                found = compare_episodes(ours, theirs)
+            if at_min in heuristic_returns:
+                found = compare_episodes(episodes["return"].to_numpy(), heuristic_returns[at_min])
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.has_enough_episodes else TOO_FEW
-                # Of the policies' means, as in the scores: another order of summing can round to another digit.
-                means = float(mean_returns(episodes).mean()), float(theirs.mean())
-                yield BesideHeuristic(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
+                # The mean of the policies' means, as in the scores: another order of summation can round differently.
+                means = float(mean_returns(episodes).mean()), float(heuristic_returns[at_min].mean())
+                yield HeuristicComparison(spec.name, arm.name, at_min, *means, found.p, found.wins, outcome)
 
 
 def not_outperforming(results: Results) -> list[str]:
-    """A sentence for each row whose policies do not outperform the rule."""
+    """A sentence for each row whose policies do not outperform the heuristic policy."""
     return [
         f"{row.robot}, {row.arm}, at {row.at_min:g} min: the policies do not outperform the heuristic policy "
         f"({row.mean_return:.1f} against {row.heuristic:.1f}; p = {row.p:.2g} over episodes"

@@ -1,4 +1,4 @@
-"""The optimal returns as jobs: at the minutes of the comparisons, and roughly at every recording."""
+"""Jobs that compute optimal returns: at the minutes of the comparisons, and on a rough grid at every recording."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 
 ROUGH = 0.5
-"""Steps of the grid along each axis where every recording has its optimum, as a part of those elsewhere."""
+"""Grid steps along each axis for the optima of every recording, as a fraction of those elsewhere."""
 COARSER = 0.8
-"""Steps of the grid of bootstrapped responses along each axis, at most, as a part of the optimum's."""
+"""Grid steps along each axis for bootstrapped responses, at most, as a fraction of the optimum's."""
 
 
 def kinds_of(study: Study) -> list[Arm]:
-    """One arm for each mapping and way to hold percentiles, delivered as chosen: each has its own optimum."""
-    alike = [Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles) for arm in study.arms]
-    return list(dict.fromkeys(alike))
+    """One arm for each mapping and percentile setting, delivered as chosen: each has its own optimum."""
+    kinds = [Arm("optimum", mapping=arm.mapping, percentiles=arm.percentiles) for arm in study.arms]
+    return list(dict.fromkeys(kinds))
 
 
 def rough_kinds(study: Study) -> list[Arm]:
-    """Of `kinds_of`, those whose optimum is computed at every recording; of mappings without steps that is long."""
+    """The `kinds_of` whose optimum is computed at every recording, which takes too long for mappings without steps."""
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
 
-def optima_of_all(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
-    """The optima of all conditions; what policies could do with fewer is none of theirs."""
+def read_complete_optima(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
+    """The optima over all conditions, leaving out those over fewer, which do not apply to the policies."""
     return [optimum for optimum in read_optima(folder, robot, what) if optimum.left_out is None]
 
 
 def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOptimum, ...]:
-    """The optima as the job left them."""
+    """All optima that the job wrote."""
     return read_typed(optima_file(folder, robot, what), tuple[StudyOptimum, ...])
 
 
-def left_out(study: Study) -> list[str]:
-    """What its robots cannot do, and the study is without: a sentence each."""
+def missing_capabilities(study: Study) -> list[str]:
+    """A sentence for each thing that a robot of the study cannot do, and that the study therefore lacks."""
     messages: list[str] = []
     for robot in dict.fromkeys(spec.robot() for spec in study.robots):
         lacks = lacking(robot)
@@ -62,13 +62,13 @@ def left_out(study: Study) -> list[str]:
 @final
 @dataclass(frozen=True)
 class FindOptima(StudyTask):
-    """The optimal return on a robot for every mapping of the study, of conditions with enough responses.
+    """Compute the optimal return on a robot for every mapping of the study, over conditions with enough responses.
 
-    Of a robot without a grid the table is empty.
+    For a robot without a grid the table is empty.
 
     Attributes:
-        over_time: at every recording, on a rough grid, without the controller's return and without an interval; if not,
-            at the minutes that anything is evaluated at.
+        over_time: at every recording, on a rough grid, without the controller's return and without an interval;
+            otherwise at the minutes at which anything is evaluated.
     """
 
     sizes = ("optimum_resolution", "optimum_episodes")
@@ -90,51 +90,51 @@ class FindOptima(StudyTask):
         if timeline is not None:
             series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
             timeline = replace(timeline, responses=tuple(series))
-        asked = [
-            self._asked(kind, at, timeline) for kind in kinds for at in (minutes if kind.through_neurons else [last])
+        requests = [
+            self._request(kind, at, timeline) for kind in kinds for at in (minutes if kind.through_neurons else [last])
         ]
-        # Cases side by side all have as many actions as the one with the most, and as many commands as all together: a
-        # continuous one has many, and over time there are many cases.
-        alike: dict[object, list[_Asked]] = {}
-        for each in asked:
+        # Cases computed together are padded to the most actions, and to the commands of all. So continuous ones, which
+        # have many, are computed apart, and over time, where there are many cases, each kind is.
+        batches: dict[object, list[_Request]] = {}
+        for each in requests:
             if each.case is not None:
-                alike.setdefault(each.kind if self.over_time else each.case[0].n_actions is None, []).append(each)
+                batches.setdefault(each.kind if self.over_time else each.case[0].n_actions is None, []).append(each)
         compared = [] if self.over_time else _compared(study, first, last)
-        known = [each for each in asked if each.counted is not None and (each.kind, each.at_min) in compared]
-        done, steps = 0, sum(map(len, alike.values())) + len(known)
-        for same in alike.values():
-            part = Part(progress, done, len(same), steps)
-            cases = [each.case for each in same if each.case is not None]
+        bootstrapped = [each for each in requests if each.counted is not None and (each.kind, each.at_min) in compared]
+        done, steps = 0, sum(map(len, batches.values())) + len(bootstrapped)
+        for batch in batches.values():
+            part = Part(progress, done, len(batch), steps)
+            cases = [each.case for each in batch if each.case is not None]
             best = best_returns(cases, resolution=resolution, episodes=episodes, seed=study.seed, progress=part)
-            for each, optimum in zip(same, best, strict=True):
+            for each, optimum in zip(batch, best, strict=True):
                 each.optimum = optimum
-            done += len(same)
-        for each in known:
+            done += len(batch)
+        for each in bootstrapped:
             assert each.counted is not None and each.optimum is not None
             each.optimum = each.counted.with_interval(each.optimum, resolution=COARSER * resolution, seed=study.seed)
             done += 1
-            progress.update(done, steps, "how well it is known")
-        return [write_typed(file, [each.told(self.spec.name) for each in asked])]
+            progress.update(done, steps, "intervals")
+        return [write_typed(file, [each.to_row(self.spec.name) for each in requests])]
 
-    def _asked(self, kind: Arm, at_min: float, timeline: SimulatorTimeline | None) -> _Asked:
+    def _request(self, kind: Arm, at_min: float, timeline: SimulatorTimeline | None) -> _Request:
         environment = setting_of(self.study, self.spec, kind, timeline).environment
         if timeline is None or not isinstance(environment, Animat):
-            return _Asked(kind, at_min, case=(environment, None))
+            return _Request(kind, at_min, case=(environment, None))
         responses = timeline.responses[timeline.row_at(at_min)]
         few = undersampled(responses)
         if len(few) == len(responses.conditions):
-            return _Asked(kind, at_min, left_out=few)
+            return _Request(kind, at_min, left_out=few)
         of = WellSampled.of(environment, timeline, at_min, are_fixed=kind.percentiles == "first")
-        return _Asked(kind, at_min, case=(of.environment, of.simulator), counted=of, left_out=few)
+        return _Request(kind, at_min, case=(of.environment, of.simulator), counted=of, left_out=few)
 
 
 @dataclass
-class _Asked:
-    """An optimum that is asked for.
+class _Request:
+    """An optimum to compute.
 
     Attributes:
-        case: where it is; None where no condition has enough responses.
-        counted: the responses that it is of; None without neurons.
+        case: environment and simulator; None if no condition has enough responses.
+        counted: the responses of the simulator; None without neurons.
         left_out: conditions with too few responses.
     """
 
@@ -145,14 +145,14 @@ class _Asked:
     left_out: tuple[str, ...] = ()
     optimum: Optimum | None = None
 
-    def told(self, robot: str) -> StudyOptimum:
+    def to_row(self, robot: str) -> StudyOptimum:
         """A row of the table."""
         kind, few = self.kind, "; ".join(self.left_out) or None
-        return StudyOptimum(robot, kind.mapping, kind.percentiles, self.at_min, **_known(self.optimum), left_out=few)
+        return StudyOptimum(robot, kind.mapping, kind.percentiles, self.at_min, **_fields(self.optimum), left_out=few)
 
 
 def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]]:
-    """Threshold mappings at the minutes that arms of theirs are evaluated at: whose optima have an interval."""
+    """Threshold mappings at the minutes at which their arms are evaluated: these optima have an interval."""
     return [
         (kind, at)
         for kind in rough_kinds(study)
@@ -161,14 +161,14 @@ def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]
     ]
 
 
-def _known(optimum: Optimum | None) -> dict[str, Any]:
-    """The fields of an optimum from the best return to the nodes; None where no condition has enough responses."""
-    told = {} if optimum is None else optimum.to_dict()
+def _fields(optimum: Optimum | None) -> dict[str, Any]:
+    """An optimum's columns of the table, from the best return to the nodes; all None if there is no optimum."""
+    fields = {} if optimum is None else optimum.to_dict()
     interval = None if optimum is None else optimum.interval
     names = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
     return {
-        "best_return": told.get("value"),
+        "best_return": fields.get("value"),
         "low_95": None if interval is None else interval.low,
         "high_95": None if interval is None else interval.high,
-        **{name: told.get(name) for name in names},
+        **{name: fields.get(name) for name in names},
     }

@@ -1,4 +1,4 @@
-"""The paper's study as a value, and the figures that it printed."""
+"""The specification of the paper's study, and the figures that the paper printed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from animat.studies.specification import Arm, Compared, RobotSpec, Study
 
 @dataclass(frozen=True)
 class Printed:
-    """A comparison as the paper gives it: p, and the U that this p implies. The second arm was the better."""
+    """The paper's result of a comparison: p, and the U that this p implies. The second arm was better."""
 
     p: float
     u: float
@@ -47,15 +47,18 @@ COMPARISONS = (
 
 
 def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) -> Study:
-    """The paper's study on the virtual culture of a seed; another decides every draw of training and evaluation.
+    """The paper's study on a virtual culture.
 
-    Quick is for a first look, which gives no results: every step with fewer policies, iterations and recordings.
+    Args:
+        culture_seed: of the virtual culture.
+        seed: decides every draw of training and evaluation.
+        quick: all steps with fewer policies, iterations and recordings: a first look, not a result.
     """
     if not quick:
         return Study(
             title="The paper's study on a virtual culture",
             culture=Source(seed=culture_seed),
-            # On navigation's grid 0.6 of the steps leave an error of a hundredth.
+            # On navigation's grid a resolution of 0.6 leaves an error of 0.01.
             robots=(RobotSpec("cartpole"), RobotSpec("navigation", optimum_resolution=0.6)),
             arms=ARMS,
             comparisons=COMPARISONS,

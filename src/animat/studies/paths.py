@@ -1,4 +1,4 @@
-"""Single episodes with all that happened in them, for pictures and tables."""
+"""Single episodes with all observations and commands, for figures and tables."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Paths:
 
     Attributes:
         observations: before each iteration and after the last, shape (actors, iterations + 1, observations).
-        commands: u of each iteration, shape (actors, iterations); of several commands (actors, iterations, commands).
-        lengths: iterations of each episode; what comes after them means nothing, shape (actors,).
+        commands: u of each iteration, shape (actors, iterations), or (actors, iterations, commands) for several.
+        lengths: iterations of each episode, shape (actors,); observations and commands beyond them are meaningless.
     """
 
     observations: Float[np.ndarray, "actors iterations+1 observations"]
@@ -34,7 +34,7 @@ class Paths:
     lengths: Int64[np.ndarray, " actors"]
 
     def save(self, path: Path) -> Path:
-        """Write it, complete or absent."""
+        """Write it atomically."""
         return write_arrays(path, vars(self))
 
     @staticmethod
@@ -42,7 +42,7 @@ class Paths:
         """Read what `save` wrote; raises InvalidFile if it cannot be read."""
         return Paths(**read_arrays(path))
 
-    def whole(self) -> list[tuple[np.ndarray, list[float]]]:
+    def episodes(self) -> list[tuple[np.ndarray, list[float]]]:
         """Observations and commands of each actor, up to the end of its episode."""
         return [
             (observations[: length + 1], commands[:length].tolist())
@@ -53,7 +53,7 @@ class Paths:
 def record_paths(
     environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, n_actors: int, seed: int
 ) -> Paths:
-    """Run one episode of each actor; arguments as in `animat.evaluation.rollouts.roll_out`."""
+    """Run one episode of each actor; arguments as for `animat.evaluation.rollouts.roll_out`."""
     if isinstance(environment.robot, HostRobot):
         keys = jax.random.split(jax.random.key(seed), n_actors)
         return Paths(*paths_on_host(environment, simulator, actors, keys, seed))

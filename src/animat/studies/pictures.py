@@ -1,4 +1,4 @@
-"""The report's figures as jobs, each as PNG, SVG and PDF, and their numbers: of the culture, and of every robot."""
+"""Jobs that draw the report's figures of the culture and of every robot, as PNG, SVG and PDF, with their numbers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
 from animat.studies.results import read_typed
 from animat.studies.simulating import read_series
-from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
 from animat.training.settings import SAC
@@ -47,7 +47,7 @@ from animat.training.settings import SAC
 @final
 @dataclass(frozen=True)
 class CulturePictures(StudyTask):
-    """Draw the first recording, and the series; write their numbers beside."""
+    """Draw the first recording and the series, and write their numbers to tables."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         series = read_series(self.study, folder, as_one=True)
@@ -82,9 +82,9 @@ class CulturePictures(StudyTask):
 @final
 @dataclass(frozen=True)
 class RobotPictures(StudyTask):
-    """Draw learning, comparisons, the course over the recordings, controls, paths and frames of one robot.
+    """Draw learning, comparisons, returns over the recordings, controls, paths and frames of one robot.
 
-    The numbers of what no other table holds are written beside: learning with its intervals, and the course.
+    Numbers that no other table has are written to tables: learning with its intervals, returns over time, and paths.
     """
 
     spec: RobotSpec
@@ -95,7 +95,7 @@ class RobotPictures(StudyTask):
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
-        # At every recording, with the optimum on a rough grid.
+        # For every recording, with the optimum on a rough grid.
         rough = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
@@ -119,14 +119,14 @@ class RobotPictures(StudyTask):
         tables.append(
             figure_tables.write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded)
         )
-        paths = {arm: of.whole() for arm, of in recorded.items()}
+        paths = {arm: of.episodes() for arm, of in recorded.items()}
         lacks = lacking(robot)
         if "draw_paths" not in lacks:
             only_paths = {c: [path for path, _ in each] for c, each in paths.items()}
             figures["paths"] = draw_paths(robot, only_paths, f"{name}: one episode of each policy")
         if "draw" not in lacks:
             middle = {c: sorted(each, key=lambda one: len(one[0]))[len(each) // 2] for c, each in paths.items()}
-            figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of middle length of each arm")
+            figures["frames"] = draw_frames(robot, middle, f"{name}: the episode of median length of each arm")
         return tables + _save(folder, name, figures, progress)
 
 
@@ -150,26 +150,26 @@ def _curves(
     for arm in study.arms:
         if not arm.trained:
             continue
-        told = learning_of(study, folder, spec, arm)
+        learning = learning_of(study, folder, spec, arm)
         random, optimum = [], []
-        for at_min in _minutes_in_training(study, arm, timeline, told.shape[1]):
+        for at_min in _minutes_in_training(study, arm, timeline, learning.shape[1]):
             random.append((rough if arm.through_neurons else known).random(arm, at_min))
             best = known.optimum(arm, at_min) or rough.optimum(arm, at_min)
             optimum.append(None if best is None else best.best_return)
-        beside = np.array(random, np.float64), np.array(optimum, np.float64)
-        iterations = told[0, :, 0]
-        returns = over_rounds(iterations, told[:, :, 1], told[:, :, 2], round_of(study, spec))
-        curves.append(LearningCurve(arm.name, iterations, returns, *beside))
+        levels = np.array(random, np.float64), np.array(optimum, np.float64)
+        iterations = learning[0, :, 0]
+        returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, spec))
+        curves.append(LearningCurve(arm.name, iterations, returns, *levels))
     return curves
 
 
 def round_of(study: Study, spec: RobotSpec) -> int:
-    """Iterations in which every environment of a training ends at least one episode."""
+    """Iterations within which every training environment ends at least one episode."""
     return spec.robot().episode_limit * read_record(SAC, study.algorithm, "algorithm").environments
 
 
 def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, parts: int) -> list[float]:
-    """The recording that answers in each part of a training."""
+    """The minute of the recording in use in each part of training."""
     if timeline is None or not arm.through_neurons:
         return [span_min(timeline)[1]] * parts
     start, _ = span_min(timeline)
@@ -201,7 +201,7 @@ def _courses(
         optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
-                named_mapping(*kind.kind),
+                mapping_label(*kind.kind),
                 tuple(courses),
                 np.array([rough.random(kind, at_min) for at_min in every_min]),
                 None if levels[0] is None else np.array(levels, np.float64),
@@ -216,9 +216,9 @@ def _courses(
 
 
 def _controls(rows: Iterable[ControlReturns]) -> list[tuple[str, list[ControlReturns]]]:
-    """Those of a mapping at a recording together, with a title."""
+    """Controls grouped by mapping and recording, with a title each."""
     panels = []
     for (mapping, percentiles, at_min), same in groupby(rows, lambda row: (row.mapping, row.percentiles, row.at_min)):
         at = "" if mapping == "none" else f", recording at {at_min:g} min"
-        panels.append((f"{named_mapping(mapping, percentiles)}{at}", list(same)))
+        panels.append((f"{mapping_label(mapping, percentiles)}{at}", list(same)))
     return panels

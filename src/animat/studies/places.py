@@ -1,4 +1,4 @@
-"""Where everything lies in a study's folder."""
+"""Paths of everything in a study's folder."""
 
 from __future__ import annotations
 
@@ -13,35 +13,23 @@ RESPONSES = "simulators/responses.csv"
 REPORT = "report.html"
 RECEIPTS = "jobs"
 OWN_FOLDERS = (
-    RECORDINGS,
-    "simulators",
-    "policies",
-    "episodes",
-    "controls",
-    "optima",
-    "tables",
-    "figures",
-    RECEIPTS,
-    UNFINISHED,
-)
-"""All that a study makes in its folder, beside the report, the specification and its description."""
+    RECORDINGS, "simulators", "policies", "episodes", "controls", "optima", "tables", "figures", RECEIPTS, UNFINISHED,
+)  # fmt: skip
+"""All folders that a study makes in its folder; its other files are the report, the specification and its manifest."""
 
 
 def policies_folder(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
-    """Of the policies of an arm on a robot."""
+    """The policies of an arm on a robot."""
     return folder / "policies" / spec.name / arm.slug
 
 
 def episodes_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
-    """The episodes of an arm's policies on a robot.
-
-    Every arm has a folder of its own, so that no name of one can be a file of another's.
-    """
+    """The episodes of an arm's policies on a robot; each arm has its own folder, so that names cannot collide."""
     return folder / "episodes" / spec.name / arm.slug / "episodes.npz"
 
 
 def paths_file(folder: Path, spec: RobotSpec, arm: Arm) -> Path:
-    """One whole episode of each of an arm's policies on a robot."""
+    """One complete episode of each of an arm's policies on a robot."""
     return folder / "episodes" / spec.name / arm.slug / "paths.npz"
 
 
@@ -56,10 +44,10 @@ def optima_file(folder: Path, robot: str, what: str = "optima") -> Path:
 
 
 def results_file(folder: Path) -> Path:
-    """All results, typed."""
+    """All results as typed records."""
     return folder / "tables" / "results.json"
 
 
 def table_file(folder: Path, name: str) -> Path:
-    """A table of results, for people and other programs."""
+    """A table of results as CSV."""
     return folder / "tables" / f"{name}.csv"

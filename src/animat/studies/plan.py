@@ -1,4 +1,4 @@
-"""From a study to its jobs, and what each needs."""
+"""The jobs of a study and their dependencies."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from animat.studies.folder import MANIFEST
 from animat.studies.specification import Arm, RobotSpec, Study
 
 ITERATIONS_PER_S = 110_000
-"""Of training on one core, all policies of a group together; only the order of jobs and the time left rest on it."""
+"""Training speed on one core, all policies of a group together; used only to order jobs and estimate the time left."""
 
 
 def plan_study(study: Study, base: Path) -> list[Job]:
-    """All jobs of a study, whose files are named as seen from `base`."""
-    # Tasks bring JAX along; a finished folder is recognised without it only in part, but the command line stays light.
+    """All jobs of a study, whose files are relative to `base`."""
+    # Tasks import JAX, which the command line should not load.
     from animat.studies.evaluating import Evaluate
     from animat.studies.pictures import CulturePictures, RobotPictures
     from animat.studies.publishing import Publish
@@ -42,10 +42,10 @@ def plan_study(study: Study, base: Path) -> list[Job]:
                 groups.append(f"train/{spec.name}/{arm.slug}/p{members[0]}")
                 trained = spec.trained_for * len(members) / ITERATIONS_PER_S if arm.trained else 0.0
                 jobs.append(Job(groups[-1], TrainGroup(study, spec, arm, members), needs, 4 + trained))
-            # Its minute is the last recording's, also without neurons.
+            # The minute is the last recording's, even without neurons.
             needs = (*groups, *neurons)
             jobs.append(Job(f"evaluate/{spec.name}/{arm.slug}", Evaluate(study, spec, arm), needs, 4))
-        jobs += _beside(study, spec, neurons)
+        jobs += _reference_jobs(study, spec, neurons)
         results = [job.name for job in jobs if job.name.split("/")[1:2] == [spec.name]]
         jobs.append(Job(f"pictures/{spec.name}", RobotPictures(study, spec), (*results, *neurons, "tables"), 15))
     everything = [job.name for job in jobs if job.name.split("/")[0] in ("evaluate", "controls", "optimum", "train")]
@@ -55,7 +55,7 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     return jobs
 
 
-def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job]:
+def _reference_jobs(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job]:
     """Controls and optima on a robot."""
     from animat.studies.evaluating import Control
     from animat.studies.optima import FindOptima, kinds_of
@@ -76,5 +76,5 @@ def _beside(study: Study, spec: RobotSpec, neurons: tuple[str, ...]) -> list[Job
 
 
 def plain_arm(study: Study, kind: Arm) -> Arm:
-    """Of the arms with a mapping, the one trained most plainly: its policies stand for the mapping."""
+    """The most plainly trained arm of a kind, whose policies represent it."""
     return max(study.arms_of(kind), key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))

@@ -1,4 +1,4 @@
-"""The report: a study's tables and figures put together as one page."""
+"""The report: a study's tables and figures on one page."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float64
@@ -20,27 +20,27 @@ from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
 from animat.report.style import FORMATS, save_figure
 from animat.responses.responses import Responses
-from animat.studies.arms import arms_shown, many_arms, mapped, what_parts
+from animat.studies.arms import arm_differences, arms_table, describe_mapping, summarise_arms
 from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT
-from animat.studies.differences import came_out_otherwise, decisions
+from animat.studies.differences import decisions, differing_comparisons
 from animat.studies.episodes import DataFrame
 from animat.studies.folder import MANIFEST
-from animat.studies.goals import goals_shown
+from animat.studies.goals import goals_table
 from animat.studies.heuristic import not_outperforming
 from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
-from animat.studies.reflex import reflexes_told
-from animat.studies.results import read_typed
-from animat.studies.shown import (
-    comparisons_shown,
-    controllability_shown,
-    controls_shown,
-    heuristic_shown,
-    optima_shown,
-    reflexes_shown,
-    returns_shown,
-    scores_shown,
+from animat.studies.reflex import describe_reflexes
+from animat.studies.report_tables import (
+    comparisons_table,
+    controllability_table,
+    controls_table,
+    heuristic_table,
+    optima_table,
+    reflexes_table,
+    returns_table,
+    scores_table,
 )
+from animat.studies.results import read_typed
 from animat.studies.simulating import controllability, load_timeline, read_series
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
@@ -65,29 +65,26 @@ class Publish(StudyTask):
         figure = draw_headline(headline)
         drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
-        sections = [_short(study, results, [row for row, _ in headline], drawn, narrow)]
+        sections = [_summary(study, results, [row for row, _ in headline], drawn, narrow)]
         for spec in study.robots:
             pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT, _facts_of_robot(study, spec))
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
         if kept:
-            table = controllability_shown(study, folder, kept)
+            table = controllability_table(study, folder, kept)
             pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(series))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
             sections.append(_differences(study, results, kept, series))
         settings = "All settings, as in study.toml, with which animat study makes the same study again"
-        settings += (
-            ", where the files are found under the same paths from where study.toml lies."
-            if study.culture.kind == "files"
-            else "."
-        )
-        sections += [_noticed(results), Section("How it was done", (settings,), verbatim=study_to_toml(study))]
+        if study.culture.kind == "files":
+            settings += ", provided that the files are at the same paths relative to study.toml"
+        sections += [_findings(results), Section("How it was done", (f"{settings}.",), verbatim=study_to_toml(study))]
         versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
         colophon = [
             f"Made with {versions}.",
-            f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study on the same "
-            "versions and machine has the same results, bit for bit.",
+            f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study with the same "
+            "versions on the same machine has the same results, bit for bit.",
             f"Study {manifest['fingerprint']}",
         ]
         return [*drawn, narrow, write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
@@ -97,7 +94,7 @@ def _lead(study: Study) -> str:
     robots = _and([spec.name for spec in study.robots])
     neurons = {"virtual": "a virtual culture", "files": "recordings"}[study.culture.kind]
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
-    return f"{robots.capitalize()}, driven through {neurons}. {many_arms(study)}, trained for {trained}."
+    return f"{robots.capitalize()}, driven through {neurons}. {summarise_arms(study)}, trained for {trained}."
 
 
 def _and(parts: Sequence[str]) -> str:
@@ -105,7 +102,7 @@ def _and(parts: Sequence[str]) -> str:
 
 
 def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Score, Float64[np.ndarray, " policies"]]]:
-    """Each arm on each robot, at the last recording that it was evaluated on, with the mean return of each policy."""
+    """Each arm on each robot at the last recording that it was evaluated on, with the mean return of each policy."""
     last = {(row.robot, row.arm): row for row in sorted(results.scores, key=lambda row: row.at_min)}
     return [
         (row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes))
@@ -114,8 +111,8 @@ def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Sc
     ]
 
 
-def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Sequence[Path], narrow: Path) -> Section:
-    """How the best arm does on each robot, what comes of it without the culture, and how many comparisons hold."""
+def _summary(study: Study, results: Results, headline: Sequence[Score], drawn: Sequence[Path], narrow: Path) -> Section:
+    """The best arm on each robot, the same with random stimuli, and how many comparisons agree with the paper."""
     chosen = {arm.name for arm in study.arms if arm.trained and arm.through_neurons and arm.delivery == "chosen"}
     sentences, explained = [], []
     for spec in study.robots:
@@ -123,17 +120,17 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
         best = max((row for row in of_robot if row.arm in chosen), key=lambda row: row.interquartile_mean, default=None)
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
-            means = f"In “{best.arm}” {mapped(study.arm(best.arm))}"
-            words = f"{spec.name[:1].upper() + spec.name[1:]}: {_beside(best)}{at_random}"
-            sentences.append(words if means in explained else f"{words} {means}")
-            explained.append(means)
+            mapping = f"In “{best.arm}” {describe_mapping(study.arm(best.arm))}"
+            text = f"{spec.name[:1].upper() + spec.name[1:]}: {_describe(best)}{at_random}"
+            sentences.append(text if mapping in explained else f"{text} {mapping}")
+            explained.append(mapping)
     rows = results.comparisons
     printed = [row for row in rows if row.paper_p is not None]
     if printed:
-        otherwise = [row for row in printed if row.as_in_paper == "no"]
-        parts = [each for row in otherwise for each in what_parts(study.arm(row.first), study.arm(row.second))]
+        differing = [row for row in printed if row.as_in_paper == "no"]
+        parts = [each for row in differing for each in arm_differences(study.arm(row.first), study.arm(row.second))]
         explain = [each for each in dict.fromkeys(parts) if each not in explained]
-        if otherwise:
+        if differing:
             explain.append("The section “Differences from the paper” says what is known about the reasons.")
         sentences.append(" ".join([_as_in_paper(printed), *explain]))
     elif rows:
@@ -142,7 +139,7 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
-            f"With {study.policies} policies per side no p can fall below {smallest:.2g}: this is a first look, not a "
+            f"With {study.policies} policies per side p cannot fall below {smallest:.2g}: this is a first look, not a "
             "result."
         )
     picture = Picture(
@@ -152,29 +149,29 @@ def _short(study: Study, results: Results, headline: Sequence[Score], drawn: Seq
         (*(f"figures/{file.name}" for file in drawn[1:]), "tables/scores.csv"),
         narrow,
     )
-    return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_shown(study),))
+    return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_table(study),))
 
 
-def _beside(row: Score) -> str:
-    """What came out in a sentence, then its numbers in another."""
-    beside = [("random actions", row.random), ("the optimal controller", row.optimum)]
-    known = [f"that of {name} {cell(value)}" for name, value in beside if value is not None]
+def _describe(row: Score) -> str:
+    """The result in one sentence, and its numbers in another."""
+    references = [("random actions", row.random), ("the optimal controller", row.optimum)]
+    known = [f"that of {name} {cell(value)}" for name, value in references if value is not None]
     numbers = ", ".join((f"interquartile mean return is {cell(row.interquartile_mean)}", *known)) + "."
     low, high = row.low_95, row.high_95
     if row.random is None or low is None or high is None:
         return f"of the policies trained as “{row.arm}” the {numbers}"
     if low > row.random:
-        found = "do better than random actions"
+        result = "do better than random actions"
         if row.optimum is not None and row.optimum > row.random:
             way = (row.interquartile_mean - row.random) / (row.optimum - row.random)
-            found += f": {100 * way:.0f} % of the way to the optimal controller"
+            result += f": {100 * way:.0f} % of the way to the optimal controller"
     else:
-        found = "do worse than random actions" if high < row.random else "are not found to differ from random actions"
-    return f"policies trained as “{row.arm}” {found}. Their {numbers}"
+        result = "do worse than random actions" if high < row.random else "are not found to differ from random actions"
+    return f"policies trained as “{row.arm}” {result}. Their {numbers}"
 
 
 def _at_random(robot: str, arm: Arm, controls: Sequence[ControlReturns]) -> str:
-    """What is left where the stimuli are drawn at random."""
+    """The return that remains if the stimuli are drawn at random."""
     kind = robot, arm.mapping, arm.percentiles, "shuffled"
     of = [row for row in controls if (row.robot, row.mapping, row.percentiles, row.control) == kind]
     return f" With stimuli delivered at random it is {cell(of[-1].mean_return)}." if of else ""
@@ -183,37 +180,38 @@ def _at_random(robot: str, arm: Arm, controls: Sequence[ControlReturns]) -> str:
 def _compared(study: Study, results: Results) -> Section:
     rows = results.comparisons
     if not rows:
-        return Section("Comparisons", ("The study compares no arms; how each did is under Scores.",))
-    said = (
+        return Section("Comparisons", ("The study compares no arms; the results of each are under Scores.",))
+    method = (
         "A policy's performance is its mean return over the episodes. Policies are compared by the two-sided "
         "Mann-Whitney U test: p by the normal approximation with continuity correction, as in the paper, and "
         "exactly; p corrected is Holm's for the number of comparisons. Stars in figures are of the corrected p. The "
-        "outcome goes by the first p, as in the paper: the better one of two arms counts as found at p < "
-        f"{LEVEL:g}, and where the corrected p is not below that, the table says so. That none was found does not say "
-        "that there is no difference. The effect is the rank-biserial correlation, +1 where every "
-        "policy of the second arm is better, with Newcombe's 95 % interval."
+        "outcome is decided by the first p, as in the paper: an arm counts as better at p < "
+        f"{LEVEL:g}, and where the corrected p is not below that, the table says so. That no difference was found does "
+        "not mean that there is none. The effect is the rank-biserial correlation, +1 where every policy of the second "
+        "arm is better, with Newcombe's 95 % interval."
     )
-    return Section("Comparisons", (said,), tables=(comparisons_shown(rows), returns_shown(rows)))
+    return Section("Comparisons", (method,), tables=(comparisons_table(rows), returns_table(rows)))
 
 
 def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
-    """How many of the paper's comparisons came out as there; what cannot be told is neither yes nor no."""
-    told = Counter(row.as_in_paper for row in rows)
-    if told["cannot tell"] == len(rows):
-        which = "comparison comes" if len(rows) == 1 else f"{len(rows)} comparisons come"
-        return f"Whether the {which} out as in the paper is not known, with so few policies."
+    """How many comparisons agree with the paper; undecided ones neither agree nor disagree."""
+    count = Counter(row.as_in_paper for row in rows)
+    if count["cannot tell"] == len(rows):
+        which = "comparison agrees" if len(rows) == 1 else f"{len(rows)} comparisons agree"
+        return f"With so few policies it is not known whether the {which} with the paper."
     comparisons = "1 comparison" if len(rows) == 1 else f"{len(rows)} comparisons"
-    words = f"{told['yes']} of {comparisons} came out as in the paper: the same arm was better, at p < {LEVEL:g}."
-    if told["cannot tell"]:
-        words += f" For {told['cannot tell']} there are too few policies."
-    if told["no"]:
-        differ = "; ".join(_otherwise([row for row in rows if row.as_in_paper == "no"]))
-        words += f" {told['no']} came out differently: {differ}."
-    return words
+    agree = "agrees" if count["yes"] == 1 else "agree"
+    text = f"{count['yes']} of {comparisons} {agree} with the paper: the same arm was better, at p < {LEVEL:g}."
+    if count["cannot tell"]:
+        text += f" For {count['cannot tell']} there are too few policies."
+    if count["no"]:
+        differ = "; ".join(_describe_differing([row for row in rows if row.as_in_paper == "no"]))
+        text += f" {count['no']} came out differently: {differ}."
+    return text
 
 
-def _otherwise(rows: Sequence[ComparedReturns]) -> Iterator[str]:
-    """The comparisons that came out otherwise than in the paper, and how: those of the same arms together."""
+def _describe_differing(rows: Sequence[ComparedReturns]) -> Iterator[str]:
+    """How comparisons differ from the paper, those of the same arms together."""
     for first, second in dict.fromkeys((row.first, row.second) for row in rows):
         on: dict[str, list[str]] = {}
         for row in (row for row in rows if (row.first, row.second) == (first, second)):
@@ -224,13 +222,13 @@ def _otherwise(rows: Sequence[ComparedReturns]) -> Iterator[str]:
 
 
 def _scores(results: Results) -> Section:
-    tables = [scores_shown(results.scores), optima_shown(results.optima)]
+    tables = [scores_table(results.scores), optima_table(results.optima)]
     if results.goals:
-        tables.append(goals_shown(results.goals))
-    said = (
+        tables.append(goals_table(results.goals))
+    note = (
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     )
-    return Section("Scores", (said,), tables=tuple(tables))
+    return Section("Scores", (note,), tables=tuple(tables))
 
 
 _NUMBERS_OF_CULTURE = {
@@ -248,11 +246,11 @@ _NUMBERS_OF_ROBOT = {
     "paths": ("tables/{of}-paths.csv",),
     "controls": ("tables/controls.csv",),
 }
-"""Files that hold what figures show."""
+"""Files with the numbers behind each figure."""
 
 
 def _facts_of_robot(study: Study, spec: RobotSpec) -> dict[str, str]:
-    """On how much the figures of a robot rest."""
+    """The placeholders in captions of a robot's figures."""
     return {
         "policies": f"{study.policies}",
         "episodes": f"{study.episodes}",
@@ -262,7 +260,7 @@ def _facts_of_robot(study: Study, spec: RobotSpec) -> dict[str, str]:
 
 
 def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
-    """On how much the figures of the culture rest."""
+    """The placeholders in captions of the culture's figures."""
     return {
         "channels": f"{series[0].n_channels:,}",
         "responses": f"{len(series[0]):,}",
@@ -290,26 +288,26 @@ def _pictures(
 def _controls(study: Study, results: Results) -> Section:
     points = (
         ("random", "Any action, equally likely, whatever is observed."),
-        ("constant", "One stimulus always (without neurons: one command)."),
+        ("constant", "Always the same stimulus (without neurons: the same command)."),
         (
             "heuristic",
             "A rule instead of learning: the stimulus whose mean command is nearest to a push to the side where the "
-            "pole will lean in 0.1 s, to a turn towards the goal, or to what another robot's rule wants.",
+            "pole will lean in 0.1 s, to a turn towards the goal, or to the command of another robot's rule.",
         ),
-        ("silent", "The trained policies, but no pulse; what is there without stimuli is read (0 on a simulator)."),
-        ("shuffled", "The trained policies, but the stimulus that is delivered is drawn at random."),
+        ("silent", "The trained policies, but no pulse; the activity without stimuli is read (0 on a simulator)."),
+        ("shuffled", "The trained policies, but the delivered stimulus is drawn at random."),
         (
             "coupling",
-            "The best reflex: a fixed rule from what is sensed to a stimulus, without memory and without a goal.",
+            "The best reflex: a fixed rule from sensed values to a stimulus, without memory and without a goal.",
         ),
     )
-    beside = heuristic_shown(results.heuristic), reflexes_shown(results.reflexes)
-    told = [*(f"{each}." for each in not_outperforming(results)), *reflexes_told(results.reflexes)]
+    comparisons = heuristic_table(results.heuristic), reflexes_table(results.reflexes)
+    sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
-        ("Each control takes something away.", *(each[:1].upper() + each[1:] for each in told)),
+        ("Each control removes something.", *(each[:1].upper() + each[1:] for each in sentences)),
         points,
-        (*(table for table in beside if table.rows), controls_shown(study, results.controls)),
+        (*(table for table in comparisons if table.rows), controls_table(study, results.controls)),
     )
 
 
@@ -318,27 +316,24 @@ def _differences(
 ) -> Section:
     rows = [row for row in results.comparisons if row.paper_p is not None]
     lost = {at_min: of.largest_loss for at_min, of in kept.items()}
-    otherwise = came_out_otherwise(rows, lost)
+    differing = differing_comparisons(rows, lost)
     paragraphs = [
         "Sawada, Wake, Sasabuchi, Takamatsu, Takahashi, Ikeuchi: Design strategies for controlling neuron-connected "
-        "robots using reinforcement learning (2022). First what came out otherwise, then what was decided where the "
+        "robots using reinforcement learning (2022). First the results that differ, then the decisions taken where the "
         "paper is silent or contradicts itself."
     ]
-    if rows and not otherwise:
-        paragraphs.append("Every comparison came out as in the paper.")
-    return Section("Differences from the paper", tuple(paragraphs), (*otherwise, *decisions(study, series)))
+    if rows and not differing:
+        paragraphs.append("Every comparison agrees with the paper.")
+    return Section("Differences from the paper", tuple(paragraphs), (*differing, *decisions(study, series)))
 
 
-def _noticed(results: Results) -> Section:
-    grave = [finding for finding in results.findings if finding.severity != "note"]
-    notes = len(results.findings) - len(grave)
-    shown = tuple((finding.name, finding.message) for finding in grave)
-    said = (
-        f"{len(grave)} warnings and {notes} notes on the recordings, the simulators made of them and the optima; all "
-        "are in tables/findings.csv."
+def _findings(results: Results) -> Section:
+    file = "tables/findings.csv"
+    warnings = tuple((finding.name, finding.message) for finding in results.findings if finding.severity != "note")
+    counts = (
+        f"{len(warnings)} warnings and {len(results.findings) - len(warnings)} notes on the recordings, the simulators "
+        f"made of them and the optima; all are in {file}."
     )
-    table: tuple[Any, ...] = (
-        (Table("Warnings", ("finding", "what"), shown, beside="tables/findings.csv"),) if shown else ()
-    )
+    tables = (Table("Warnings", ("finding", "message"), warnings, beside=file),) if warnings else ()
     left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)
-    return Section("Findings", (said,), left_out, table, links=("tables/findings.csv",))
+    return Section("Findings", (counts,), left_out, tables, links=(file,))

@@ -1,4 +1,4 @@
-"""The study's recordings: of a culture that is recorded for it, or copies of files at hand."""
+"""The job that makes a study's recordings: by recording a culture, or by copying existing files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ JOB = "record"
 @final
 @dataclass(frozen=True)
 class Record(StudyTask):
-    """Make the recordings, as NWB; a specification's file names are relative to `base`."""
+    """Make the recordings as NWB; the specification's file names are relative to `base`."""
 
     sizes = ("culture.trials", "culture.pulses")
 
@@ -33,7 +33,7 @@ class Record(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         out, receipt = folder / RECORDINGS, Receipt.load(folder / RECEIPTS, JOB)
-        # Recordings that are no longer as they were left: nobody else can tell, as they may still be good ones.
+        # Changed recordings are deleted here, as they may be valid and nothing later would notice the change.
         for name in () if receipt is None else receipt.changed(folder):
             (folder / name).unlink(missing_ok=True)
         if self.study.culture.kind == "files":
@@ -49,7 +49,7 @@ class Record(StudyTask):
             copy = out / recording_name(recording.start_min)
             if copy in copies:
                 raise InvalidFile(
-                    f"culture.files: expected recordings of different minutes, got two that would both be {copy.name}"
+                    f"culture.files: expected recordings at different minutes, got two that would both be {copy.name}"
                 )
             copies.append(copy)
             write_nwb(recording, copy)

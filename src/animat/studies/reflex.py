@@ -1,4 +1,4 @@
-"""A study's policies beside the best coupling: whether a task needs more than a reflex, and what they do beyond one."""
+"""A study's policies against the best coupling: whether a task needs more than a reflex, and if policies do more."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Iterable, Iterator
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
-from animat.report.results import BesideReflex, StudyOptimum
+from animat.report.results import ReflexComparison, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns
 from animat.studies.evaluating import is_usual
-from animat.studies.specification import RobotSpec, Study, named_mapping
+from animat.studies.specification import RobotSpec, Study, mapping_label
 
 
-def beside_reflex(
+def compare_with_reflex(
     study: Study, table: DataFrame, spec: RobotSpec, optima: Iterable[StudyOptimum]
-) -> Iterator[BesideReflex]:
-    """Each arm that is trained as usual, at the minute at which the best coupling was run too.
+) -> Iterator[ReflexComparison]:
+    """Compare each arm that `is_usual` at the minute at which the best coupling was run; `table` is of episodes.
 
-    The table is of episodes. Where there is no optimal return of all conditions there is no context gap, and no row.
+    Without an optimal return over all conditions there is no context gap, and hence no row.
     """
     at = table[(table["robot"] == spec.name) & ~table["over_time"]]
     known = {
@@ -27,7 +27,7 @@ def beside_reflex(
         if each.robot == spec.name and each.left_out is None and each.best_return is not None
     }
     for arm in filter(is_usual, study.arms):
-        of = at[at["arm"] == named_mapping(*arm.kind)]
+        of = at[at["arm"] == mapping_label(*arm.kind)]
         for at_min, coupled in of[of["agent"] == COUPLING].groupby("at_min")["return"]:
             best = known.get((*arm.kind, at_min))
             policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY) & (at["at_min"] == at_min)]
@@ -38,7 +38,7 @@ def beside_reflex(
             optimum = Optimum(best.best_return or 0.0, best.grid_error or 0.0, nan, nan, nan, nan, 0, 0)
             context = context_gap(coupled.to_numpy(), random, optimum)
             gap, score = context.gap, context.score(mean_returns(policies), optimum)
-            yield BesideReflex(
+            yield ReflexComparison(
                 spec.name,
                 arm.name,
                 at_min,
@@ -51,9 +51,9 @@ def beside_reflex(
             )
 
 
-def reflexes_told(rows: Iterable[BesideReflex]) -> list[str]:
-    """A sentence for each row of which the gap is known."""
-    told = []
+def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
+    """A sentence for each row whose gap is known."""
+    sentences = []
     for row in rows:
         if row.gap is None:
             continue
@@ -61,11 +61,11 @@ def reflexes_told(rows: Iterable[BesideReflex]) -> list[str]:
         if not row.needs_context:
             is_known = row.gap_high_95 is not None and row.gap_high_95 <= REFLEX_GAP
             more = "the task needs no more than that" if is_known else "whether the task needs more is not known"
-            told.append(f"{where}; {more}.")
+            sentences.append(f"{where}; {more}.")
         else:
             score = "" if row.score is None else f"; the policies' context score is {row.score:.2f}"
-            told.append(f"{where}; the task needs more{score}.")
-    return told
+            sentences.append(f"{where}; the task needs more{score}.")
+    return sentences
 
 
 def _ends(interval: Interval | None) -> tuple[float | None, float | None, float | None]:

@@ -1,4 +1,4 @@
-"""The files of a study's results: records as JSON, CSV and Parquet, arrays as NumPy's npz, all complete or absent."""
+"""The files of a study's results: records as JSON, CSV and Parquet, arrays as NumPy's npz, all written atomically."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def write_typed(path: Path, value: Any) -> Path:
-    """Write records, complete or absent: `read_typed` reads them."""
+    """Write records atomically, for `read_typed`."""
     plain = [asdict(each) for each in value] if isinstance(value, Sequence) else asdict(value)
     return write_whole(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
@@ -35,7 +35,7 @@ def read_typed(path: Path, kind: type[T]) -> T:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
-    """Write arrays by name as NumPy's npz, complete or absent; the same bytes always."""
+    """Write arrays by name as NumPy's npz, atomically and always as the same bytes."""
     with atomic_write(path) as beside, beside.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return path
@@ -51,7 +51,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a CSV file, complete or absent; numbers with all their digits, None as nothing."""
+    """Write a CSV file atomically; numbers with all digits, None as an empty cell."""
     with atomic_write(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(head)
@@ -60,12 +60,12 @@ def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) 
 
 
 def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
-    """Write records as a CSV file, a column a field."""
+    """Write records as a CSV file, one column per field."""
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
 
 
 def write_named_records(path: Path, named: Iterable[tuple[str, Any]], kind: type, name: str) -> Path:
-    """The same with a first column of this name, which comes with each record."""
+    """Write records as a CSV file with an extra first column `name`, whose value comes with each record."""
     head = [name, *(field.name for field in fields(kind))]
     return write_table(path, head, ((first, *astuple(row)) for first, row in named))
 
@@ -74,10 +74,7 @@ MISSING = "fastparquet is not installed: pip install 'animat[parquet]'"
 
 
 def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name: str) -> bool:
-    """Write records, as `write_named_records` takes them, complete or absent; numbers that may be None are NaN there.
-
-    Returns whether it was written: not where fastparquet is missing.
-    """
+    """Write records as `write_named_records` does, with None as NaN; returns False if fastparquet is missing."""
     try:
         import fastparquet
     except ImportError:

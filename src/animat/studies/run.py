@@ -1,4 +1,4 @@
-"""Running a study: the jobs that are not done yet, as many at once as there is room, until its folder is complete."""
+"""Running a study: does the missing jobs, in parallel, until its folder is complete."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from animat.execution.jobs import Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import MANIFEST, describe_study, described_beside, held, source_files, sums_of
+from animat.studies.folder import MANIFEST, claim_folder, describe_study, hash_files, source_files, specification_files
 from animat.studies.places import RECEIPTS, REPORT
 from animat.studies.plan import plan_study
 from animat.studies.specification import RobotSpec, Study
 
 
 @dataclass(frozen=True)
-class Ran:
-    """What a run of a study did: where, of how many jobs.
+class StudyRun:
+    """The result of running a study.
 
     Attributes:
-        done_now: jobs that this run did, with the processor seconds that each took; none if the folder was finished.
+        jobs: number of jobs of the study.
+        done_now: processor seconds of each job that this run did; empty if the folder was finished.
     """
 
     folder: Path
@@ -45,34 +46,34 @@ def run_study(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Ran:
-    """Run a study into a folder, or go on with one.
+) -> StudyRun:
+    """Run a study in a folder, or resume it there.
 
-    Killed at any moment and called again, it goes on from the jobs that are done and, within a training, from its last
-    checkpoint; the folder ends as if undisturbed, with any number of workers: the same files, bit for bit,
-    and the same recordings, in files to which NWB gives identifiers and dates of their own.
+    If it was killed at any moment, it resumes after the finished jobs and, within a training, from the last checkpoint.
+    The folder ends as if undisturbed, with any number of workers: with the same files, bit for bit, except that NWB
+    files of the same recordings have their own identifiers and dates.
 
     Args:
         study: the specification.
-        folder: where everything goes; made if it is missing.
-        base: what the specification's names of files are relative to.
-        workers: processes, each on a core of its own; None: one a core. Not with an executor.
-        executor: where jobs are run, in view of the folder; it stays open. None: processes on this machine.
-        progress: told how far it is, and what runs.
+        folder: for all files; created if it is missing.
+        base: folder to which the specification's file names are relative.
+        workers: number of processes, each on its own core; None: one per core. Not with an executor.
+        executor: runs the jobs and must have access to the folder; it stays open. None: processes on this machine.
+        progress: updated with the share of the work that is done, and the running jobs.
 
     Raises:
-        Mismatch: if the folder is another study's, its recordings have changed, or another run is at work in it.
+        Mismatch: if the folder belongs to another study, its recordings have changed, or another run is using it.
         InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer workers than one, or any beside an executor, or a robot of one's own that does not
-            keep to the contract.
+        InvalidArgument: for fewer than one worker, workers together with an executor, or a custom robot or mapping that
+            violates the contract.
         AnimatError: if a job failed; its message names the job.
     """
     expect_workers(workers, executor)
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None
-    check_own(study.robots, [arm.mapping for arm in study.arms])
-    manifest = describe_study(study, sums_of(source_files(study, base), base), gpu)
-    with held(folder, "study", manifest, MANIFEST, described_beside(study)):
+    check_custom(study.robots, [arm.mapping for arm in study.arms])
+    manifest = describe_study(study, hash_files(source_files(study, base), base), gpu)
+    with claim_folder(folder, "study", manifest, MANIFEST, specification_files(study)):
         jobs = plan_study(study, base)
         left = Jobs(jobs, folder, folder / RECEIPTS, manifest["fingerprint"])
         took_s: dict[str, float] = {}
@@ -85,11 +86,11 @@ def run_study(
                 workers=workers, executor=executor, progress=progress or Silent(), has_gpu=gpu is not None
             )
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-    return Ran(folder, folder / REPORT, len(jobs), took_s)
+    return StudyRun(folder, folder / REPORT, len(jobs), took_s)
 
 
-def check_own(robots: Iterable[RobotSpec], mappings: Iterable[str]) -> None:
-    """Refuse robots and mappings of one's own that do not keep to the contract (InvalidArgument)."""
+def check_custom(robots: Iterable[RobotSpec], mappings: Iterable[str]) -> None:
+    """Raise InvalidArgument for custom robots and mappings that violate the contract."""
     for spec in robots:
         if ":" in spec.kind:
             check_robot(spec.robot())

@@ -1,4 +1,4 @@
-"""The study's neuron simulators: fitted once, kept in a file that holds no code and needs no recordings."""
+"""The study's neuron simulators: fitted once, and saved to a file without code that needs no recordings."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _KINDS = {
 @final
 @dataclass(frozen=True)
 class Fit(StudyTask):
-    """Read the responses of all recordings and fit a simulator to each."""
+    """Extract the responses of all recordings and fit a simulator to each."""
 
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, series = self.study, read_series(self.study, folder)
-        timeline = fit_as(study, series)
+        timeline = fit_simulators(study, series)
         if len(timeline.conditions) < 2 and "one-condition" not in study.simulators.allow:
             raise UnusableData(
                 f"{one_condition(timeline)}; sort the stimuli by interval:5,10, electrode or pattern "
@@ -55,20 +55,20 @@ class Fit(StudyTask):
         return [folder / TIMELINE, _write_responses(folder / RESPONSES, series)]
 
 
-def fit_as(study: Study, series: list[Responses]) -> SimulatorTimeline:
-    """The simulators that a study's settings make of responses."""
+def fit_simulators(study: Study, series: list[Responses]) -> SimulatorTimeline:
+    """Fit simulators to responses with a study's settings."""
     settings = study.simulators
     return fit_timeline(series, kind=settings.kind, bins=settings.bins, range_hz=settings.range_hz)
 
 
 def one_condition(timeline: SimulatorTimeline) -> str:
-    """The beginning of an error of simulators of one condition."""
+    """The beginning of an error message for simulators with only one condition."""
     only = timeline.conditions[0].label
     return f"simulators.conditions: expected two or more for an agent to choose from, got one ({only})"
 
 
 def _write_responses(path: Path, series: list[Responses]) -> Path:
-    """A line a response: x of all channels, which the figures show, and of each readout where there are several."""
+    """One row per response: x of all channels, as in the figures, and of each readout if there are several."""
     names = () if series[0].readouts.are_all else series[0].readouts.names
     rows = (
         (responses.start_min, responses.conditions[c].label, x, ratio, int(burst), *(of_each if names else ()))
@@ -87,22 +87,22 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
 
 
 def _moved(study: Study, start_min: list[float]) -> list[Finding]:
-    """What is to be said of comparisons at minutes that no recording starts at."""
+    """A finding for each comparison at a minute at which no recording starts."""
     settled = study.at_recordings(start_min).comparisons
     return [
         Finding(
             "comparison-minute",
             "note",
-            f"{asked.name} was asked for at {asked.at_min:g} min and is made on the recording at {got.at_min:g} min",
-            got.at_min,
+            f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min",
+            new.at_min,
         )
-        for asked, got in zip(study.comparisons, settled, strict=True)
-        if asked.at_min is not None and asked.at_min != got.at_min
+        for old, new in zip(study.comparisons, settled, strict=True)
+        if old.at_min is not None and old.at_min != new.at_min
     ]
 
 
 def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Responses]:
-    """The responses of the study's recordings, in the order of time; `as_one`: of all channels, whatever is read."""
+    """The responses of the study's recordings, in order of time; `as_one`: of all channels, whatever the readouts."""
     settings = study.simulators
     return extract_series(
         read_recordings(folder / RECORDINGS),
@@ -115,24 +115,24 @@ def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Res
 
 
 def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
-    """What each simulator keeps of its responses, by minute; of several readouts each condition and readout alone."""
-    found, names = {}, timeline.readouts.names
+    """What each simulator keeps of its responses, by minute; for several readouts by condition and readout."""
+    fidelities, names = {}, timeline.readouts.names
     for at_min, kept in zip(timeline.start_min.tolist(), timeline.fidelities, strict=True):
         if len(names) > 1:
             labels = tuple(f"{label}, {name}" for label in kept.labels for name in names)
             kept = replace(kept, labels=labels, in_data=kept.in_data.ravel(), in_simulator=kept.in_simulator.ravel())
-        found[at_min] = kept
-    return found
+        fidelities[at_min] = kept
+    return fidelities
 
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
-    """Write the simulators as safetensors, with all that is no array as JSON in the metadata; the same bytes always."""
+    """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
     from safetensors.numpy import save
 
     simulators = timeline.simulators
     names = [field.name for field in fields(simulators)]  # type: ignore[arg-type]
     arrays = {name: np.ascontiguousarray(getattr(simulators, name)) for name in names}
-    told = {
+    metadata = {
         "kind": type(simulators).__name__,
         "start_min": timeline.start_min.tolist(),
         "conditions": [asdict(condition) for condition in timeline.conditions],
@@ -145,7 +145,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "fitted": timeline.fitted,
         **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
-    write_whole(path, save(arrays, metadata={"animat": json.dumps(told, sort_keys=True)}))
+    write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:
@@ -154,22 +154,22 @@ def load_timeline(path: Path) -> SimulatorTimeline:
 
     try:
         with safe_open(path, framework="numpy") as file:
-            told: dict[str, Any] = json.loads(file.metadata()["animat"])
+            metadata: dict[str, Any] = json.loads(file.metadata()["animat"])
             arrays = {name: placed(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
-        conditions = tuple(Condition(**each) for each in told["conditions"])
+        conditions = tuple(Condition(**each) for each in metadata["conditions"])
         labels = tuple(condition.label for condition in conditions)
-        presentation = told["presentation"]
-        kept = zip(told["in_data"], told["in_simulator"], told["n_above_range"], strict=True)
-        readouts = Readouts.from_dict(told.get("readouts"))
+        presentation = metadata["presentation"]
+        kept = zip(metadata["in_data"], metadata["in_simulator"], metadata["n_above_range"], strict=True)
+        readouts = Readouts.from_dict(metadata.get("readouts"))
         return SimulatorTimeline(
-            simulators=_KINDS[told["kind"]](**arrays),
-            start_min=np.array(told["start_min"], np.float64),
+            simulators=_KINDS[metadata["kind"]](**arrays),
+            start_min=np.array(metadata["start_min"], np.float64),
             conditions=conditions,
-            window_ms=tuple(told["window_ms"]),
+            window_ms=tuple(metadata["window_ms"]),
             presentation=None if presentation is None else Presentation(**presentation),
             fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n, readouts.names) for a, b, n in kept),
-            findings=tuple(Finding.from_dict(each) for each in told["findings"]),
-            fitted=told["fitted"],
+            findings=tuple(Finding.from_dict(each) for each in metadata["findings"]),
+            fitted=metadata["fitted"],
             readouts=readouts,
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:

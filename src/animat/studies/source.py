@@ -1,4 +1,4 @@
-"""Where a study's recordings come from: files, or a culture that is recorded for it."""
+"""The source of a study's recordings: files, or a culture that is recorded for it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from animat.records import Positive, Seed, Whole, record
 from animat.stimulation.protocol import TWO_COMMANDS, Protocol
 
 MOST_SESSIONS, MOST_TRIALS, MOST_ENTRIES = 10_000, 1_000_000, 1_000
-"""Recordings, trials in each, and entries of a list; `docs/studies.md` states them."""
+"""Limits of recordings, trials in each, and entries of a list; documented in `docs/studies.md`."""
 MOST_DIGITS = 9
 
 LISTED = Field(max_length=MOST_ENTRIES)
@@ -23,18 +23,18 @@ LISTED = Field(max_length=MOST_ENTRIES)
 
 @record
 class Source:
-    """Where the recordings come from: files, or a culture that is recorded for the study.
+    """The source of a study's recordings: files, or a culture that is recorded for the study.
 
     Attributes:
         kind: `"virtual"`, simulated neurons, or `"files"`.
         files: recordings of one culture, or folders of them, for `"files"`; relative to the specification.
-        seed: which virtual culture.
-        seeds, folders: of a study over many cultures (`animat.studies.cultures`): seeds such as `"1-5, 8"` in place of
-            `seed`, or folders of recordings, one a culture, in place of `files`.
-        sessions, interval_min: how many recordings, and the minutes from one to the next.
+        seed: of the virtual culture.
+        seeds, folders: for a study over many cultures (`animat.studies.cultures`): seeds such as `"1-5, 8"` in place of
+            `seed`, or folders of recordings, one per culture, in place of `files`.
+        sessions, interval_min: number of recordings, and minutes from one to the next.
         order, pulses, trials: how stimuli are presented (`animat.stimulation.protocol`).
-        places, frequencies_hz: of a virtual culture, `"corners"`, `"halves"` or `"quadrants"`, each a condition of its
-            own, and the frequencies; None: the paper's patterns, and its frequencies, but 20 Hz alone at corners.
+        places, frequencies_hz: for a virtual culture, `"corners"`, `"halves"` or `"quadrants"`, each place a separate
+            condition, and the frequencies; None: the paper's patterns and frequencies, but only 20 Hz with corners.
     """
 
     kind: Literal["virtual", "files"] = "virtual"
@@ -55,7 +55,7 @@ class Source:
             raise InvalidArgument("files, folders: expected files or folders with kind = 'files', got none")
         if self.kind != "files" and (self.files or self.folders):
             n = len(self.files) + len(self.folders or ())
-            raise InvalidArgument(f"files, folders: expected some for kind = 'files' only, got {n} for {self.kind!r}")
+            raise InvalidArgument(f"files, folders: expected only with kind = 'files', got {n} for {self.kind!r}")
         if self.files and self.folders:
             raise InvalidArgument("folders: expected files of one culture or folders of many, got both")
         names = [Path(each).name for each in self.folders or ()]
@@ -77,22 +77,22 @@ class Source:
             for each in fields(self):
                 if each.name not in ("kind", "files", "folders") and getattr(self, each.name) != each.default:
                     raise InvalidArgument(
-                        f"{each.name}: expected only for a culture that is recorded, got one of files"
+                        f"{each.name}: expected only for a culture that is recorded, got kind = 'files'"
                     )
-        # What the recordings themselves refuse is refused before there is a folder.
+        # An invalid protocol is refused before a folder is made.
         if self.kind == "virtual":
             self.protocol()
 
     def protocol(self) -> Protocol:
-        """Of every recording of a virtual culture; raises InvalidArgument for one that cannot be."""
-        asked: dict[str, Any] = {} if self.places is None else {"places": self.places}
+        """The protocol of each recording of a virtual culture; raises InvalidArgument if it is invalid."""
+        places: dict[str, Any] = {} if self.places is None else {"places": self.places}
         if self.frequencies_hz is not None or self.places == "corners":
-            asked["frequencies_hz"] = self.frequencies_hz or TWO_COMMANDS.frequencies_hz
-        return Protocol(order=self.order, pulses=self.pulses, trials=self.trials, **asked)
+            places["frequencies_hz"] = self.frequencies_hz or TWO_COMMANDS.frequencies_hz
+        return Protocol(order=self.order, pulses=self.pulses, trials=self.trials, **places)
 
 
 def read_seeds(text: str) -> list[int]:
-    """Seeds that are written as numbers and ranges, such as `1-5, 8`; InvalidArgument for all else, or too many."""
+    """Seeds written as numbers and ranges, such as `1-5, 8`; raises InvalidArgument for other text, or too many."""
     seeds: list[int] = []
     for part in text.split(","):
         found = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", part)

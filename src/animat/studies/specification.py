@@ -1,4 +1,4 @@
-"""What a study is: recordings or a culture, robots, arms, comparisons, how often and from which seeds."""
+"""The specification of a study: recordings or a culture, robots, arms, comparisons, sizes and seeds."""
 
 from __future__ import annotations
 
@@ -26,44 +26,44 @@ from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
 MOST_TRAINED = 20_000
 """Policies of all arms on all robots: each is a file, and five are a job."""
 FINEST_RESOLUTION = 2.0
-"""Of the optimal return's grid: the cartpole's tables are of 2 GiB there, and grow with its fourth power."""
+"""Of the optimal return's grid: the cartpole's tables take 2 GiB there, and grow with its fourth power."""
 
 
-def _name(given: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,60}", given):
-        raise ValueError(f"expected letters, digits, spaces, dots and dashes, got {shown(given)}")
+def _check_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,60}", name):
+        raise ValueError(f"expected letters, digits, spaces, dots and dashes, got {shown(name)}")
     try:
-        float(given)
+        float(name)
     except ValueError:
-        return given
-    raise ValueError(f"expected a name, got {given!r}, which in a table would be a number")
+        return name
+    raise ValueError(f"expected a name, got {name!r}, which would be read as a number in a table")
 
 
-def _as_given(given: float, checked: ValidatorFunctionWrapHandler) -> float:
-    checked(given)
-    return given
+def _unconverted(number: float, check: ValidatorFunctionWrapHandler) -> float:
+    check(number)
+    return number
 
 
-Name = Annotated[str, AfterValidator(_name)]
-Numbers = dict[str, Annotated[float, Strict(), WrapValidator(_as_given)]]
-"""By name, each as it is given: 64 stays a whole number."""
+Name = Annotated[str, AfterValidator(_check_name)]
+Numbers = dict[str, Annotated[float, Strict(), WrapValidator(_unconverted)]]
+"""Numbers by name, unconverted: 64 stays an integer."""
 Episodes = Annotated[Whole, Field(ge=1, le=MOST_AT_ONCE)]
 Resolution = Annotated[Number, Field(ge=0.1, le=FINEST_RESOLUTION)]
 
 
 @record
 class Simulators:
-    """How responses are read and neuron simulators made of them; as the options of `animat train`.
+    """How responses are read and simulators fitted to them; as the options of `animat train`.
 
     Attributes:
         kind, bins, range_hz: of the simulators; by default 20 bins with edges at each recording's own percentiles.
-        conditions: what the agent picks from, such as `frequency` or `interval:5,10+-25%`; empty: by frequency.
-        readouts: what becomes a command each: `all` channels as one, `halves` or `quadrants` of the array, or groups of
+        conditions: what the agent chooses from, such as `frequency` or `interval:5,10+-25%`; empty: by frequency.
+        readouts: channels of each command: `all` channels as one, `halves` or `quadrants` of the array, or groups of
             electrodes as JSON, `{"left": [1, 2], "right": [3, 4]}`; every robot of the study takes as many commands.
         window_ms: start and end of the response window.
-        burst_threshold: share of active channels above which a response is a burst; None: Otsu's, where there are two
+        burst_threshold: share of active channels above which a response is a burst; None: Otsu's, if there are two
             groups.
-        allow: findings to go on in spite of.
+        allow: names of findings that do not stop the study.
     """
 
     kind: Literal["histogram", "empirical", "memory"] = "histogram"
@@ -81,7 +81,7 @@ class Simulators:
         from animat.responses.series import check_allowed
         from animat.responses.windows import check_window
 
-        # All before anything is recorded: whoever corrects it later needs another folder.
+        # Checked before anything is recorded, as a later correction would need another folder.
         check_binning(self.bins, self.range_hz)
         check_window(self.window_ms)
         check_allowed(self.allow)
@@ -95,15 +95,14 @@ class RobotSpec:
     """A robot of the study.
 
     Attributes:
-        name: what it is called in tables and folders; where it is a robot's own (`animat.robots.robot_named`), no more
-            need be said.
-        kind: the robot's own name, where this one is another, such as of two cartpoles with different parameters; or
-            where to import it from, `my_package.robots:Rover`, which is filled in for robots that are not ours.
+        name: in tables and folders; if it is the name of a robot (`animat.robots.robot_named`), `kind` is not needed.
+        kind: the robot's name if `name` is another, as with two cartpoles of different parameters; or where to import
+            it from, `my_package.robots:Rover`, which is filled in for custom robots.
         iterations: of training, for each policy; None: the paper's.
-        parameters: in place of its defaults, such as `pole_mass_kg`.
-        optimum_resolution: of its optimal return, in place of the study's.
-        goal: what is wanted of it in place of its own task (`animat.goals.text`); None: its own task.
-        lessons: that its policies are taught in turn, a table `[[robots.lessons]]` each (`animat.training.lessons`).
+        parameters: that replace its defaults, such as `pole_mass_kg`.
+        optimum_resolution: of its optimal return; replaces the study's.
+        goal: that replaces its own task (`animat.goals.text`); None: its own task.
+        lessons: taught to its policies in turn, each a table `[[robots.lessons]]` (`animat.training.lessons`).
     """
 
     name: Name
@@ -125,16 +124,16 @@ class RobotSpec:
         except InvalidArgument as error:
             raise InvalidArgument(f"parameters: {error}") from error
         if self.name == "culture":
-            raise InvalidArgument("name: expected another name than the culture's figures have, got 'culture'")
+            raise InvalidArgument("name: expected a name other than that of the culture's figures, got 'culture'")
         if self.goal is not None:
             with_goal(robot, self.goal)
         expect_lessons(self.lessons, self.robot(), draws_recordings=True)
         if not is_ours(robot):
-            # Workers know it by that.
+            # Workers import it from there.
             object.__setattr__(self, "kind", place_of(kind))
 
     def robot(self) -> Robot[Any]:
-        """The robot itself, with its goal."""
+        """The robot, with its goal."""
         robot = robot_named(self.kind or self.name, **self.parameters)
         return robot if self.goal is None else with_goal(robot, self.goal)
 
@@ -149,9 +148,9 @@ class Arm:
     """One way to train policies, on each robot.
 
     Attributes:
-        name: what it is called in tables and folders.
+        name: in tables and folders.
         mapping: from responses to commands, or where to import one from, `my_package.mappings:Steep` (filled in for
-            mappings that are not ours); `"none"` is the baseline without neurons.
+            custom mappings); `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training; `"drawn"`: each episode draws one of them.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
         percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording.
@@ -173,12 +172,12 @@ class Arm:
         except InvalidArgument as error:
             raise InvalidArgument(f"{error}; none is without neurons") from error
         if not is_ours(mapping):
-            # Workers know it by that.
+            # Workers import it from there.
             object.__setattr__(self, "mapping", place_of(type(mapping)))
 
     @property
     def slug(self) -> str:
-        """The name as a folder's."""
+        """The name of its folder."""
         return self.name.lower().replace(" ", "-")
 
     @property
@@ -193,22 +192,22 @@ class Arm:
 
     @property
     def thresholds(self) -> str:
-        """Its mapping and whether the percentiles are fixed, as a folder's name."""
+        """The folder name of its mapping and percentiles."""
         return self.mapping.replace(":", ".") + ("-held" if self.percentiles == "first" else "")
 
     @property
     def has_steps(self) -> bool:
-        """Whether its mapping gives a few commands only, with which optimal returns are quick."""
+        """Whether its mapping gives only a few commands, so that optimal returns are quick to compute."""
         return self.through_neurons and isinstance(mapping_named(self.mapping), Thresholds)
 
     @property
     def learns_one_recording(self) -> bool:
-        """Whether its policies learn what they choose to do with the first recording, and with no other."""
+        """Whether its policies learn, with their chosen stimuli, from the first recording only."""
         return self.trained and self.through_neurons and not self.shadowing and self.delivery == "chosen"
 
 
-def named_mapping(mapping: str, percentiles: str) -> str:
-    """A mapping in words, with whether its percentiles are fixed."""
+def mapping_label(mapping: str, percentiles: str) -> str:
+    """The label of a mapping, with whether its percentiles are fixed."""
     fixed = ", percentiles fixed" if percentiles == "first" else ""
     return "without neurons" if mapping == "none" else f"{mapping}{fixed}"
 
@@ -219,8 +218,8 @@ class Compared:
 
     Attributes:
         name: of the comparison.
-        first, second: names of arms; the second is the one expected to be better.
-        at_min: minute of the recording that they are evaluated on, the nearest to it; None: the last recording.
+        first, second: names of arms; the second is expected to be better.
+        at_min: minute whose nearest recording they are evaluated on; None: the last recording.
         episodes: of each policy.
     """
 
@@ -232,29 +231,27 @@ class Compared:
 
     def __post_init__(self) -> None:
         if self.first == self.second:
-            raise InvalidArgument(
-                f"second: expected another arm than the first, got {self.second!r} twice in {self.name!r}"
-            )
+            raise InvalidArgument(f"second: expected an arm other than the first, got {self.second!r} in {self.name!r}")
 
 
 @record
 class Study:
-    """Everything that decides how a study comes out, but for the recordings in files.
+    """Everything that decides a study's results, except for the recordings in files.
 
     Attributes:
         title: of the report.
         culture, simulators: the recordings, and how responses are read from them and fitted.
-        robots, arms, comparisons: what is trained and what is compared.
+        robots, arms, comparisons: what is trained and compared.
         policies: of each arm on each robot.
         seed: decides every draw of training and evaluation.
-        training_min: minutes of the culture's clock that a training stands for.
+        training_min: duration of training on the culture's clock.
         episodes: of each policy where no comparison says otherwise, and of controls.
         episodes_over_time: of each policy at every recording.
-        actions: how policies act when they are evaluated: the most probable one, or drawn as in training.
+        actions: how policies act in evaluation: the most probable action, or drawn as in training.
         optimum_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
-        optimum_episodes: episodes in which that controller's return is checked.
-        algorithm: settings of `animat.training.settings.SAC` in place of its defaults.
-        paper: whether the paper's own figures are printed beside comparisons of the same name and robot.
+        optimum_episodes: episodes in which the optimal controller's return is checked.
+        algorithm: settings of `animat.training.settings.SAC` that replace its defaults.
+        paper: whether the paper's results are printed with comparisons of the same name and robot.
 
     Raises:
         InvalidArgument: naming the setting, what was expected and what came.
@@ -278,16 +275,16 @@ class Study:
     paper: Flag = False
 
     def __post_init__(self) -> None:
-        for what in ("robots", "arms"):
-            if not getattr(self, what):
-                raise InvalidArgument(f"{what}: expected at least one, got none")
+        for name in ("robots", "arms"):
+            if not getattr(self, name):
+                raise InvalidArgument(f"{name}: expected at least one, got none")
         n_readouts = count_readouts(readouts_named(self.simulators.readouts))
         for spec in self.robots:
             if self.needs_neurons and (n := spec.robot().n_commands) != n_readouts:
                 raise InvalidArgument(
-                    f"simulators.readouts: expected as many as the commands of {spec.name} ({n}), got "
-                    f"{self.simulators.readouts!r}, which are {n_readouts}; robots of more or fewer commands are a "
-                    "study of their own"
+                    f"simulators.readouts: expected as many as {spec.name} has commands ({n}), got "
+                    f"{self.simulators.readouts!r}, which are {n_readouts}; robots with more or fewer commands need "
+                    "another study"
                 )
         for spec in self.robots:
             for arm in self.arms:
@@ -296,9 +293,9 @@ class Study:
                     expect_lessons(spec.lessons, spec.robot(), draws_recordings=drawn)
                 except InvalidArgument as error:
                     raise InvalidArgument(f"robots.lessons: {error} ({spec.name}, {arm.name})") from error
-        _expect_unlike("robots", [spec.name for spec in self.robots])
-        _expect_unlike("arms", [arm.slug for arm in self.arms], ": capitals, and spaces for dashes, make no difference")
-        _expect_unlike("comparisons", [compared.name for compared in self.comparisons])
+        _expect_unique("robots", [spec.name for spec in self.robots])
+        _expect_unique("arms", [arm.slug for arm in self.arms], ": capitals, and spaces for dashes, make no difference")
+        _expect_unique("comparisons", [compared.name for compared in self.comparisons])
         # All policies are evaluated side by side.
         for name, episodes in (
             ("episodes", self.episodes),
@@ -307,7 +304,7 @@ class Study:
         ):
             if episodes * self.policies > MOST_AT_ONCE:
                 raise InvalidArgument(
-                    f"{name}: expected at most {MOST_AT_ONCE:,} of all policies together, got {episodes:,} of each of "
+                    f"{name}: expected at most {MOST_AT_ONCE:,} of all policies together, got {episodes:,} for each of "
                     f"{self.policies}"
                 )
         trained = len(self.robots) * len(self.arms) * self.policies
@@ -334,13 +331,13 @@ class Study:
         return next(arm for arm in self.arms if arm.name == name)
 
     def arms_of(self, kind: Arm) -> list[Arm]:
-        """The arms of the same kind as one."""
+        """All arms with the same `kind`."""
         return [arm for arm in self.arms if arm.kind == kind.kind]
 
     def minutes_of(self, arm: Arm, first_min: float, last_min: float) -> dict[float, int]:
-        """Minutes that an arm is evaluated at, and in how many episodes: of its comparisons, and the last.
+        """The minutes at which an arm is evaluated, with numbers of episodes: those of its comparisons, and the last.
 
-        If it is trained on the first recording alone, also that one: how well did it learn what it was taught?
+        An arm that is trained on the first recording only is evaluated on it too, to show how well it learned it.
         """
         minutes: dict[float, int] = {}
         for compared in self.comparisons:
@@ -355,8 +352,8 @@ class Study:
     def at_recordings(self, start_min: Sequence[float]) -> Study:
         """The same study with every comparison at the minute of a recording: the nearest to its own, or the last.
 
-        Recordings start at rising minutes; without neurons, where every minute is the same, there are none. Raises
-        InvalidArgument for a comparison before the first recording, or after the last by more than an interval.
+        `start_min` rises; it is empty without neurons, where every minute is the same. Raises InvalidArgument for a
+        comparison before the first recording, or after the last, by more than the longest interval between two.
         """
         settled = (replace(each, at_min=self._minute_of(each, start_min)) for each in self.comparisons)
         return replace(self, comparisons=tuple(settled))
@@ -376,7 +373,7 @@ class Study:
         return min(start_min, key=lambda start: (abs(start - at), start))
 
     def optimum_minutes(self, first_min: float, last_min: float) -> list[float]:
-        """Minutes at which anything is evaluated, rising."""
+        """All minutes at which anything is evaluated, rising."""
         return sorted({at for arm in self.arms for at in self.minutes_of(arm, first_min, last_min)})
 
     @property
@@ -385,7 +382,7 @@ class Study:
         return any(arm.through_neurons for arm in self.arms)
 
 
-def _expect_unlike(what: str, names: Sequence[str], note: str = "") -> None:
+def _expect_unique(argument: str, names: Sequence[str], note: str = "") -> None:
     for name, times in Counter(names).items():
         if times > 1:
-            raise InvalidArgument(f"{what}: expected each name once, got {name!r} {times} times{note}")
+            raise InvalidArgument(f"{argument}: expected each name once, got {name!r} {times} times{note}")

@@ -1,4 +1,4 @@
-"""The study's results as tables: scores of every arm, comparisons, controls, learning curves, the culture."""
+"""The study's results as tables: scores, comparisons, controls, learning curves, controllability, findings."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Resu
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
 from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
-from animat.studies.heuristic import beside_heuristic
-from animat.studies.optima import kinds_of, left_out, optima_of_all, read_optima
+from animat.studies.heuristic import compare_with_heuristic
+from animat.studies.optima import kinds_of, missing_capabilities, read_complete_optima, read_optima
 from animat.studies.paper import PRINTED
 from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
-from animat.studies.reflex import beside_reflex
+from animat.studies.reflex import compare_with_reflex
 from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.simulating import controllability
-from animat.studies.specification import Arm, RobotSpec, Study, named_mapping
+from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
 from animat.writing import atomic_write
@@ -35,10 +35,10 @@ from animat.writing import atomic_write
 T = TypeVar("T")
 
 LEVEL = 0.01
-"""The p, by the normal approximation and uncorrected as the paper's, below which a comparison's issue is found."""
+"""The p below which an arm counts as better: by the normal approximation and uncorrected, as in the paper."""
 
 LEFT_OUT = "left-out"
-"""The finding that a robot cannot do something, which the study is without."""
+"""The finding that the study lacks something, as a robot cannot do it."""
 
 CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 
@@ -46,7 +46,7 @@ CURVES = ("robot", "arm", "policy", "iterations", "episodes", "mean_return")
 @final
 @dataclass(frozen=True)
 class Tabulate(StudyTask):
-    """Summarise the table of episodes and write `tables/`: results for the tasks that show them, all else as CSV."""
+    """Summarise the table of episodes and write `tables/`: typed results for later tasks, and everything as CSV."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline = as_recorded(self.study, folder)
@@ -58,27 +58,27 @@ class Tabulate(StudyTask):
             scores=tuple(_scores(study, table, first, last, known)),
             comparisons=tuple(_comparisons(study, table, last, known)),
             controls=tuple(row for spec in study.robots for row in _controls(study, table, spec, known[spec.name])),
-            heuristic=tuple(row for spec in study.robots for row in beside_heuristic(study, table, spec)),
+            heuristic=tuple(row for spec in study.robots for row in compare_with_heuristic(study, table, spec)),
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
             goals=tuple(goals_met(study, table)),
-            reflexes=tuple(row for spec in study.robots for row in beside_reflex(study, table, spec, optima)),
+            reflexes=tuple(row for spec in study.robots for row in compare_with_reflex(study, table, spec, optima)),
         )
         files = [write_typed(results_file(folder), results)]
         for name, kinds in get_type_hints(Results).items():
             rows = getattr(results, name)
-            # Findings have columns of their own, and most studies have no goals.
+            # Findings have other columns, below, and most studies have no goals.
             if name != "findings" and (rows or name != "goals"):
                 files.append(write_records(table_file(folder, name), get_args(kinds)[0], rows))
-        told = ((finding.severity, finding.name, finding.message) for finding in results.findings)
-        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), told))
+        findings = ((finding.severity, finding.name, finding.message) for finding in results.findings)
+        files.append(write_table(table_file(folder, "findings"), ("severity", "name", "message"), findings))
         files.append(write_table(table_file(folder, "learning-curves"), CURVES, _curves(study, folder)))
         if timeline is not None:
             head = ("at_min", "condition", "above_median_in_data", "above_median_in_simulator")
             rows = (
-                (at_min, *told)
+                (at_min, *shares)
                 for at_min, kept in controllability(timeline).items()
-                for told in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True)
+                for shares in zip(kept.labels, kept.in_data.tolist(), kept.in_simulator.tolist(), strict=True)
             )
             files.append(write_table(table_file(folder, "controllability"), head, rows))
         with atomic_write(table_file(folder, "episodes")) as beside:
@@ -99,17 +99,17 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
     if timeline is not None:
         yield from timeline.findings
     for optimum in optima:
-        where = f"{optimum.robot}, {named_mapping(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
-        for told in optimum.findings():
-            yield replace(told, message=f"{where}: {told.message}")
-    for message in left_out(study):
+        where = f"{optimum.robot}, {mapping_label(optimum.mapping, optimum.percentiles)}, at {optimum.at_min:g} min"
+        for finding in optimum.findings():
+            yield replace(finding, message=f"{where}: {finding.message}")
+    for message in missing_capabilities(study):
         yield Finding(LEFT_OUT, "note", message)
 
 
 class References:
-    """Random policies and optimal returns on a robot, for every mapping and minute, by the table of its episodes.
+    """Mean returns of random actions and optimal returns on a robot, for every mapping and minute.
 
-    Over time: of the few episodes at every recording, with the optimum on a rough grid.
+    With `over_time`: of the few episodes at every recording, with the optimum on a rough grid.
     """
 
     def __init__(
@@ -117,27 +117,25 @@ class References:
     ) -> None:
         self._optima = {
             (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
-            for optimum in optima_of_all(folder, spec.name, "over-time" if over_time else "optima")
+            for optimum in read_complete_optima(folder, spec.name, "over-time" if over_time else "optima")
         }
         random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_kind = random[random["arm"] == named_mapping(*kind.kind)]
+            of_kind = random[random["arm"] == mapping_label(*kind.kind)]
             for at_min, returns in of_kind.groupby("at_min")["return"]:
                 self._random[*kind.kind, at_min] = float(returns.to_numpy().mean())
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._of(self._random, arm, at_min)
+        return self._find(self._random, arm, at_min)
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """None for a control, which can do nothing, and where conditions with few responses were left out of it."""
-        if arm.delivery == "shuffled":
-            return None
-        return self._of(self._optima, arm, at_min)
+        """The optimal return; None for the control, which has none, and where it leaves out conditions."""
+        return None if arm.delivery == "shuffled" else self._find(self._optima, arm, at_min)
 
     def score(self, arm: Arm, at_min: float, mean: float) -> float | None:
-        """The normalised score; None where nothing can be learned."""
+        """The normalised score; None if it is not known, or nothing can be learned."""
         random, optimum = self.random(arm, at_min), self.optimum(arm, at_min)
         if random is None or optimum is None or optimum.best_return is None:
             return None
@@ -147,7 +145,7 @@ class References:
             return None
 
     @staticmethod
-    def _of(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
+    def _find(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
         if arm.through_neurons:
             return known.get((*arm.kind, at_min))
         # Without neurons every minute is the same.
@@ -157,13 +155,13 @@ class References:
 def performances(
     table: DataFrame, robot: str, arm: Arm, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
-    """Each policy's mean return over its first `episodes` at a minute, or all: the paper's measure of a policy."""
+    """Each policy's mean return over its first `episodes`, or all, at a minute: the paper's measure of a policy."""
     of_robot = table[(table["robot"] == robot) & (table["arm"] == arm.name) & (table["agent"] == POLICY)]
     return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
 
 
-def _known(end: float) -> float | None:
-    """The end of an interval; one policy on a robot whose returns have no bounds leaves none."""
+def _finite(end: float) -> float | None:
+    """An end of an interval; None if it is infinite, as for one policy on a robot with unbounded returns."""
     return end if math.isfinite(end) else None
 
 
@@ -188,8 +186,8 @@ def _scores(
                     mean_return=mean,
                     standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
                     interquartile_mean=middle.value,
-                    low_95=_known(middle.low),
-                    high_95=_known(middle.high),
+                    low_95=_finite(middle.low),
+                    high_95=_finite(middle.high),
                     random=known.random(arm, at_min),
                     optimum=None if optimum is None else optimum.best_return,
                     normalised_score=known.score(arm, at_min, mean),
@@ -204,19 +202,19 @@ FIRST, SECOND, NONE, TOO_FEW = (
 )
 
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
-"""Of each outcome, whether it is the paper's, in which the second arm was always the better."""
+"""Whether each outcome agrees with the paper, in which the second arm was always better."""
 
 
-def outcome_of(told: Comparison) -> str:
-    """In words: which arm is better, that neither was found to be, or that it could not have been found."""
-    if told.p_normal < LEVEL:
-        return SECOND if told.effect.value > 0 else FIRST
-    # With four policies per side even U = 0 has p = 0.03: nothing could be found, which says nothing of a difference.
-    return NONE if p_of_u(0.0, told.n_first, told.n_second) < LEVEL else TOO_FEW
+def outcome_of(comparison: Comparison) -> str:
+    """Which arm is better, that no difference was found, or that none could have been found."""
+    if comparison.p_normal < LEVEL:
+        return SECOND if comparison.effect.value > 0 else FIRST
+    # With four policies per side even U = 0 has p = 0.03, so no difference could have been found.
+    return NONE if p_of_u(0.0, comparison.n_first, comparison.n_second) < LEVEL else TOO_FEW
 
 
 def _optimum_error(optimum: StudyOptimum | None) -> float | None:
-    """How far the optimal return may lie from its value: by the grid, or down to the controller's return."""
+    """The possible error of the optimal return: that of the grid, or the distance to the controller's return."""
     if optimum is None or optimum.grid_error is None:
         return None
     return max(optimum.grid_error, *(abs(each.value or 0.0) for each in optimum.findings()), 0.0)
@@ -232,11 +230,11 @@ def _comparisons(
         for spec in study.robots:
             a, b = (performances(table, spec.name, side, at_min, compared.episodes) for side in sides)
             made.append((compared, spec.name, sides, at_min, a, b, compare(a, b)))
-    corrected = holm({f"{compared.name}/{robot}": told.p_normal for compared, robot, *_, told in made})
-    for compared, robot, (first, second), at_min, a, b, told in made:
+    corrected = holm({f"{compared.name}/{robot}": test.p_normal for compared, robot, *_, test in made})
+    for compared, robot, (first, second), at_min, a, b, test in made:
         known = references[robot]
         printed = PRINTED.get((compared.name, robot)) if study.paper else None
-        outcome = outcome_of(told)
+        outcome = outcome_of(test)
         optima = [known.optimum(arm, at_min) for arm in (first, second)]
         yield ComparedReturns(
             comparison=compared.name,
@@ -255,13 +253,13 @@ def _comparisons(
             optimum_second=None if optima[1] is None else optima[1].best_return,
             optimum_error_first=_optimum_error(optima[0]),
             optimum_error_second=_optimum_error(optima[1]),
-            u=told.u,
-            p_normal=told.p_normal,
-            p_exact=told.p_exact,
+            u=test.u,
+            p_normal=test.p_normal,
+            p_exact=test.p_exact,
             p_holm=corrected[f"{compared.name}/{robot}"],
-            effect=told.effect.value,
-            effect_low_95=told.effect.low,
-            effect_high_95=told.effect.high,
+            effect=test.effect.value,
+            effect_low_95=test.effect.low,
+            effect_high_95=test.effect.high,
             outcome=outcome,
             paper_u=None if printed is None else printed.u,
             paper_p=None if printed is None else printed.p,
@@ -271,7 +269,7 @@ def _comparisons(
 
 def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        through = named_mapping(*kind.kind)
+        through = mapping_label(*kind.kind)
         of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
         for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
@@ -281,7 +279,7 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
                     rows.append((f"{TRAINED}{arm.name}", len(means), means))
             for agent, of_agent in of_minute.groupby("agent", sort=False):
                 means = mean_returns(of_agent)
-                # Over actors, as each is one sample; a control of one actor has its episodes for samples.
+                # Each actor is one sample; for a single actor, each of its episodes is.
                 rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
             optimum = known.optimum(kind, at_min)
             for name, actors, samples in rows:
@@ -313,5 +311,5 @@ def _curves(study: Study, folder: Path) -> Iterator[tuple[Any, ...]]:
         for arm in (arm for arm in study.arms if arm.trained):
             for i, curve in enumerate(learning_of(study, folder, spec, arm).tolist()):
                 for iterations, episodes, mean in curve:
-                    told = int(iterations), int(episodes), None if np.isnan(mean) else mean
-                    yield spec.name, arm.name, f"p{i}", *told
+                    row = int(iterations), int(episodes), None if np.isnan(mean) else mean
+                    yield spec.name, arm.name, f"p{i}", *row

@@ -1,4 +1,4 @@
-"""Parts of a study as tasks, each of which leaves files that follow from the study and from the jobs it needs."""
+"""The base class of a study's tasks, whose files depend only on the study and on the jobs that they need."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from animat.studies.specification import Study
 
 
 def draw_seed(*names: object) -> int:
-    """A seed from the names of what is drawn, so that no two arms share their luck."""
+    """A seed derived from the names of what is drawn, so that no two arms share random numbers."""
     return int.from_bytes(hashlib.sha256(repr(names).encode()).digest()[:4], "big") >> 1
 
 
 @dataclass(frozen=True)
 class StudyTask(Task):
-    """A task that is told what to do by a study's specification."""
+    """A task that is specified by a study."""
 
     sizes: ClassVar[tuple[str, ...]] = ("policies", "episodes")
-    """Settings of the study that its memory grows with."""
+    """Settings of the study with which its memory grows."""
 
     study: Study
 
@@ -34,9 +34,9 @@ class StudyTask(Task):
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         for spec in self.study.robots:
-            spec.robot()  # It registers one that is imported, for policies to be loaded.
+            spec.robot()  # Registers custom robots, so that policies can be loaded.
         return self.make(folder, progress)
 
     @abc.abstractmethod
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        """Do it, as `Task.run`, with all robots of the study registered."""
+        """Do the work, as `Task.run`, with all robots of the study registered."""

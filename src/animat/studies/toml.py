@@ -1,4 +1,4 @@
-"""A study as a TOML file: read strictly, every mistake in one line; lists in it multiplied out; and written again."""
+"""A study as a TOML file: reading it strictly, with each mistake in one line; expanding its lists; and writing it."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from animat.training.settings import FORMER as FORMER_SETTINGS
 
 MOST_BYTES = 2**20
 """Of a specification."""
+TABLES = ("robots", "arms", "comparisons")
 FORMER = {
     "": {"conditions": "arms", "limit_resolution": "optimum_resolution", "limit_episodes": "optimum_episodes"},
     "robots": {"limit_resolution": "optimum_resolution"},
@@ -26,17 +27,17 @@ FORMER = {
     "simulators": {"despite": "allow"},
     "algorithm": FORMER_SETTINGS,
 }
-"""What keys are called in files of before, table by table (at the top: none)."""
+"""Former names of keys, by table ("" is the top level)."""
 FORMER_CHANNELS = 256
-"""Former files name that many channels of every culture, which only synthetic recordings used; it is ignored."""
+"""Former files have this `channels` in every culture, which only synthetic recordings used; it is ignored."""
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study's specification.
 
-    Keys are the attributes of `animat.studies.specification.Study` and of the tables in it; what is left out has its
-    default; a key that is not known is refused. Lists in robots, arms and comparisons stand for their products
-    (`without_lists`).
+    Keys are the attributes of `animat.studies.specification.Study` and of the tables in it. A key that is left out has
+    its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations
+    (`expand_lists`).
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -45,7 +46,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """A specification's file as plain data; raises InvalidFile if it cannot be read, is no TOML or is empty."""
+    """A specification's file as plain data; raises InvalidFile if it cannot be read, is not TOML or is empty."""
     data = plain_file.read_toml(path, MOST_BYTES)
     if not data:
         raise InvalidFile(f"{path}: expected the settings of a study, got none (animat reproduce is the paper's)")
@@ -53,52 +54,48 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
-    """The study of a file's plain data; errors as those of `read_study`."""
+    """The study from a file's plain data; raises as `read_study` does."""
     if "tune" in data:
-        raise InvalidFile(f"{path}: expected a study, got the file of a tuning, with [tune]: give it to animat tune")
-    for name in ("robots", "arms", "comparisons"):
+        raise InvalidFile(f"{path}: expected a study, got the file of a tuning, with [tune]: use animat tune")
+    for name in TABLES:
         if isinstance(table := data.get(name), dict):
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")
             raise InvalidFile(f"{path}: {name}: expected [[{name}]] for each, and its name in it, got {wrote}")
     try:
-        return read_record(Study, without_lists(_in_todays_words(data)))
+        return read_record(Study, expand_lists(_with_current_keys(data)))
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
 
 
-def _in_todays_words(data: dict[str, Any]) -> dict[str, Any]:
-    """The same with former keys by their names of today; whatever else is wrong is left for the checks."""
-    data = _renamed(data, FORMER[""])
+def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
+    """The data with former keys renamed; other mistakes are left to later checks."""
+    data = _rename_keys(data, FORMER[""])
     for name, names in FORMER.items():
         table = data.get(name)
         if isinstance(table, dict):
-            data[name] = _renamed(table, names)
+            data[name] = _rename_keys(table, names)
         elif isinstance(table, list):
-            data[name] = [_renamed(each, names) if isinstance(each, dict) else each for each in table]
+            data[name] = [_rename_keys(each, names) if isinstance(each, dict) else each for each in table]
     culture = data.get("culture")
     if isinstance(culture, dict) and culture.get("channels") == FORMER_CHANNELS:
         data["culture"] = {key: value for key, value in culture.items() if key != "channels"}
     return data
 
 
-def _renamed(table: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
-    found = {}
-    for key, value in table.items():
-        today = names.get(key, key)
-        # Where both are given, the former one is told as a key that is not known.
-        found[key if today in table else today] = value
-    return found
+def _rename_keys(table: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
+    # If both names are present, the former one stays and is refused as an unknown key.
+    return {key if names.get(key, key) in table else names[key]: value for key, value in table.items()}
 
 
 def study_to_toml(study: Study) -> str:
-    """The study as TOML, every setting named; `read_study` gives the same study back."""
+    """The study as TOML with every setting; `read_study` returns the same study."""
     return "\n".join(_lines(dataclasses.asdict(study), ())) + "\n"
 
 
 def _lines(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
-    """TOML wants a table's plain values before the tables in it."""
+    """A table's lines: first its plain values, as TOML requires, then the tables in it."""
     inner = {key: value for key, value in table.items() if _is_table(value) or _is_tables(value)}
-    lines = [f"{key} = {_written(value)}" for key, value in table.items() if key not in inner and value is not None]
+    lines = [f"{key} = {_format_value(v)}" for key, v in table.items() if key not in inner and v is not None]
     for key, value in inner.items():
         name = ".".join((*path, key))
         if _is_table(value):
@@ -117,53 +114,50 @@ def _is_tables(value: Any) -> bool:
     return isinstance(value, tuple | list) and bool(value) and isinstance(value[0], dict)
 
 
-def _written(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, tuple | list):
-        return f"[{', '.join(_written(each) for each in value)}]"
-    # JSON's text, numbers and booleans are TOML's too, but for one sign; an empty table is {} in both.
+        return f"[{', '.join(_format_value(each) for each in value)}]"
+    # JSON's text, numbers and booleans are valid TOML except for one character; an empty table is {} in both.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-TABLES = ("robots", "arms", "comparisons")
+def expand_lists(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A specification's plain data with each combination of listed values as a separate entry.
 
-
-def without_lists(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A specification's plain data with all products named, `{key}` in a name replaced by each value.
-
-    What is no table of the right kind is left for the checks. Raises InvalidArgument for a name that does not tell
-    products apart, or too many of them.
+    `{key}` in an entry's name is replaced by each value. Tables of the wrong type are left to later checks. Raises
+    InvalidArgument for a name that does not distinguish the combinations, or for too many of them.
     """
-    found = dict(data)
+    expanded = dict(data)
     for table in TABLES:
         if isinstance(entries := data.get(table), list):
-            found[table] = [each for entry in entries for each in _products(table, entry)]
-            if len(found[table]) > MOST_ENTRIES:
-                raise InvalidArgument(f"{table}: expected at most {MOST_ENTRIES:,}, got {len(found[table]):,}")
-    return found
+            expanded[table] = [each for entry in entries for each in _combinations(table, entry)]
+            if len(expanded[table]) > MOST_ENTRIES:
+                raise InvalidArgument(f"{table}: expected at most {MOST_ENTRIES:,}, got {len(expanded[table]):,}")
+    return expanded
 
 
-def _products(table: str, entry: Any) -> Iterator[Any]:
+def _combinations(table: str, entry: Any) -> Iterator[Any]:
     lists = dict(_lists_in(entry)) if isinstance(entry, dict) else {}
     if not lists:
         yield entry
         return
     if (n := math.prod(map(len, lists.values()))) > MOST_ENTRIES:
-        raise InvalidArgument(f"{table}: expected at most {MOST_ENTRIES:,}, got {n:,} from the lists in one")
+        raise InvalidArgument(f"{table}: expected at most {MOST_ENTRIES:,}, got {n:,} from the lists of one")
     name = entry.get("name")
     for path, values in lists.items():
         if not isinstance(name, str) or (len(values) > 1 and f"{{{path[-1]}}}" not in name):
-            raise InvalidArgument(f"{table}.name: expected {{{path[-1]}}} in it, as that is a list, got {name!r}")
+            raise InvalidArgument(f"{table}.name: expected it to contain {{{path[-1]}}}, which is a list, got {name!r}")
     for product in itertools.product(*lists.values()):
         one = {**entry, **{key: dict(inner) for key, inner in entry.items() if isinstance(inner, dict)}}
         for path, value in zip(lists, product, strict=True):
             inside = one if len(path) == 1 else one[path[0]]
             inside[path[-1]] = value
-            one["name"] = one["name"].replace(f"{{{path[-1]}}}", _in_words(value))
+            one["name"] = one["name"].replace(f"{{{path[-1]}}}", _name_part(value))
         yield one
 
 
 def _lists_in(entry: dict[str, Any]) -> Iterator[tuple[tuple[str, ...], list[Any]]]:
-    """The lists of plain values, also in a table such as `parameters`, by where they are."""
+    """The lists of plain values by their keys, including those in a table such as `parameters`."""
     for key, value in entry.items():
         inner = {(key, name): each for name, each in value.items()} if isinstance(value, dict) else {(key,): value}
         for path, each in inner.items():
@@ -171,5 +165,5 @@ def _lists_in(entry: dict[str, Any]) -> Iterator[tuple[tuple[str, ...], list[Any
                 yield path, each
 
 
-def _in_words(value: Any) -> str:
+def _name_part(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)

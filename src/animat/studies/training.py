@@ -1,4 +1,4 @@
-"""Training as jobs: each a group of one arm's policies on one robot, with its checkpoint in the folder."""
+"""Training jobs, each for a group of one arm's policies on one robot, with its checkpoint in the folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from animat.training.specification import Training
 @final
 @dataclass(frozen=True)
 class TrainGroup(StudyTask, Trains):
-    """Train some policies of an arm on a robot, going on from where a killed run stopped."""
+    """Train some policies of an arm on a robot, resuming where a killed run stopped."""
 
     sizes = ("algorithm",)
 
@@ -51,21 +51,21 @@ class TrainGroup(StudyTask, Trains):
 def work_on(
     training: Training, members: tuple[int, ...], timeline: SimulatorTimeline | None, place: Path, checkpoint: Path
 ) -> Work:
-    """Some policies of a training as work that describes itself in the folder of the policies."""
+    """The work of training some policies, with a description for the policies' folder."""
     manifest = describe(training, timeline, device=gpu_here())
     group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
     return Work(group, place, checkpoint, description=manifest)
 
 
 def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:
-    """What an arm means for the trainer."""
+    """The training of an arm's policies on a robot."""
     through_neurons = arm.through_neurons
     return Training(
         robot=spec.robot(),
         mapping=mapping_named(arm.mapping) if through_neurons else None,
         policies=study.policies,
         iterations=spec.trained_for,
-        # Tests of ranks take the policies of two arms for independent: none starts as another one does.
+        # Rank tests assume that the policies of two arms are independent, so arms have different seeds.
         seed=draw_seed("training", study.seed, spec.name, arm.slug),
         shadowing=arm.shadowing if through_neurons else bool(arm.shadowing),
         duration_min=study.training_min,

@@ -18,11 +18,11 @@ from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.task import UNFINISHED
 from animat.progress import Part, Progress, Silent
-from animat.studies.folder import describe_study, held, source_files, sums_of
+from animat.studies.folder import claim_folder, describe_study, hash_files, source_files
 from animat.studies.places import OWN_FOLDERS, RECEIPTS
 from animat.studies.plan import ITERATIONS_PER_S
 from animat.studies.recording import JOB, Record
-from animat.studies.run import check_own
+from animat.studies.run import check_custom
 from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
@@ -74,13 +74,13 @@ def tune(
     folder, base, progress = Path(folder).absolute(), Path(base).absolute(), progress or Silent()
     study = tuning.study
     # Looked at before there is a folder.
-    check_own(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
-    manifest = describe_tuning(tuning, sums_of(source_files(study, base), base))
+    check_custom(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
+    manifest = describe_tuning(tuning, hash_files(source_files(study, base), base))
     # Processes of ours stay from one part of the work to the next.
     running_on: AbstractContextManager[Executor] = (
         PinnedProcesses(own_cores(workers)) if executor is None else nullcontext(executor)
     )
-    with held(folder, "tuning", manifest, MANIFEST, {}, (*OWN_FOLDERS, FINALS)), running_on as at:
+    with claim_folder(folder, "tuning", manifest, MANIFEST, {}, (*OWN_FOLDERS, FINALS)), running_on as at:
         run = _Run(tuning, folder, manifest["fingerprint"], at, progress)
         run.fit(base)
         told = run.search()

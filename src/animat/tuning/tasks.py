@@ -16,7 +16,7 @@ from animat.errors import UnusableData
 from animat.evaluation.rollouts import roll_out
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
-from animat.studies.simulating import fit_as, load_timeline, one_condition, read_series, save_timeline
+from animat.studies.simulating import fit_simulators, load_timeline, one_condition, read_series, save_timeline
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
@@ -44,7 +44,7 @@ class Fit(StudyTask):
     sizes = ("culture.sessions", "culture.trials", "simulators.bins")
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        timeline = fit_as(self.study, read_series(self.study, folder))
+        timeline = fit_simulators(self.study, read_series(self.study, folder))
         if len(timeline.conditions) < 2:
             raise UnusableData(one_condition(timeline))
         save_timeline(timeline, folder / timeline_file(self.study))

@@ -1,4 +1,4 @@
-"""One picture of a film: the robot on the left; raster, response, command and return of the last seconds beside it."""
+"""One frame of a film: the robot on the left; raster, response, command and return of the last seconds on the right."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from animat.report.film.scene import Moment, Scene
 from animat.report.style import BLUE, ORANGE, RED, condition_colours
 
 WIDTH_PX, HEIGHT_PX = 880, 440
-"""Even, as encoders of films want it."""
+"""Even, as video encoders require."""
 SHOWN_S = 4.0
-"""How far back the strips go."""
+"""The time span of the strips."""
 ROBOT_PX = 360
 _PAPER, _INK, _FAINT, _LINE = "#fafaf8", "#343a40", "#868e96", "#dee2e6"
 _LEFT, _RIGHT = 478, WIDTH_PX - 14
 COMMANDS = (ORANGE, BLUE, RED)
-"""Colours of one command after the other."""
+"""Colours of the commands, in their order."""
 
 
 class Frames:
-    """Draws a scene at any time; the picture is the robot at a moment, None where it cannot be drawn."""
+    """Draws a scene at any time; `picture` gives the robot at a moment, None if it cannot be drawn."""
 
     def __init__(self, scene: Scene, picture: Callable[[int], UInt8[np.ndarray, "height width 3"] | None]) -> None:
         self._scene, self._picture = scene, picture
         self._times_s = np.array([moment.time_s for moment in scene.moments])
         self._colours = dict(zip(scene.conditions, condition_colours(["Hz"] * len(scene.conditions)), strict=True))
         rates = np.array([moment.rate_hz for moment in scene.moments if math.isfinite(moment.rate_hz)])
-        # Bursts would press all others to the ground: they are triangles at the upper edge.
+        # Bursts would squeeze all other responses, so they are triangles at the upper edge.
         self._most_hz = _round_up(max(1.0, float(np.percentile(rates, 95)))) if len(rates) else None
         self._is_some_beyond = bool(len(rates)) and float(rates.max()) > (self._most_hz or 0.0)
         self._has_room_for_all = sum(_font(14).getlength(label) + 14 for label in scene.conditions) < _LEFT - 28
@@ -41,11 +41,11 @@ class Frames:
 
     @property
     def colours(self) -> tuple[str, ...]:
-        """All that pictures have, whenever; robots aside."""
+        """All colours of the frames, except those of robots."""
         return (*self._colours.values(), *COMMANDS, _PAPER, _INK, _FAINT, _LINE, "#ffffff")
 
     def at(self, time_s: float) -> Image.Image:
-        """The picture of a time."""
+        """The frame at a time."""
         scene = self._scene
         now = max(0, int(np.searchsorted(self._times_s, time_s, "right")) - 1)
         moment = scene.moments[now]
@@ -53,7 +53,7 @@ class Frames:
         draw = ImageDraw.Draw(image)
         draw.text((14, 12), scene.title, _INK, _font(17))
         self._draw_robot(image, draw, now)
-        self._draw_words(draw, moment)
+        self._draw_captions(draw, moment)
         first = int(np.searchsorted(self._times_s, time_s - SHOWN_S))
         past = scene.moments[max(0, first - 1) : now + 1]
         top = 18
@@ -95,8 +95,8 @@ class Frames:
         robot.thumbnail(box_px, Image.Resampling.BOX)
         image.paste(robot, (14 + (box_px[0] - robot.width) // 2, 40 + (box_px[1] - robot.height) // 2))
 
-    def _draw_words(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
-        # As in ticks.csv.
+    def _draw_captions(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
+        # Iterations are counted as in ticks.csv.
         step = "warm-up" if moment.iteration < 0 else f"iteration {moment.iteration:,} (counted from 0)"
         draw.text((14, HEIGHT_PX - 48), f"{moment.agent}, episode {moment.episode}, {step}", _INK, _font(15))
         if not self._has_room_for_all:
@@ -120,7 +120,7 @@ class Frames:
 
 
 class _Strip:
-    """Something over the last seconds, the newest at the right."""
+    """A panel over the last seconds, the newest at the right."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class _Strip:
             self._draw.line((_LEFT, self._y(0.0), _RIGHT, self._y(0.0)), _LINE)
 
     def dot(self, time_s: float, value: float, colour: str) -> None:
-        """A dot, or at the upper edge a triangle for what is above it."""
+        """Draw a dot, or for a value above the upper edge a triangle at that edge."""
         if time_s < self._now_s - SHOWN_S:
             return
         x, y = self._x(time_s), self._y(value)
@@ -153,12 +153,12 @@ class _Strip:
             self._draw.circle((x, y), 3, colour)
 
     def name(self, i: int) -> None:
-        """The number of a command, in its colour."""
+        """Draw the number of a command, in its colour."""
         at = (_LEFT + 64 + 14 * i, self._top - 3)
         self._draw.text(at, f"{i + 1}", COMMANDS[i % len(COMMANDS)], _font(12), anchor="ls")
 
     def steps(self, known: Sequence[tuple[float, float]], until_s: float, colour: str) -> None:
-        """What stays as it is until the next one is known."""
+        """Draw values that each hold until the next one."""
         if not known:
             return
         points = []
@@ -185,7 +185,7 @@ class _Strip:
 
 
 def _round_up(value: float) -> float:
-    """To one digit: the end of an axis."""
+    """Round up to one digit."""
     unit = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
     return math.ceil(value / unit) * unit
 

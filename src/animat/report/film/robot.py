@@ -1,8 +1,9 @@
-"""The robot of a scene as pictures: drawn from what it observed, or, where the bodies of others move, moved again."""
+"""Pictures of a scene's robot: drawn from its observations, or, for host robots, by replaying its commands."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -12,27 +13,20 @@ from animat.robots.drawing import Picture, draw_robot
 from animat.robots.host import HostRobot
 
 MOST_EARLIER = 500
-"""Observations of which a trail is drawn."""
+"""Observations from which a trail is drawn."""
 
 
 def pictures_of(scene: Scene) -> Callable[[int], Picture | None]:
-    """The robot at each moment, by its number, asked for in their order; None where there is no picture of it."""
+    """A function that draws the robot at each moment, called with rising numbers; it returns None without a picture."""
     if isinstance(scene.robot, HostRobot):
-        return _MovedAgain(scene).picture
+        return _Replay(scene).picture
     if not hasattr(scene.robot, "draw"):
         return lambda number: None
-    kept: dict[int, Picture | None] = {}
-
-    def picture(number: int) -> Picture | None:
-        if number not in kept:
-            kept.clear()
-            kept[number] = _drawn(scene, number)
-        return kept[number]
-
-    return picture
+    # Several frames in a row show the same moment.
+    return lru_cache(1)(partial(_draw, scene))
 
 
-def _drawn(scene: Scene, number: int) -> Picture | None:
+def _draw(scene: Scene, number: int) -> Picture | None:
     now = scene.moments[number]
     if not now.observation:
         return None
@@ -45,8 +39,8 @@ def _drawn(scene: Scene, number: int) -> Picture | None:
     )
 
 
-class _MovedAgain:
-    """A body of somebody else, moved by the same commands; None from where it does not do what it did."""
+class _Replay:
+    """A host robot moved by the same commands again; without a picture from where its observations differ."""
 
     def __init__(self, scene: Scene) -> None:
         assert isinstance(scene.robot, HostRobot)
@@ -54,24 +48,24 @@ class _MovedAgain:
         self._runner = HostRunner(scene.robot, np.random.default_rng(scene.runner_seed), with_pictures=True)
         self._episode: int | None = None
         self._is_same = True
-        self._shown: Picture | None = None
+        self._picture: Picture | None = None
 
     def picture(self, number: int) -> Picture | None:
         if self._next > number:
-            return self._shown
+            return self._picture
         while self._next <= number:
-            self._go_on(self._next)
+            self._move(self._next)
             self._next += 1
-        self._shown = self._runner.picture() if self._is_same else None
-        return self._shown
+        self._picture = self._runner.picture() if self._is_same else None
+        return self._picture
 
-    def _go_on(self, number: int) -> None:
+    def _move(self, number: int) -> None:
         moment = self._scene.moments[number]
         if moment.episode != self._episode:
             self._episode, self._is_same = moment.episode, True
-            seen = self._runner.reset(moment.turn)
+            observation = self._runner.reset(moment.turn)
         elif moment.command is None or not self._is_same:
             return
         else:
-            seen = self._runner.step(moment.command).observation
-        self._is_same = not moment.observation or np.array_equal(seen, moment.observation)
+            observation = self._runner.step(moment.command).observation
+        self._is_same = not moment.observation or np.array_equal(observation, moment.observation)

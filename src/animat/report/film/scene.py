@@ -1,4 +1,4 @@
-"""What a film shows: moments of a robot that is moved by neurons, and their spikes where these were seen."""
+"""The data of a film: moments of a robot that is moved by neurons, and their spikes if recorded."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from animat.robots.base import Robot
 
 @dataclass(frozen=True)
 class Moment:
-    """What is known from one time on.
+    """The state from one time on.
 
     Attributes:
-        time_s: from when.
-        agent: who acts.
-        episode: number of its episode.
+        time_s: when the state begins.
+        agent: that acts.
+        episode: number of the episode.
         iteration: of the robot; -1 before it moves.
-        turn: the robot starts its episodes of the same number alike.
-        observation: in the robot's units; empty where it was not written down.
-        command: that led here; None where the robot was not moved.
-        total: sum of rewards of the episode so far.
-        delivered: label of the condition that the neurons got; "" for none.
-        rate_hz: what they answered; NaN where nobody asked.
-        ended: whether the episode did.
+        turn: number that decides how the episode starts.
+        observation: in the robot's units; empty if it was not recorded.
+        command: that led to this state; None if the robot was not moved.
+        total: sum of the episode's rewards so far.
+        delivered: label of the condition that was delivered; "" for none.
+        rate_hz: the response; NaN if nothing was read.
+        ended: whether the episode has ended.
     """
 
     time_s: float
@@ -47,19 +47,19 @@ _NO_TIMES, _NO_CHANNELS = np.empty(0), np.empty(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A stretch of time with all that is drawn of it.
+    """A stretch of time with everything that is drawn.
 
     Attributes:
-        title: what it is.
+        title: of the film.
         robot: that is moved.
-        conditions: labels of what can be delivered, in their order.
-        moments: in the order of time; those of the first episode from its start on, so that a body can be moved again.
-        start_s, stop_s: of what is shown.
-        spike_times_s, spike_channels: that were seen, in the order of time.
+        conditions: labels of the conditions, in their order.
+        moments: in order of time; those of the first episode from its start, so that a host robot can be replayed.
+        start_s, stop_s: of the film.
+        spike_times_s, spike_channels: recorded spikes, in order of time.
         pulse_times_s: of all stimuli.
-        n_channels: of the array; 0: there was none, and responses alone are shown.
-        lost_bytes: of a session's log, from where it is torn or damaged on; nothing of them is shown.
-        runner_seed: of the runner that moved a robot on the host (`animat.closed_loop.runner.HostRunner`).
+        n_channels: of the array; 0 without an array, when only responses are shown.
+        lost_bytes: bytes at the end of a session's log that are torn or damaged and not shown.
+        runner_seed: of the runner that moved a host robot (`animat.closed_loop.runner.HostRunner`).
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""The scene of a closed-loop session, from its log: whole, or as far as a killed one came."""
+"""The scene of a closed-loop session, from its log; a killed session is shown as far as it got."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from animat.report.film.scene import Moment, Scene
 from animat.stimulation.stimulus import NOTHING
 
 USUAL_S = 60.0
-"""That are shown where nothing else is asked for."""
+"""The length of a film by default."""
 
 
 def is_session(path: Path) -> bool:
@@ -29,34 +29,35 @@ def is_session(path: Path) -> bool:
 
 
 def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] | None = None) -> Scene:
-    """What a session's log has of a span.
+    """The scene of a span of a session, from its log.
 
     Args:
-        path: of its folder or its log.
-        span_s: on the session's clock; None: a minute from just before the robot moves first.
+        path: of the session's folder or log.
+        span_s: on the session's clock; None: a minute from just before the robot first moves.
 
     Raises:
         InvalidFile: if there is no session, or its log cannot be read.
-        InvalidArgument: for a span in which nothing happened, or a robot that is not known here.
+        InvalidArgument: for a span in which nothing happened, or an unknown robot.
         UnusableData: for a session without episodes.
     """
     session = read_session(path)
     file = session.folder / LOG_FILE
-    header, words = read_header(file, session.log.header), session.log.header
+    header, header_data = read_header(file, session.log.header), session.log.header
     from_s, to_s = span_s or (0.0, USUAL_S)
     is_found = span_s is not None
     reading = _Reading(header.conditions)
     with expect_session_log(file):
-        reading.window_s = float(words["loop"]["window_ms"][1]) * 1e-3
-        robot_data, seed = words["loop"] | {"robot": words["loop"]["robot"]}, int(words["seed"])
+        reading.window_s = float(header_data["loop"]["window_ms"][1]) * 1e-3
+        # A missing "robot" is an error here, not below.
+        robot_data, seed = header_data["loop"] | {"robot": header_data["loop"]["robot"]}, int(header_data["seed"])
         for record in session.log.records:
             is_past = is_found and record.fields["kind"] == "seen" and record.fields.get("start_s", 0.0) >= to_s
-            # In a pause before the first trial nothing moves yet: that trial tells where the robot stands.
+            # In a pause before the first trial nothing moves yet; the robot's state is known from that trial.
             if is_past and reading.moments:
                 break
             reading.add(record.fields)
             if not is_found and reading.moments:
-                # While it does not move, the film begins later and later.
+                # The start of the film is postponed until the robot moves.
                 is_found = reading.moments[-1].iteration >= 0
                 from_s = max(0.0, reading.moments[-1].time_s - LOOK_BACK_S)
                 to_s = from_s + USUAL_S
@@ -71,13 +72,13 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
         )
     moments = reading.moments
     first = max((each.episode for each in moments if each.time_s <= from_s), default=moments[0].episode)
-    # Of a session without any spike, too.
-    seen = [(np.empty(0), np.empty(0, np.int64)), *reading.spikes]
-    times_s, channels = (np.concatenate(each) for each in zip(*seen, strict=True))
+    # The empty arrays are for a session without spikes.
+    spikes = [(np.empty(0), np.empty(0, np.int64)), *reading.spikes]
+    times_s, channels = (np.concatenate(each) for each in zip(*spikes, strict=True))
     order = np.argsort(times_s, kind="stable")
     robot = robot_of(robot_data)
     return Scene(
-        title=f"{robot.name} on the {words.get('culture', '')} culture",
+        title=f"{robot.name} on the {header_data.get('culture', '')} culture",
         robot=robot,
         conditions=header.conditions,
         moments=tuple(each for each in moments if each.episode >= first),
@@ -93,7 +94,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
 
 
 LOOK_BACK_S = 5.0
-"""Before a span, of which spikes and pulses are in its first pictures."""
+"""Time before a span whose spikes and pulses are in its first frames."""
 
 
 class _Reading:
@@ -120,7 +121,7 @@ class _Reading:
         is_rest = NOTHING in tick["patterns"]
         self.pulses_s += () if is_rest else tick["pulse_time_s"]
         if before is None or before.episode != episode:
-            # Of a session that is broken off before it moves nothing more is known than where it starts.
+            # If a session ends before the robot moves, only its start is known.
             start = Moment(tick["read_after_s"], agent, episode, -1, self._turns[agent], (), None, 0.0, "", math.nan)
             before = replace(start, observation=self._starts.get(episode, ()))
             self._turns[agent] += 1

@@ -1,4 +1,4 @@
-"""The scene of policies on a neuron simulator: an episode of each, one after the other, in the time it would take."""
+"""The scene of policies on a neuron simulator: one episode of each in sequence, in the time it would take."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import ShuffledDelivery
 
 _PAUSE_S = 1.0
-"""Between episodes, in which the last picture stays."""
+"""Between episodes, during which the last frame stays."""
 _WITHOUT_NEURONS_S = 0.02
-"""An iteration of a policy that moves its robot directly, which takes no time that is known: as in Gymnasium."""
-
+"""An iteration of a policy that moves its robot directly, whose duration is unknown: as in Gymnasium."""
 
 _ALIKE = ("robot", "mapping", "readouts", "conditions", "commands", "delivery", "percentiles")
 
@@ -38,13 +37,13 @@ def scene_of_policies(
     span_s: tuple[float, float] | None = None,
     seed: int = 1,
 ) -> Scene:
-    """Run an episode of each policy, taking the most probable actions, until the span is over.
+    """Run an episode of each policy with the most probable actions, until the span is over.
 
     Args:
-        policies: by name, of one robot, mapping and set of conditions.
+        policies: by name; all with the same robot, mapping and conditions.
         timeline: the culture's simulators; None for policies without neurons.
-        at_min: minute whose newest recording answers; None: the last recording.
-        span_s: what is shown; None: the first minute.
+        at_min: minute whose newest recording is used; None: the last recording.
+        span_s: start and end of the film; None: the first minute.
         seed: decides every random draw.
 
     Raises:
@@ -58,7 +57,7 @@ def scene_of_policies(
     environment: Environment[Any] = WithoutNeurons(robot, first.commands)
     if first.mapping is not None and timeline is not None:
         if timeline.conditions != first.conditions:
-            raise InvalidArgument("recordings: expected the conditions that the policies pick from, got others")
+            raise InvalidArgument("recordings: expected the conditions that the policies choose from, got others")
         row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
         fixed = timeline.with_first_percentiles() if first.percentiles == "first" else timeline
         simulator = fixed.at(float(timeline.start_min[row]))
@@ -66,23 +65,23 @@ def scene_of_policies(
         environment = ShuffledDelivery(environment) if first.delivery == "shuffled" else environment
     respond = jax.jit(environment.respond)
     state = environment.reset(jax.random.key(seed))
-    rng, of_runner = np.random.default_rng([seed, 1]), (seed, 22)
-    runs = HostRunner if isinstance(robot, HostRobot) else RobotRunner
-    runner: Runner = runs(robot, np.random.default_rng(of_runner))
+    rng, runner_seed = np.random.default_rng([seed, 1]), (seed, 22)
+    runner_type = HostRunner if isinstance(robot, HostRobot) else RobotRunner
+    runner: Runner = runner_type(robot, np.random.default_rng(runner_seed))
     time_s, moments = 0.0, list[Moment]()
     for episode, (name, policy) in enumerate(policies.items()):
         if time_s >= to_s:
             break
-        seen, neurons, total = runner.reset(episode), state.neurons, 0.0
-        moments.append(Moment(time_s, name, episode, -1, episode, tuple(seen.tolist()), None, 0.0, "", math.nan))
+        observation, neurons, total = runner.reset(episode), state.neurons, 0.0
+        moments.append(Moment(time_s, name, episode, -1, episode, tuple(observation.tolist()), None, 0.0, "", math.nan))
         for iteration in range(robot.episode_limit):
-            given = np.concatenate([seen, np.asarray(neurons)]) if policy.neural_observation else seen
+            observed = np.concatenate([observation, np.asarray(neurons)]) if policy.neural_observation else observation
             uniforms = jnp.asarray(rng.random(environment.noise_size, np.float32))
-            action = jnp.asarray(policy.act_greedily(given))
-            delivered, answer, command = respond(uniforms, state._replace(neurons=neurons), action, simulator)
-            neurons, u = answer.history, np.asarray(command, np.float64)
+            action = jnp.asarray(policy.act_greedily(observed))
+            delivered, response, command = respond(uniforms, state._replace(neurons=neurons), action, simulator)
+            neurons, u = response.history, np.asarray(command, np.float64)
             moved = runner.step(u)
-            seen, total = moved.observation, total + moved.reward
+            observation, total = moved.observation, total + moved.reward
             truncated, label, period_s = iteration + 1 >= robot.episode_limit, "", _WITHOUT_NEURONS_S
             if simulator is not None:
                 condition = first.conditions[int(delivered)]
@@ -90,11 +89,11 @@ def scene_of_policies(
                 label, period_s = condition.label, pulses / (condition.frequencies_hz or (1 / _WITHOUT_NEURONS_S,))[0]
             time_s += period_s
             ended = moved.terminated or moved.truncated or truncated
-            rate_hz = float(np.mean(answer.rate_hz))
-            led_here = tuple(u.tolist()) if u.ndim else float(u)
-            at = tuple(seen.tolist())
+            rate_hz = float(np.mean(response.rate_hz))
+            commands = tuple(u.tolist()) if u.ndim else float(u)
+            at = tuple(observation.tolist())
             moments.append(
-                Moment(time_s, name, episode, iteration, episode, at, led_here, total, label, rate_hz, ended)
+                Moment(time_s, name, episode, iteration, episode, at, commands, total, label, rate_hz, ended)
             )
             if ended or time_s >= to_s:
                 break
@@ -105,4 +104,4 @@ def scene_of_policies(
     labels = tuple(condition.label for condition in first.conditions)
     through = "on the simulator" if simulator is not None else "without neurons"
     kept = tuple(each for each in moments if each.episode >= shown)
-    return Scene(f"{robot.name} {through}", robot, labels, kept, from_s, min(time_s, to_s), runner_seed=of_runner)
+    return Scene(f"{robot.name} {through}", robot, labels, kept, from_s, min(time_s, to_s), runner_seed=runner_seed)

@@ -20,18 +20,18 @@ from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAI
 from animat.writing import atomic_write
 
 FRAMES_PER_S = {".mp4": 25, ".gif": 10}
-"""By the kind of film."""
+"""By the film's suffix."""
 _COLOURS = 96
 """Of a GIF."""
 ROBOTS = (ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL)
-"""Colours of robots, which may come later than the first picture."""
+"""Colours of robots, which need not be in the first frame."""
 
 
 def check_film(path: str | os.PathLike[str]) -> None:
-    """Refuse a film that cannot be written, before any work.
+    """Check, before any work, that a film can be written.
 
     Raises:
-        InvalidArgument: for a name that ends otherwise, or where an MP4 needs what is not installed.
+        InvalidArgument: for another suffix, or if a package that MP4 needs is not installed.
     """
     path = Path(path)
     if path.suffix.lower() not in FRAMES_PER_S:
@@ -48,7 +48,7 @@ def check_film(path: str | os.PathLike[str]) -> None:
 
 
 def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-    """Film a scene in real time, as .mp4 or .gif; the file is complete or absent.
+    """Film a scene in real time, as .mp4 or .gif; the file is written atomically.
 
     Raises:
         InvalidArgument: as `check_film`.
@@ -76,7 +76,7 @@ def _pictures(scene: Scene, frames: Frames, frames_per_s: int, progress: Progres
 
 def _write_gif(pictures: Iterator[Image.Image], colours: Sequence[str], path: Path) -> None:
     first = next(pictures)
-    # One palette for all, without dithering: what stands still costs nothing then.
+    # One palette for all frames, without dithering, so that unchanged pixels cost nothing.
     every = Image.new("RGB", (first.width, first.height + 20 * (len(colours) + len(ROBOTS))))
     every.paste(first)
     swatches: list[str | tuple[int, int, int]] = [*colours, *ROBOTS]
@@ -84,7 +84,7 @@ def _write_gif(pictures: Iterator[Image.Image], colours: Sequence[str], path: Pa
         row = first.height + 20 * number
         every.paste(colour, (0, row, first.width, row + 20))
     palette = every.quantize(_COLOURS, Image.Quantize.MEDIANCUT)
-    # One after the other: all of a long film would not fit into memory.
+    # One at a time, as all frames of a long film would not fit into memory.
     indexed = (each.quantize(palette=palette, dither=Image.Dither.NONE) for each in chain([first], pictures))
     start = next(indexed)
     ms = 1000 // FRAMES_PER_S[".gif"]
@@ -94,22 +94,22 @@ def _write_gif(pictures: Iterator[Image.Image], colours: Sequence[str], path: Pa
 def _write_mp4(pictures: Iterator[Image.Image], path: Path) -> None:
     from imageio_ffmpeg import get_ffmpeg_exe
 
-    # Its own writer forks, which a process with JAX's threads must not.
-    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH_PX}x{HEIGHT_PX}", "-r", str(FRAMES_PER_S[".mp4"])]
-    made = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path.absolute())]
-    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *given, "-i", "-", *made]
+    # imageio's own writer forks, which a process with JAX's threads must not do.
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH_PX}x{HEIGHT_PX}", "-r", str(FRAMES_PER_S[".mp4"])]
+    output = ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path.absolute())]
+    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, "-i", "-", *output]
     pipe = subprocess.PIPE
-    # A session of its own: Ctrl-C is ours alone.
+    # In a new session, so that Ctrl-C does not reach ffmpeg.
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True) as ffmpeg:
         assert ffmpeg.stdin is not None
         try:
-            # What it says when it ends before its time is in the error below.
+            # If ffmpeg ends early, its message is in the error below.
             with suppress(BrokenPipeError):
                 for picture in pictures:
                     ffmpeg.stdin.write(picture.tobytes())
-            _, said = ffmpeg.communicate()
+            _, message = ffmpeg.communicate()
         except BaseException:
             ffmpeg.kill()
             raise
     if ffmpeg.returncode:
-        raise InvalidFile(f"{path}: cannot be written: {' '.join(said.decode(errors='replace').split())}")
+        raise InvalidFile(f"{path}: cannot be written: {' '.join(message.decode(errors='replace').split())}")

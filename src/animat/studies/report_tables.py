@@ -1,4 +1,4 @@
-"""The tables of the report, from those of the study: which columns and rows are shown, and what is said of them."""
+"""The tables of the report: which columns and rows of the study's results they show, and their notes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from typing import Any
 
 from animat.neurons.fidelity import LARGEST_LOSS, Fidelity
 from animat.report.html import Columns, Table, cell, columns_of, table_of, with_error
-from animat.report.results import BesideHeuristic, BesideReflex, ComparedReturns, ControlReturns, Score, StudyOptimum
+from animat.report.results import (
+    ComparedReturns,
+    ControlReturns,
+    HeuristicComparison,
+    ReflexComparison,
+    Score,
+    StudyOptimum,
+)
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
-from animat.studies.optima import optima_of_all, rough_kinds
-from animat.studies.specification import Study, named_mapping
+from animat.studies.optima import read_complete_optima, rough_kinds
+from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
 _MOST_LABELS = 12
@@ -20,14 +27,14 @@ _MOST_ROWS = 40
 
 _SCORE_NOTE = (
     "Optimum: the optimal return of any controller with the same neurons, mapping and robot, by dynamic "
-    "programming. Score: (mean − random) / (optimum − random); 0 is as good as random actions, 1 the optimum, which "
-    "chance can pass. A control, whose delivery is drawn at random, has no optimum: whatever it chooses is as good as "
-    "random."
+    "programming. Score: (mean − random) / (optimum − random); 0 is as good as random actions, 1 is the optimum, which "
+    "can be exceeded by chance. A control, whose delivered stimuli are drawn at random, has no optimum: whatever it "
+    "chooses is as good as random."
 )
 
 
-def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
-    """Tests and outcomes, beside the paper's p where it printed one."""
+def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
+    """Tests and outcomes, with the paper's p where it printed one."""
     printed = any(row.paper_p is not None for row in rows)
     columns: Columns = [
         *columns_of("comparison", "robot"),
@@ -46,7 +53,7 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
         "Comparisons",
         rows,
         columns,
-        note="The paper prints p and no U; U is the one that gives this p. Highlighted: not as in the paper."
+        note="The paper prints p but not U; U is the value that gives this p. Highlighted: not as in the paper."
         if printed
         else "",
         beside="tables/comparisons.csv",
@@ -54,8 +61,8 @@ def comparisons_shown(rows: Sequence[ComparedReturns]) -> Table:
     )
 
 
-def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
-    """The same comparisons as mean returns, optima and scores."""
+def returns_table(rows: Sequence[ComparedReturns]) -> Table:
+    """The comparisons as mean returns, optima and scores."""
     return table_of(
         "The same comparisons as returns",
         rows,
@@ -66,13 +73,13 @@ def returns_shown(rows: Sequence[ComparedReturns]) -> Table:
             ("optimum second", _pair("optimum_second", "optimum_error_second")),
             *columns_of("score_first", "score_second"),
         ],
-        note=_SCORE_NOTE + " ±: how far it may lie from there, by the grid, or down to its controller's return.",
+        note=_SCORE_NOTE + " ±: its possible error, due to the grid, or down to the return of its controller.",
         beside="tables/comparisons.csv",
     )
 
 
-def scores_shown(rows: Sequence[Score]) -> Table:
-    """Every arm at every minute it was evaluated at."""
+def scores_table(rows: Sequence[Score]) -> Table:
+    """Every arm at every minute at which it was evaluated."""
     return table_of(
         "Every arm",
         rows,
@@ -91,11 +98,11 @@ def scores_shown(rows: Sequence[Score]) -> Table:
     )
 
 
-def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
-    """The optimal returns as brackets, with their intervals; what was left out of them is said."""
+def optima_table(optima: Sequence[StudyOptimum]) -> Table:
+    """The optimal returns as brackets, with their intervals and the conditions that were left out."""
     columns: Columns = [
         ("robot", "robot"),
-        ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
+        ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
         ("at (min)", "at_min"),
         ("optimum ± grid", _pair("best_return", "grid_error")),
         ("95 % interval", lambda row: None if row.low_95 is None else _ends(row.low_95, row.high_95)),
@@ -109,31 +116,31 @@ def optima_shown(optima: Sequence[StudyOptimum]) -> Table:
         columns.append(("left out (responses)", "left_out"))
         left_out = (
             f" {len(without)} of {len(optima)} optima leave out conditions with fewer than {FEW_SAMPLES} responses, "
-            "which would promise too much: no score is against these, as policies act on all conditions."
+            "which would raise them too much. These are not used for scores, as policies act on all conditions."
         )
     return table_of(
         "Optimal returns",
         optima,
         columns,
-        note="± grid: how far the value moved from a grid with 3/4 of the steps. Interval: how well the responses "
-        "determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
-        "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its "
-        "standard error: a return that is achievable. The optimal return lies between the two; scores keep to "
-        "the value, the upper end. Highlighted: they part by more than 3 standard errors and the grid's "
-        "error. Without clock: the same controller if it does not know the time left, as policies do not. On "
-        "a rough grid at every recording: optima/." + left_out,
+        note="± grid: by how much the value differs from that on a grid with 3/4 of the steps. Interval: how well the "
+        "responses determine the value, bootstrapped 39 times; for threshold mappings, where an arm is evaluated. "
+        "Run: the mean return of the controller that takes the best actions, on the robot itself, ± its standard "
+        "error: a return that is achievable. The optimal return lies between the two; scores use the value, the upper "
+        "end. Highlighted: the two differ by more than 3 standard errors and the grid's error. Without clock: the same "
+        "controller without knowledge of the time left, which policies do not have either. Optima at every recording, "
+        "on a rough grid, are in optima/." + left_out,
         beside="tables/optima.csv",
         marked=tuple(i for i, row in enumerate(optima) if row.findings()),
     )
 
 
-def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
-    """How often each condition passes the median in every recording, in the data and in what the simulator kept."""
+def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
+    """How often each condition exceeds the median in every recording, in the data and in the simulator."""
     kinds = rough_kinds(study)[:1]
     optima = {
         spec.name: {
             optimum.at_min: optimum.best_return
-            for optimum in optima_of_all(folder, spec.name, "over-time")
+            for optimum in read_complete_optima(folder, spec.name, "over-time")
             if (optimum.mapping, optimum.percentiles) == kinds[0].kind
         }
         for spec in study.robots
@@ -147,21 +154,22 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
             f"{a:.2f}\u00a0→\u00a0{b:.2f}" if abs(a - b) > LARGEST_LOSS else a
             for a, b in zip(in_data, in_simulator, strict=True)
         ]
-        apart = (max(each) - min(each) for each in (in_data, in_simulator))
-        rows.append((at_min, *shares[:_MOST_LABELS], *apart, *(by_minute.get(at_min) for by_minute in optima.values())))
+        ranges = (max(each) - min(each) for each in (in_data, in_simulator))
+        optimum_of_each = (by_minute.get(at_min) for by_minute in optima.values())
+        rows.append((at_min, *shares[:_MOST_LABELS], *ranges, *optimum_of_each))
         if of.largest_loss > LARGEST_LOSS:
             marked.append(i)
     note = (
-        "P(x ≥ P50) of each condition: how often it answers above the median of all. A controller can only work with "
-        "the difference between them, and of that with what the simulator keeps of the responses. Highlighted, with "
-        f"an arrow: binning moves a share by more than {LARGEST_LOSS:g}, and what the simulator, optima and policies "
-        "have is not what the culture would give."
+        "P(x ≥ P50) of each condition: how often its responses are above the median of all. A controller can only use "
+        "the difference between conditions, as far as the simulator keeps it. Highlighted, with an arrow: binning "
+        f"moves a share by more than {LARGEST_LOSS:g}, so the simulator, the optima and the policies differ from what "
+        "the culture would allow."
     )
     if kinds:
-        mapping = named_mapping(*kinds[0].kind)
+        mapping = mapping_label(*kinds[0].kind)
         note += f" Optimum: the optimal return with {mapping} on a rough grid."
     if len(labels) > _MOST_LABELS:
-        note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all."
+        note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all of them."
     return Table(
         "Controllability of every recording",
         (
@@ -178,24 +186,24 @@ def controllability_shown(study: Study, folder: Path, kept: Mapping[float, Fidel
     )
 
 
-def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
-    """Trained policies and the controls of their mapping, at every recording that anything is evaluated at."""
+def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
+    """Trained policies and the controls of their mapping, at every recording at which anything is evaluated."""
     return table_of(
         "Controls",
         rows,
         [
             ("robot", "robot"),
-            ("mapping", lambda row: named_mapping(row.mapping, row.percentiles)),
+            ("mapping", lambda row: mapping_label(row.mapping, row.percentiles)),
             ("at (min)", lambda row: None if row.mapping == "none" else row.at_min),
             *columns_of("control", "actors"),
             ("mean return", _pair("mean_return", "standard_error")),
             *columns_of("random", "optimum"),
             ("score", "normalised_score"),
         ],
-        note="Trained policies stand beside their controls, as in the figures above. ±: standard error over actors, of "
-        "one actor over its episodes. Optima are those of the culture as it answers, also beside silent and shuffled."
+        note="Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; "
+        "for one actor, over its episodes. Optima are those with the culture, also in the rows of silent and shuffled."
         + (
-            " Without neurons, where any command can be chosen, none is held constant."
+            " Without neurons, where any command can be chosen, there is no constant control."
             if any(row.mapping == "none" for row in rows)
             and any(spec.robot().baseline_commands is None for spec in study.robots)
             else ""
@@ -205,10 +213,10 @@ def controls_shown(study: Study, rows: Sequence[ControlReturns]) -> Table:
     )
 
 
-def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
-    """Trained policies beside the heuristic policy, episode by episode."""
+def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
+    """Trained policies and the heuristic policy, compared over episodes."""
     return table_of(
-        "Policies beside the heuristic policy",
+        "Policies and the heuristic policy",
         rows,
         [
             *columns_of("robot", "arm"),
@@ -219,16 +227,16 @@ def heuristic_shown(rows: Sequence[BesideHeuristic]) -> Table:
             ("the policies", "outcome"),
         ],
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
-        "return is larger, ties half. Highlighted: learning brought no more than the heuristic policy did.",
+        "return is larger, ties half. Highlighted: learning did no better than the heuristic policy.",
         beside="tables/heuristic.csv",
         marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
     )
 
 
-def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
-    """Trained policies beside the best coupling: context gap and context score."""
+def reflexes_table(rows: Sequence[ReflexComparison]) -> Table:
+    """Trained policies and the best coupling: context gap and context score."""
     return table_of(
-        "Policies beside the best reflex",
+        "Policies and the best reflex",
         rows,
         [
             *columns_of("robot", "arm"),
@@ -238,7 +246,7 @@ def reflexes_shown(rows: Sequence[BesideReflex]) -> Table:
             ("context gap", _interval("gap", "gap_low_95", "gap_high_95")),
             ("context score", _interval("score", "score_low_95", "score_high_95")),
         ],
-        note="Best coupling: a fixed rule from what is sensed to a stimulus, without memory and without a goal, found "
+        note="Best coupling: a fixed rule from sensed values to a stimulus, without memory and without a goal, found "
         "by a search. Context gap: (optimum − coupling) / (optimum − random), what such a rule leaves undone. Context "
         "score: (policies − coupling) / (optimum − coupling), where the task needs more. With 95 % intervals.",
         beside="tables/reflexes.csv",
@@ -250,11 +258,11 @@ def _pair(value: str, error: str) -> Callable[[Any], str | None]:
 
 
 def _interval(value: str, low: str, high: str) -> Callable[[Any], str]:
-    def shown(row: Any) -> str:
+    def text(row: Any) -> str:
         ends = getattr(row, low), getattr(row, high)
         return cell(getattr(row, value)) + ("" if None in ends else f"\u00a0{_ends(*ends)}")
 
-    return shown
+    return text
 
 
 def _ends(low: float, high: float) -> str:
@@ -266,6 +274,6 @@ def _printed(row: ComparedReturns) -> str | None:
 
 
 def _outcome(row: ComparedReturns) -> str:
-    """The outcome by the paper's p; where correction takes it back, it says so."""
-    taken_back = row.outcome in (FIRST, SECOND) and row.p_holm >= LEVEL
-    return f"{row.outcome}, not after correction" if taken_back else row.outcome
+    """The outcome by the paper's p, with a remark if it does not hold after correction."""
+    is_lost = row.outcome in (FIRST, SECOND) and row.p_holm >= LEVEL
+    return f"{row.outcome}, not after correction" if is_lost else row.outcome
