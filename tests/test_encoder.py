@@ -17,7 +17,7 @@ from animat.coding.encoder import Dealer, Encoder
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.reading import read_recording
-from animat.responses.condition import Condition, other_stimulus
+from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.conditions import All, ByBoth, ByElectrode, ByFrequency, ByInterval, ByPattern, conditions_named
 from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
@@ -108,11 +108,11 @@ def test_products_are_the_combinations_that_occur() -> None:
 def test_conditions_of_before_are_equal_and_tell_nothing_of_their_stimuli() -> None:
     (known,) = ByPattern((1,)).assign(table([5], [[3, 4, 5]])).conditions
     before = Condition(label="pattern 1", value=1.0, unit="")
-    assert before == known and other_stimulus([before], [known]) is None
+    assert before == known and stimulus_mismatch([before], [known]) is None
     assert Condition("5 Hz", 5.0, "Hz").frequencies_hz == (5.0,)
     (moved,) = ByElectrode(((1, 2),)).assign(table([5], [[1, 2]])).conditions
     other = Condition("pattern 1", 1.0, "", (5.0,), moved.electrodes)
-    assert other_stimulus([known], [other]) == (
+    assert stimulus_mismatch([known], [other]) == (
         "expected pattern 1 at 5 Hz on the electrodes 3+4+5, got pattern 1 at 5 Hz on the electrodes 1+2"
     )
 
@@ -125,7 +125,7 @@ def test_a_condition_met_at_other_frequencies_too_is_no_other(
     one_hz: tuple[float, ...], other_hz: tuple[float, ...], is_other: bool
 ) -> None:
     one, other = (Condition("pattern 0", 0.0, "", at_hz, ((1, 2),)) for at_hz in (one_hz, other_hz))
-    assert (other_stimulus([one], [other]) is not None) is is_other
+    assert (stimulus_mismatch([one], [other]) is not None) is is_other
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_a_loop_over_patterns_is_read_as_any_recording_of_patterns(
         responses = extract_responses(read_recording(session.recording_file), by, loop.window_ms)
         assert responses.condition.tolist() == [tick.delivered for tick in session.ticks]
         np.testing.assert_array_equal(responses.rate_hz, [tick.rate_hz for tick in session.ticks])
-        assert other_stimulus(loop.conditions, responses.conditions) is None
+        assert stimulus_mismatch(loop.conditions, responses.conditions) is None
         assert all(c.only_last is only_last for c in responses.conditions)
     assert len({tick.delivered for tick in session.ticks}) == 3
 

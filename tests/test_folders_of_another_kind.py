@@ -10,8 +10,8 @@ from animat.cli import main
 from animat.closed_loop.gathering import LOG_FILE as SESSION
 from animat.cultures.series import SELECTION_FILE, STATE_FILE
 from animat.errors import Mismatch
+from animat.folder_kinds import MARKERS, Kind, expect_no_other
 from animat.live.plan import LOG_FILE as LIVE
-from animat.marks import MARKS, Kind, expect_no_other
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
@@ -83,4 +83,4 @@ def test_ones_own_folder_an_empty_one_and_files_beside_are_taken(kind: Kind, tmp
 
 
 def test_every_kind_is_tried() -> None:
-    assert {kind for kind, *_ in OTHERS} == set(MARKS)
+    assert {kind for kind, *_ in OTHERS} == set(MARKERS)

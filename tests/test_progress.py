@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from animat.progress import Bar, InTurn, Part, Phase, Speed, in_phase
+from animat.progress import Bar, EqualPhases, Part, Phase, Speed, in_phase
 
 SCRIPT = """
 from animat.progress import Bar
@@ -187,7 +187,7 @@ def test_phases_of_a_part_never_go_back() -> None:
         def update(self, done: float, total: float, note: str = "") -> None:
             seen.append(done / total)
 
-    whole = InTurn(Seen(), 4)
+    whole = EqualPhases(Seen(), 4)
     for done in (0, 5, 10):
         whole.update(done, 10)
     # Of a phase that tells nothing nothing is added.

@@ -34,8 +34,8 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.evaluation.verdict import Beside
+from animat.neurons.history_tracker import HistoryState
 from animat.neurons.kinds import Kind
-from animat.neurons.remembering import Remembered
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
@@ -287,7 +287,7 @@ def test_what_policies_were_answered_is_as_the_log_and_the_adaptive_median_have_
             commands.append(float(mapping.command(np.float32(tick.rate_hz), thresholds.percentiles())))
         if not tick.is_burst:
             # Two pulses a trial: neurons remember nothing.
-            thresholds.add(tick.delivered, Remembered(), np.array(tick.rate_hz))
+            thresholds.add(tick.delivered, HistoryState(), np.array(tick.rate_hz))
     found = answered(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])

@@ -84,7 +84,7 @@ def pynwb_importable() -> Iterator[None]:
                     os.environ[name] = value
 
 
-def kept_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` that keeps what it compiles beside the source or in the user's cache.
 
     Where neither can be written (a package of the system's, no home), each process compiles anew, instead of failing.

@@ -25,7 +25,7 @@ _LONGEST_IMPORT_S = 10.0
 
 
 @contextmanager
-def heard_everywhere() -> Iterator[None]:
+def interruptible() -> Iterator[None]:
     """Let Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt, a moment later where Python would drop it.
 
     What is raised in a callback of the garbage collector (JAX has one) or in a finaliser is told to a hook, and Python

@@ -70,7 +70,7 @@ def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
     return told | {"fingerprint": fingerprint_of(told)}
 
 
-def description_in(path: Path, what: str) -> dict[str, Any] | None:
+def read_description(path: Path, what: str) -> dict[str, Any] | None:
     """What a file of JSON says of the folder that it lies in, with its fingerprint; None if there is none.
 
     What the folder holds, such as a `study`, is for the message of an InvalidFile, if it cannot be read.
@@ -85,7 +85,7 @@ def description_in(path: Path, what: str) -> dict[str, Any] | None:
     return found
 
 
-def of_another(folder: Path, what: str, difference: str) -> Mismatch:
+def folder_mismatch(folder: Path, what: str, difference: str) -> Mismatch:
     """The error of a folder that holds another study or training than was asked for."""
     return Mismatch(
         f"{folder}: expected a folder of this {what}, got one of another ({difference}); give another folder, or "

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from animat.coding.decoder import decoded, expect_fit, expect_one_command
 from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
-from animat.neurons.history import AT_FIRST
+from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import Answer, NeuronSimulator
 from animat.robots.base import Quantity, Robot
 
@@ -118,7 +118,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         return State(
             self.robot.reset(key),
             jnp.int32(0),
-            jnp.array(AT_FIRST, jnp.float32),
+            jnp.array(INITIAL_HISTORY, jnp.float32),
             jnp.float32(0.0),
             Ended(jnp.bool_(False), jnp.bool_(False)),
             {"delivered": delivered, "rate_hz": rest, "command": rest},

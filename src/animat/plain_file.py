@@ -49,7 +49,7 @@ def is_folder(path: Path) -> bool:
         return False
 
 
-def is_nothing(path: Path) -> bool:
+def is_absent(path: Path) -> bool:
     """Whether no file or folder has this name; it is no error where the system cannot have such a name."""
     try:
         return not path.exists()

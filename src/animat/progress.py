@@ -54,7 +54,7 @@ class Part:
         self._whole.update(self._before + self._units * done / total, self._total, note or self._note)
 
 
-class InTurn:
+class EqualPhases:
     """Work in so many phases as one progress that never goes back: each phase is an equal part of the whole."""
 
     def __init__(self, whole: Progress, phases: int) -> None:
@@ -75,7 +75,7 @@ class InTurn:
 def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: str = "") -> Progress:
     """The progress of another phase of the work, whose length says nothing about that of the others.
 
-    A `Bar` shows each phase by itself, one below the other, and `InTurn` lets each be a part of the whole; any other
+    A `Bar` shows each phase by itself, one below the other, and `EqualPhases` lets each be a part of the whole; any other
     progress is told the phases one after the other.
 
     Args:
@@ -86,7 +86,7 @@ def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: s
     """
     if isinstance(progress, Bar):
         progress.begin(title, amount, unit)
-    elif isinstance(progress, InTurn):
+    elif isinstance(progress, EqualPhases):
         progress.begin()
     return Silent() if progress is None else progress
 
@@ -170,15 +170,15 @@ class Phase:
             return []
         told = [f"{self.share * self._amount:,.0f} of {self._amount:,.0f} {self._unit}"]
         per_s = self._speed.per_s
-        return told if per_s is None else [*told, rate_in_words(per_s * self._amount)]
+        return told if per_s is None else [*told, format_rate(per_s * self._amount)]
 
     def left(self) -> str:
         """How long the rest would take at the speed so far; empty where that cannot be told."""
         left_s = self._speed.left_s(1 - self.share)
-        return f"{duration_in_words(left_s)} left" if left_s else ""
+        return f"{format_duration(left_s)} left" if left_s else ""
 
 
-def rate_in_words(per_s: float) -> str:
+def format_rate(per_s: float) -> str:
     """A rate, such as `5,300 a second` or `2.1 a minute`."""
     for unit, seconds in (("second", 1), ("minute", 60)):
         if (rate := per_s * seconds) >= 1:
@@ -186,7 +186,7 @@ def rate_in_words(per_s: float) -> str:
     return f"{per_s * 3600:.1f} an hour"
 
 
-def duration_in_words(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A duration, such as `80 s`, `12 min` or `3.4 h`."""
     if seconds < 120:
         return f"{seconds:.0f} s"

@@ -81,7 +81,7 @@ def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> No
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
 
 
-def made_anew(record: Any) -> tuple[Any, ...]:
+def reduce_dataclass(record: Any) -> tuple[Any, ...]:
     """A dataclass whose arrays are read-only, to be its `__reduce__`: they are so too where it is unpickled."""
     values = (getattr(record, field.name) for field in fields(record))
     return type(record), tuple(dict(value) if isinstance(value, MappingProxyType) else value for value in values)

@@ -165,7 +165,7 @@ def net_return(returns: Array, after: State) -> Array:
     return returns - after.info[_COST] if _COST in after.info else returns
 
 
-def costing(state: State, more: Array) -> State:
+def add_cost(state: State, more: Array) -> State:
     """A state after another trial, of bodies that are moved outside of JAX."""
     return _remembering(state, {_COST: state.info[_COST] + more})
 
@@ -238,7 +238,7 @@ class GoalSwitch(Wrapper[RobotState]):
 
 @final
 @dataclass(frozen=True)
-class TurnedRound(Animat[RobotState]):
+class ReversedMapping(Animat[RobotState]):
     """The mapping turned round: every response moves the robot by the opposite command."""
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
@@ -262,12 +262,12 @@ class IdealActuator(Animat[RobotState]):
         return responded._replace(command=jnp.asarray(self.commands, jnp.float32)[action])
 
 
-def with_inmost(
+def replace_innermost(
     environment: Environment[RobotState], change: Callable[[Environment[RobotState]], Environment[RobotState]]
 ) -> Environment[RobotState]:
     """The same wrappers around what is made of what is inside of all of them."""
     if isinstance(environment, Wrapper):
-        return replace(environment, inside=with_inmost(environment.inside, change))
+        return replace(environment, inside=replace_innermost(environment.inside, change))
     return change(environment)
 
 

@@ -44,7 +44,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(file.fileno())
         beside.chmod(0o666 & ~_umask())
         beside.replace(path)
-        keep_name(path.parent)
+        sync_folder(path.parent)
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}{UNCHANGED}") from error
@@ -165,7 +165,7 @@ def is_unfinished(path: Path) -> bool:
     return _UNFINISHED.fullmatch(path.name) is not None
 
 
-def keep_name(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Put a folder's new name on disk too: without it a file renamed just before a power cut may be the old one."""
     # Some file systems cannot, and then do it in their own time.
     with suppress(OSError):

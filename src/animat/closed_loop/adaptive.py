@@ -9,7 +9,7 @@ from scipy.special import ndtr, ndtri
 from animat.coding.mapping import N_PERCENTILES
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import ranks_among
-from animat.neurons.remembering import Remembered
+from animat.neurons.history_tracker import HistoryState
 
 NEWEST = 100
 """Of a condition, as many as the paper's recording holds: of a longer one the newest, as older ones adapt late."""
@@ -56,7 +56,7 @@ class AdaptiveThresholds:
         self._recorded, self._added = recorded, np.zeros(len(newest), np.int64)
         self._latest, self._weights = self._means(), np.ones(len(newest))
 
-    def add(self, condition: int, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
+    def add(self, condition: int, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
         """A new non-burst response.
 
         Args:

@@ -26,7 +26,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failing import in_words
 from animat.errors import AnimatError, BudgetSpent
-from animat.neurons.remembering import Remembered
+from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
 from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
@@ -84,7 +84,7 @@ class Driver:
         self._zero_s = self._seen_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
-        self._remembered = Remembered()
+        self._remembered = HistoryState()
         self._given: dict[str, list[int]] = {}
         """What was delivered in the last whole episode of each agent."""
         self._unmoved: tuple[Stretch, Sequence[Stimulus], dict[str, Any]] | None = None

@@ -23,7 +23,7 @@ from animat.closed_loop.log import Log, Records, read_log
 from animat.closed_loop.outline import Episode, Outline, electrode_pulses_of
 from animat.closed_loop.tick import Ending, Tick, TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.marks import expect_no_other
+from animat.folder_kinds import expect_no_other
 from animat.plain_file import expect_no_file
 from animat.progress import Progress
 from animat.recordings.formats.nwb import write_nwb

@@ -10,7 +10,7 @@ import numpy as np
 
 from animat.coding.mapping import N_PERCENTILES, Mapping
 from animat.errors import InvalidArgument, first_line, shown
-from animat.late import jax
+from animat.lazy import jax
 
 _RESPONSES_HZ = np.linspace(0.0, 12.0, 25, dtype=np.float32)
 _PERCENTILES_HZ = {

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from animat.coding.electrode_pulses import electrode_pulses
+from animat.columns import align_columns
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
 from animat.evaluation import transfer
@@ -23,7 +24,6 @@ from animat.evaluation.verdict import Verdict
 from animat.evaluation.whose_work import WhoseWork, whose_work
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, told_satisfaction
-from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent, in_phase
@@ -156,7 +156,7 @@ class Evaluation:
             for line in (head, *cells):
                 del line[-2]
         episodes = f"{first.shape[1]} episode{'' if first.shape[1] == 1 else 's'}"
-        lines = [f"{self.robot}, {on}: {count}, {episodes} each", *lined_up(head, cells)]
+        lines = [f"{self.robot}, {on}: {count}, {episodes} each", *align_columns(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if cost:

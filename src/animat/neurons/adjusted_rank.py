@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.neurons.history import NO_MEMORY, Ranked, ranks_among
-from animat.neurons.remembering import Remembered, Remembering
+from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.responses import Responses
 
@@ -33,7 +33,7 @@ class AdjustedRanks:
         ranks: y of each, shape (responses, readouts).
     """
 
-    remembering: Remembering
+    remembering: HistoryTracker
     sorted_hz: Float64[np.ndarray, "*readouts responses"]
     slopes: Float64[np.ndarray, "2 readouts"]
     responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
@@ -42,7 +42,7 @@ class AdjustedRanks:
     @classmethod
     def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
         """Of a recording, with the memory of its simulator."""
-        remembering, usable = Remembering.of(responses, simulator), ~responses.is_burst
+        remembering, usable = HistoryTracker.of(responses, simulator), ~responses.is_burst
         n_conditions, condition, read_hz = (
             len(responses.conditions),
             responses.condition[usable],
@@ -60,12 +60,12 @@ class AdjustedRanks:
         )
 
     def of_response(
-        self, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]
+        self, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]
     ) -> Float64[np.ndarray, " readouts"]:
         """y of another response.
 
         Args:
-            came: the history state when its trial came (`Remembering.when`).
+            came: the history state when its trial came (`HistoryTracker.when`).
             read_hz: x of each readout, Hz.
         """
         return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.responses import Presented, Responses
 
-AT_FIRST = (0.5, 0.5)
+INITIAL_HISTORY = (0.5, 0.5)
 """Trace and load that an episode begins with: its warm-up was presented in random order, as in a recording.
 
 The trace is of what was answered just before, from 0 to 1; the load of what was presented in the seconds before, 0 or
@@ -100,7 +100,7 @@ class Ranked:
         presented: Presented = self._presented
         # Of what has no condition of its own the middle one's is as good as any.
         means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
-        left = left_by(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
+        left = trace_increment(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
         trace, traces = 0.0, []
         for is_rested, is_burst, more in zip(
             presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
@@ -143,7 +143,7 @@ def ranks_among(
     return np.asarray((below + no_larger) / (2 * len(sorted_hz)))
 
 
-def left_by(
+def trace_increment(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
     """What responses add to the history."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
-from animat.neurons.history import NO_MEMORY, Memory, Ranked, left_by
+from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, placed
 from animat.responses.responses import Responses
 from animat.tables import briefly
@@ -151,7 +151,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         before[condition, : len(rows)] = np.sort(at)
         histories[condition, : len(rows)] = state[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
-        left[condition, : len(rows)] = left_by(ranked.rank[in_order], ranked.means[condition], memory)
+        left[condition, : len(rows)] = trace_increment(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
         values.values_hz,

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
 from animat.errors import InvalidArgument, UnusableData
-from animat.neurons.history import AT_FIRST
+from animat.neurons.history import INITIAL_HISTORY
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -86,7 +86,7 @@ class NeuronSimulator(abc.ABC):
 
     @final
     def sample(
-        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = AT_FIRST
+        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
     ) -> Float[Array, "*readouts"]:
         """Draw one response x to a condition, in Hz per channel, after a history state (see `Answer`)."""
         return self.answer(condition, jax.random.uniform(key), jnp.asarray(history, jnp.float32)).rate_hz

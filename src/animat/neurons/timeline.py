@@ -15,7 +15,7 @@ from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.simulator import NeuronSimulator, placed, stacked
 from animat.recordings.findings import Finding
-from animat.responses.condition import Condition, other_stimulus
+from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
@@ -152,7 +152,7 @@ def fit_timeline(
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
                     f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
                 )
-        if others := other_stimulus(first.conditions, other.conditions):
+        if others := stimulus_mismatch(first.conditions, other.conditions):
             raise Mismatch(f"conditions: {others} at {in_min(other.start_min)}")
     start_min = np.array([responses.start_min for responses in ordered], dtype=np.float64)
     if np.any(np.diff(start_min) == 0):

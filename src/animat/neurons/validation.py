@@ -259,7 +259,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         prior = probabilities.get("empirical" if each == "memory" else MARGINAL, 1 / CLASSES)
         probabilities[each] = command_probabilities(prediction, prior, halves, percentiles[1:10])
         transforms = transformed(prediction, halves)
-        distance = from_uniform(transforms)
+        distance = distance_from_uniform(transforms)
         series = free_runs(simulator, prediction, halves, FREE_RUNS, rng)
         lengths = [run_lengths(one, percentiles[5]) for one in series]
         passing = prediction.probability @ (halves.values_hz >= percentiles[5])
@@ -326,7 +326,7 @@ def pit_shares(transforms: Float64[np.ndarray, "held 2"]) -> Float64[np.ndarray,
     return np.diff(share_below(transforms, np.linspace(0, 1, PIT_BINS + 1)[1:-1]), prepend=0, append=1)
 
 
-def from_uniform(transforms: Float64[np.ndarray, "held 2"]) -> float:
+def distance_from_uniform(transforms: Float64[np.ndarray, "held 2"]) -> float:
     """Kolmogorov's distance of the transforms from the uniform distribution, to 0.001."""
     at = np.linspace(0, 1, 1001)
     return float(np.abs(share_below(transforms, at) - at).max())

@@ -9,7 +9,7 @@ import numpy as np
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_of
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Ranked
-from animat.neurons.remembering import Remembered
+from animat.neurons.history_tracker import HistoryState
 from animat.responses.responses import Responses
 
 
@@ -39,7 +39,7 @@ def as_read(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     for condition, x_hz, history, is_burst in zip(responses.condition, read_hz, came, responses.is_burst, strict=True):
         found.append(thresholds.ranks(x_hz))
         if not is_burst:
-            thresholds.add(int(condition), Remembered(*history), x_hz)
+            thresholds.add(int(condition), HistoryState(*history), x_hz)
     each = zip(np.atleast_2d(adjusted.sorted_hz), np.array(found).T, strict=True)
     now_hz = np.stack([np.quantile(own_hz, ranks) for own_hz, ranks in each], axis=-1).reshape(read_hz.shape)
     if responses.readout_hz is not None:

@@ -11,9 +11,9 @@ from jaxtyping import Float64
 
 from animat.coding.mapping import Thresholds
 from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history_tracker import HistoryTracker
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
 from animat.reality_gap.as_read import as_read
@@ -68,7 +68,7 @@ class Calibration:
         return self.adjusted.responses_hz
 
     @property
-    def remembering(self) -> Remembering:
+    def remembering(self) -> HistoryTracker:
         """How a loop's responses become the history state, with the memory of the recording's own simulator."""
         return self.adjusted.remembering
 

@@ -99,7 +99,7 @@ def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
     )
 
 
-def other_stimulus(conditions: Sequence[Condition], others: Sequence[Condition]) -> str | None:
+def stimulus_mismatch(conditions: Sequence[Condition], others: Sequence[Condition]) -> str | None:
     """In words, the first of equal conditions whose stimuli are others, where both are known; None if none is.
 
     Args:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, final
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import train_alone
-from animat.progress import InTurn, Progress
+from animat.progress import EqualPhases, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.readouts import USUAL_READOUTS
 from animat.responses.responses import Responses
@@ -192,7 +192,7 @@ class Judge(RobotTask):
             seed=self.drawn("judge"),
             optimum_resolution=self.study.optimum_resolution,
             interventions=True,
-            progress=InTurn(progress, 3),
+            progress=EqualPhases(progress, 3),
         )
         return [write_json(self.beside(folder, SIMULATED), evaluation.to_dict())]
 
@@ -228,7 +228,7 @@ class Measure(RobotTask):
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
                 # Best coupling, prediction, closed loop, optimal return.
-                progress=InTurn(progress, 4),
+                progress=EqualPhases(progress, 4),
             )
         if gap.session.ending.by != "plan":
             raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to go on")

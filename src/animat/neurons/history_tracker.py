@@ -8,14 +8,14 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by, ranks_among
+from animat.neurons.history import INITIAL_HISTORY, NO_MEMORY, Memory, Ranked, ranks_among, trace_increment
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.responses import Responses
 
 
-class Remembered(NamedTuple):
+class HistoryState(NamedTuple):
     """The history state after a trial, and when that was: trace and load as in `animat.neurons.history.Memory`."""
 
     trace: float = 0.0
@@ -24,7 +24,7 @@ class Remembered(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Remembering:
+class HistoryTracker:
     """What a response on the culture adds to the history state, by the ranks of a recording's responses.
 
     Attributes:
@@ -48,19 +48,19 @@ class Remembering:
             memory, added = simulator.memory, float(simulator.added)
         return cls(memory, added, ranked.sorted_hz, ranked.means)
 
-    def when(self, before: Remembered, at_s: float, *, is_rested: bool) -> Remembered:
+    def when(self, before: HistoryState, at_s: float, *, is_rested: bool) -> HistoryState:
         """The state when a trial comes.
 
         Args:
-            before: the state after the trial before it; `Remembered()` after silence.
+            before: the state after the trial before it; `HistoryState()` after silence.
             at_s: the pulse that it is read after, s.
             is_rested: whether there was no pulse in the second before it.
         """
         load_s = self.memory.load_s
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
-        return Remembered(0.0 if is_rested else before.trace, float(load), float(at_s))
+        return HistoryState(0.0 if is_rested else before.trace, float(load), float(at_s))
 
-    def after(self, came: Remembered, condition: int, rate_hz: float, *, is_burst: bool) -> Remembered:
+    def after(self, came: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
         """The state after a trial.
 
         Args:
@@ -72,18 +72,18 @@ class Remembering:
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         # Of what has no condition of its own the middle one's is as good as any.
         mean = 0.5 if condition == NO_CONDITION else float(self.mean_ranks[condition])
-        (more,) = left_by(rank, mean, self.memory).tolist()
+        (more,) = trace_increment(rank, mean, self.memory).tolist()
         trace = 0.5 if is_burst else self.memory.decay * came.trace + more
-        return Remembered(float(trace), came.load + self.added, came.at_s)
+        return HistoryState(float(trace), came.load + self.added, came.at_s)
 
-    def observed(self, state: Remembered) -> tuple[float, float]:
+    def observed(self, state: HistoryState) -> tuple[float, float]:
         """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""
         if self.memory == NO_MEMORY:
-            return AT_FIRST
-        return state.trace, state.load if self.memory.load_s else AT_FIRST[1]
+            return INITIAL_HISTORY
+        return state.trace, state.load if self.memory.load_s else INITIAL_HISTORY[1]
 
     def beside(
-        self, observation: Float64[np.ndarray, " numbers"], state: Remembered
+        self, observation: Float64[np.ndarray, " numbers"], state: HistoryState
     ) -> Float64[np.ndarray, " more_numbers"]:
         """What a policy is given: the robot's observation, then trace and load."""
         return np.concatenate([observation, self.observed(state)])

@@ -10,7 +10,7 @@ from animat.plain_file import is_folder
 
 Kind = Literal["session", "training", "tuning", "study", "cultures", "recording", "live"]
 
-MARKS: dict[Kind, tuple[str, ...]] = {
+MARKERS: dict[Kind, tuple[str, ...]] = {
     "session": ("session.log",),
     "training": ("training.json", "[!.]*.safetensors"),
     "tuning": ("tune.json",),
@@ -35,7 +35,7 @@ def expect_no_other(folder: Path, kind: Kind) -> None:
     """Raise Mismatch if a folder holds work of other kinds and none of this one; a missing one holds nothing."""
     if not is_folder(folder):
         return
-    found = {each: [file.name for name in names for file in folder.glob(name)] for each, names in MARKS.items()}
+    found = {each: [file.name for name in names for file in folder.glob(name)] for each, names in MARKERS.items()}
     others = [f"{_TOLD[each]} ({min(names)})" for each, names in found.items() if names]
     # Where some of it is there already it goes on, whatever came beside.
     if others and not found[kind]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 
-def lined_up(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def align_columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table, indented: the first column and the last, which are words, to the left, the others to the right.
 
     A column that needs no name has an empty one.
