@@ -59,7 +59,7 @@ def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
     (out / mark).write_bytes(b"somebody's")
     expected, words = COMMANDS[kind]
     assert main([*(word.format(beside=tmp_path) for word in words), "--out", str(out)]) == 1
-    said = f"{out}: expected a folder for {expected}, got one of {told} ({mark}); choose another folder\n"
+    said = f"{out}: expected a folder for {expected}, got one with {told} ({mark}); choose another folder\n"
     assert capsys.readouterr().err.endswith(said)
     assert {file.name: file.read_bytes() for file in out.iterdir()} == {mark: b"somebody's"}
 
@@ -75,7 +75,7 @@ def test_ones_own_folder_an_empty_one_and_files_beside_are_taken(kind: Kind, tmp
     expect_no_other(tmp_path, kind)
     (tmp_path / LIVE).touch()
     (tmp_path / TUNING).touch()
-    with pytest.raises(Mismatch, match=r"got one of a tuning \(tune.json\), a live run \(live.log\); choose"):
+    with pytest.raises(Mismatch, match=r"got one with a tuning \(tune.json\), a live run \(live.log\); choose"):
         expect_no_other(tmp_path, kind)
     # What goes on may have had another's work put beside it, by former versions or by hand.
     (tmp_path / next(mark for of, mark, _ in OTHERS if of == kind)).touch()

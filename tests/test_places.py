@@ -73,7 +73,7 @@ def test_what_is_no_place_is_refused_and_a_file_of_it_is_named(given_: object, t
     file.write_text("[[1, 2]")
     with pytest.raises(
         InvalidFile,
-        match=r"places\.json: places: expected JSON as .*, got a mistake: .* line 1 column 8",
+        match=r"places\.json: places: expected JSON as .*, got malformed text: .* line 1 column 8",
     ):
         read_places(str(file))
     with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):

@@ -106,7 +106,7 @@ def test_work_that_reports_nothing_for_long_is_told_of_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("animat.progress.LINE_EVERY_S", 0.02)
-    monkeypatch.setattr("animat.progress._LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr("animat.progress._CHECK_EVERY_S", 0.01)
     told = ""
     with Bar("solving") as progress:
         progress.update(0, 1, "optimal return")

@@ -201,7 +201,7 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
     [
         ("[[1], [2]]", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
         ("null", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
-        ("{", ": expected JSON, got a mistake"),
+        ("{", ": expected JSON, got malformed text"),
         ("{}", ".names: expected at least 1, got"),
         ('{"a": []}', ".a: expected at least 1, got"),
         ('{"a": [1], "b": [1.5]}', ".b: expected a whole number, got 1.5"),

@@ -44,7 +44,7 @@ def test_on_any_error_the_old_file_stays_and_nothing_lies_beside_it(tmp_path: Pa
         raise error
     if expected is InvalidFile:
         assert str(raised.value) == (
-            f"{path}: cannot be written: No space left on device; what stood there before is unchanged"
+            f"{path}: cannot be written: No space left on device; any previous file is unchanged"
         )
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["b.txt"]

@@ -1,4 +1,4 @@
-"""`python -m animat` is the command `animat`."""
+"""`python -m animat` runs the command `animat`."""
 
 import sys
 
@@ -6,7 +6,7 @@ from animat.ctrl_c import interruptible
 
 
 def main() -> int:
-    """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it in a line, also while it is being loaded."""
+    """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it with one line, even while it is being loaded."""
     try:
         with interruptible():
             from animat.cli import main as run
