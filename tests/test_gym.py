@@ -219,7 +219,7 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
         ({"kind": "empirical"}, "kind: expected only with recordings"),
         ({"name": 3.0}, "cartpole: expected parameters among .*, got 'name'"),
-        ({"simulator": "memory"}, "simulator: expected a simulator, and `kind` for the name of one, got 'memory'"),
+        ({"simulator": "memory"}, "simulator: expected a simulator; `kind` takes the name of one, got 'memory'"),
         ({"recordings": 3}, "recordings: expected a path or several, got 3"),
         ({"recordings": ["r", None]}, "recordings: expected a path or several, got None"),
         ({"delivery": "late"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
@@ -276,7 +276,7 @@ def test_a_vector_is_of_a_whole_number_and_starts_as_one() -> None:
     with pytest.raises(InvalidArgument, match=r"num_envs: expected a whole number, got 1\.5"):
         gymnasium.make_vec("Animat/Cartpole-v0", num_envs=1.5)
     envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=np.int64(2))
-    with pytest.raises(InvalidArgument, match="options: expected no 'reset_mask': all episodes are started at once"):
+    with pytest.raises(InvalidArgument, match="options: expected no 'reset_mask': all episodes are started together"):
         envs.reset(options={"reset_mask": np.array([True, False])})
 
 

@@ -211,7 +211,7 @@ def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> No
     class Here(type(robot_named(ROVER))):  # type: ignore[misc]
         name = "here"
 
-    with pytest.raises(InvalidArgument, match=r"at the top of a file.*<locals>\.Here.*in memory"):
+    with pytest.raises(InvalidArgument, match=r"at the top level of a file.*<locals>\.Here.*in memory"):
         train(Training(Here(), None, algorithm=SMALL), None, package / "out")
 
 
@@ -263,7 +263,7 @@ def test_robots_are_listed_with_what_each_can_do(
     [
         ("my_nowhere:Rover", "expected my_nowhere:Rover to be importable, got ModuleNotFoundError"),
         ("my_package.robots:Tank", "Tank to be importable, got AttributeError"),
-        ("my_package.robots:At", "expected a class made of animat.Robot, got <class"),
+        ("my_package.robots:At", "expected a subclass of animat.Robot, got <class"),
         ("my_package.robots:", "to be importable, got "),
         (":Rover", "to be importable, got ValueError"),
         ("./my_package/robots.py:Rover", "such as robots:Rover, got a file, './my_package/robots.py:Rover'"),

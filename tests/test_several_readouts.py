@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from animat.coding.decoder import Decoder, decoded
+from animat.coding.decoder import Decoder, decode
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
@@ -160,12 +160,12 @@ def test_each_command_is_the_mapping_s_of_its_readout(mapping: Mapping) -> None:
     x = rng.gamma(4, 5, (7, 2)).astype(np.float32)
     percentiles = np.sort(rng.gamma(4, 5, (2, 11)), axis=1).astype(np.float32)
     commands = Decoder(mapping, HALVES).command(x, percentiles)
-    of_jax = jax.jit(lambda x, p: decoded(mapping, x, p))(x, percentiles)
+    of_jax = jax.jit(lambda x, p: decode(mapping, x, p))(x, percentiles)
     for d in range(2):
         np.testing.assert_array_equal(commands[:, d], mapping.command(x[:, d], percentiles[d]))
     np.testing.assert_allclose(of_jax, commands, atol=1e-6)
     assert Decoder(mapping, HALVES).percentiles_shape == (2, 11) and Decoder(mapping).percentiles_shape == (11,)
-    assert decoded(mapping, x[0, 0], percentiles[0]) == mapping.command(x[0, 0], percentiles[0])
+    assert decode(mapping, x[0, 0], percentiles[0]) == mapping.command(x[0, 0], percentiles[0])
 
 
 @pytest.mark.oracle
@@ -176,7 +176,7 @@ def test_mean_commands_are_those_of_many_draws() -> None:
     sample = jax.jit(jax.vmap(simulator.sample, (0, None)))
     for c in actions:
         x = sample(keys, jnp.int32(c))
-        u: Any = decoded(Thresholds(9), x, simulator.percentiles)
+        u: Any = decode(Thresholds(9), x, simulator.percentiles)
         np.testing.assert_allclose(means[c], u.mean(axis=0), atol=0.05)
 
 

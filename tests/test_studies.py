@@ -802,7 +802,7 @@ COMPARED = (
             "expected each name once, got 'a' 2 times: capitals, and spaces for dashes, make no difference",
         ),
         ("[[arms]]\nname = 'a'\nmapping = '2'", "arms.mapping: expected one of"),
-        ("[[arms]]\nname = 'a'\nmapping = '2'", "named by its module:Class; none is without neurons"),
+        ("[[arms]]\nname = 'a'\nmapping = '2'", "name your own by its module:Class; none is without neurons"),
         ("[tune]\ntrials = 3", "expected a study, got the file of a tuning, with [tune]: give it to animat tune"),
         (
             "[[arms]]\nname = 'a'\ndelivery = 'none'",

@@ -114,7 +114,7 @@ def test_a_wrapper_of_ones_own_remembers() -> None:
 
 @pytest.mark.parametrize("wrapper", [ShuffledDelivery, NeuralObservation])
 def test_what_is_of_neurons_is_refused_without_them(wrapper: type[Wrapper[Any]]) -> None:
-    with pytest.raises(InvalidArgument, match="inside: expected an Animat, whose neurons answer, got WithoutNeurons"):
+    with pytest.raises(InvalidArgument, match="inside: expected an Animat, which has neurons, got WithoutNeurons"):
         wrapper(EpisodeLimit(DIRECT))
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from animat.coding.decoder import decoded
+from animat.coding.decoder import decode
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
@@ -140,7 +140,7 @@ def mean_commands(
     """
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
-        commands = decoded(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
+        commands = decode(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
         return np.arange(animat.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
     of_one = commands_of(environment, simulator)
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
