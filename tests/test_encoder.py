@@ -131,10 +131,10 @@ def test_a_condition_met_at_other_frequencies_too_is_no_other(
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"frequencies_hz": (0.0,)}, r"frequencies_hz: expected more than 0, got \(0\.0,\)"),
+        ({"frequencies_hz": (0.0,)}, r"frequencies_hz: expected numbers above 0, got \(0\.0,\)"),
         ({"frequencies_hz": ("x",)}, "frequencies_hz: expected a number, got 'x'"),
-        ({"electrodes": ((),)}, "electrodes: expected the numbers of one or more in each set"),
-        ({"electrodes": ((-1,),)}, "electrodes: expected the numbers of one or more in each set"),
+        ({"electrodes": ((),)}, "electrodes: expected sets of one or more electrode numbers"),
+        ({"electrodes": ((-1,),)}, "electrodes: expected sets of one or more electrode numbers"),
         ({"electrodes": ((1.5,),)}, "electrodes: expected a whole number, got 1.5"),
         ({"electrodes": 3}, "electrodes: expected a list, got 3"),
         ({"only_last": 1}, "only_last: expected true or false, got 1"),

@@ -440,7 +440,7 @@ def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -
         write_nwb(synthetic, tmp_path / f"{number}.nwb")
     with pytest.warns(UserWarning) as told:
         gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path)
-    few = [str(each.message) for each in told if "a distribution takes 30 or more" in str(each.message)]
+    few = [str(each.message) for each in told if "a distribution needs 30 or more" in str(each.message)]
     assert len(few) == 1
     assert few[0].endswith("more like it)")
 

@@ -161,11 +161,11 @@ def test_stimuli_without_a_condition_are_counted() -> None:
     assert names(extract_responses(source, ByPattern((7,))))["no-condition"] == "refuse"
     none = message(source, "no-condition", by=ByPattern((7,)))
     there = "the recording has pattern 0, pattern 1: choose others (--conditions"
-    assert f"no stimulus of 3 belongs to the conditions pattern:7; {there}" in none
+    assert f"none of 3 stimuli belongs to the conditions pattern:7; {there}" in none
     # What other kinds could be had is not a list of what the recording has.
     for by in (ByElectrode(), ByInterval((7.0,)), Nothing()):
         none = message(source, "no-condition", by=by)
-        assert f"no stimulus of 3 belongs to the conditions {by}: choose others (--conditions" in none
+        assert f"none of 3 stimuli belongs to the conditions {by}: choose others (--conditions" in none
 
 
 def test_empty_and_thin_conditions() -> None:
@@ -177,7 +177,7 @@ def test_empty_and_thin_conditions() -> None:
     thin = extract_responses(answering({5: 10.0, 10: 14.0}, n=29), burst_threshold=1)
     assert names(thin)["few-samples"] == "warning"
     one = message(answering({5: 10.0, 10: 14.0}, n=1), "few-samples", burst_threshold=1)
-    assert one.endswith("1 non-burst response; a distribution takes 30 or more")
+    assert one.endswith("1 non-burst response; a distribution needs 30 or more")
     assert "few-samples" not in names(extract_responses(answering({5: 10.0, 10: 14.0}, n=30), burst_threshold=1))
 
 

@@ -108,7 +108,7 @@ def test_responses_that_are_chosen_keep_their_readouts(recording: Recording, hal
         assert set(map(tuple, anew.read_of(condition).tolist())) <= known
     with pytest.raises(Mismatch, match=r"readout_hz: expected shape"):
         replace(responses, readout_hz=responses.rate_hz)
-    with pytest.raises(Mismatch, match="readout_hz: expected some where"):
+    with pytest.raises(Mismatch, match="readout_hz: expected if, and only if, readouts"):
         replace(responses, readout_hz=None)
 
 
@@ -138,7 +138,7 @@ def test_few_responses_cannot_tell_whether_conditions_separate_readouts() -> Non
     left = number < np.where(responses.condition == 0, 16, 28)
     both_hz = np.stack([left, number % 2 == 0], axis=-1).astype(np.float64)
     (found,) = _readouts(replace(responses, readout_hz=both_hz))
-    assert "so few responses cannot tell whether they separate" in found.message
+    assert "there are too few responses to know if they separate" in found.message
 
 
 def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, halves: Readouts) -> None:
@@ -154,9 +154,7 @@ def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, 
         spike_times_s=recording.spike_times_s[kept],
         spike_channels=np.searchsorted(rows, recording.spike_channels[kept]),
     )
-    with pytest.raises(
-        Mismatch, match=rf"^readouts: .*none that read 1 of its 16 \({gone}\); 31 are read .* at 10 min\)$"
-    ):
+    with pytest.raises(Mismatch, match=rf"^readouts: .*none for 1 of its 16 \({gone}\); 31 are read .* at 10 min\)$"):
         extract_series([recording, fewer], readouts="halves")
 
 
@@ -179,7 +177,7 @@ def test_names_of_readouts_are_known_or_refused(recording: Recording) -> None:
     with pytest.raises(InvalidArgument, match=r"^electrodes: expected a list, got 1$"):
         Readouts(("a", "b"), (1, 2))  # type: ignore[arg-type]
     with pytest.raises(
-        InvalidArgument, match=r"^electrodes: expected a group of them for each of the names \('a',\), got none$"
+        InvalidArgument, match=r"^electrodes: expected a group of electrodes for each of the names \('a',\), got none$"
     ):
         Readouts(("a",))
 
@@ -208,7 +206,7 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
         ('{"a": 1}', ".a: expected a list, got 1"),
         ('{"": [1]}', ".names: expected at least 1 character, got ''"),
         ('{"a": [1], "a": [2]}', ": expected each name once, got a twice"),
-        ('{"\\n": [1]}', ".names: expected a printable name for each group of electrodes (1 in all)"),
+        ('{"\\n": [1]}', ".names: expected a different printable name for each group of electrodes (1 in all)"),
     ],
 )
 def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) -> None:
@@ -216,7 +214,7 @@ def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) ->
     with pytest.raises(InvalidFile) as raised:
         read_readouts(tmp_path / "groups.json")
     assert f"groups.json: readouts{told}" in str(raised.value) and "\n" not in str(raised.value)
-    with pytest.raises(InvalidFile, match="names are all, halves and quadrants"):
+    with pytest.raises(InvalidFile, match="named readouts are all, halves and quadrants"):
         read_readouts("thirds")
 
 
@@ -224,7 +222,7 @@ def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) ->
     ("data", "told"),
     [
         (5, ": expected a table, got 5"),
-        ({"names": ["a"]}, r".electrodes: expected a group of them for each of the names \('a',\), got none"),
+        ({"names": ["a"]}, r".electrodes: expected a group of electrodes for each of the names \('a',\), got none"),
         ({"names": "ab", "electrodes": [[1], [2]]}, ".names: expected a list, got 'ab'"),
         ({"names": ["a"], "electrodes": [1]}, ".electrodes: expected a list, got 1"),
     ],

@@ -224,7 +224,7 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
         (
             lambda: extract_series("recordings"),  # type: ignore[arg-type]
             InvalidArgument,
-            "recordings: expected a list of recordings, as animat.read_recordings makes, got 'recordings'",
+            "recordings: expected a list of recordings, as animat.read_recordings returns, got 'recordings'",
         ),
         (lambda: extract_series(["recordings"]), InvalidArgument, "recordings: expected .* got 'recordings'"),  # type: ignore[list-item]
         (lambda: fit_timeline([responses_of([1.0])], kind="gamma"), InvalidArgument, "kind"),  # type: ignore[arg-type]
