@@ -151,7 +151,7 @@ def test_policies_that_see_are_predicted_and_run(
     tmp_path: Path, responses: Responses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 3)
-    monkeypatch.setattr("animat.neurons.memory._found", lambda ranked: MEMORY)
+    monkeypatch.setattr("animat.neurons.memory._find_memory", lambda ranked: MEMORY)
     given: dict[str, Any] = {"presentation": None, "neural_observation": True}
     rng = np.random.default_rng(4)
     weights = tuple(rng.standard_normal(s).astype(np.float32) for s in ((6, 16), (16, 16), (16, 5)))

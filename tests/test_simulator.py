@@ -217,7 +217,7 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
         (
             lambda: fit_timeline("recordings"),  # type: ignore[arg-type]
             InvalidArgument,
-            "series: expected a list of responses, as animat.extract_series makes, got 'recordings'",
+            "series: expected a list of responses, as animat.extract_series returns, got 'recordings'",
         ),
         (lambda: fit_timeline(responses_of([1.0])), InvalidArgument, "series: expected a list of responses"),  # type: ignore[arg-type]
         (lambda: fit_timeline([3]), InvalidArgument, "series: expected a list of responses, .* got 3"),  # type: ignore[list-item]

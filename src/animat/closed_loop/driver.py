@@ -130,7 +130,7 @@ class Driver:
         given, remembering = list[int](), loop.remembering if agent.sees_neurons(turn) else None
         source = self._source_of(agent)
         for iteration in range(loop.robot.episode_limit):
-            seen = observation if remembering is None else remembering.beside(observation, self._remembered)
+            seen = observation if remembering is None else remembering.append_to(observation, self._remembered)
             chosen = self._choose(agent, controller, seen)
             repeats = 0
             while True:

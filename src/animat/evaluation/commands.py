@@ -17,7 +17,7 @@ from animat.coding.mapping import Thresholds
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import NeuronSimulator, Stored, placed
+from animat.neurons.simulator import NeuronSimulator, Stored, to_jax
 from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
 
 CONTINUOUS_ACTIONS = 21
@@ -167,7 +167,7 @@ def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"])
 
     The load is not told apart: in each class there are the loads that were recorded with such traces.
     """
-    ends, traces = placed(np.arange(1, CLASSES) / CLASSES), placed(_recorded(simulator)[:, 0])
+    ends, traces = to_jax(np.arange(1, CLASSES) / CLASSES), to_jax(_recorded(simulator)[:, 0])
     return np.asarray(np.sum(np.asarray(history)[..., :1] >= np.asarray(jnp.quantile(traces, ends)), axis=-1))
 
 
