@@ -479,7 +479,9 @@ def test_several_readouts_by_hand() -> None:
         each = [stats.spearmanr(part[:, 0], part[:, 1]).statistic for part in parts]
         assert found[0] == pytest.approx(np.average(each, weights=[len(part) for part in parts]))
     for asked in (None, 2):
-        with pytest.raises(InvalidArgument, match=f"readout: expected one of 2 readouts, or None if there is only one, got {asked}"):
+        with pytest.raises(
+            InvalidArgument, match=f"readout: expected one of 2 readouts, or None if there is only one, got {asked}"
+        ):
             validate(responses, readout=asked)
 
 

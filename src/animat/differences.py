@@ -41,7 +41,12 @@ def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Colle
             for key in sorted(set(found) | set(wanted))
             if key not in ignoring
         ]
-    elif isinstance(found, list) and isinstance(wanted, list) and _compares_entries(found, wanted):
+    # Short lists of different lengths are shown as a whole.
+    elif (
+        isinstance(found, list)
+        and isinstance(wanted, list)
+        and (len(found) == len(wanted) or max(len(repr(found)), len(repr(wanted))) > _LONGEST)
+    ):
         # The entries that both have, then the lengths.
         pairs = [(one, other, f"{name}[{i}]") for i, (one, other) in enumerate(zip(found, wanted, strict=False))]
         pairs += [(len(found), len(wanted), f"{name}, how many")]
@@ -49,11 +54,6 @@ def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Colle
         return "" if found == wanted else f"{name}: {_short(found)} there, {_short(wanted)} now"
     differences = (first_difference(one, other, place, ignoring=ignoring) for one, other, place in pairs)
     return next(filter(None, differences), "")
-
-
-def _compares_entries(found: list[Any], wanted: list[Any]) -> bool:
-    """Whether to compare lists entry by entry: short lists of different lengths are shown as a whole."""
-    return len(found) == len(wanted) or max(len(repr(found)), len(repr(wanted))) > _LONGEST
 
 
 def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
@@ -78,11 +78,11 @@ def read_description(path: Path, what: str) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-        _ = found["fingerprint"]
+        description: dict[str, Any] = json.loads(path.read_text())
+        _ = description["fingerprint"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise InvalidFile(f"{path}: expected a {what}'s description, got a file that cannot be read") from error
-    return found
+    return description
 
 
 def folder_mismatch(folder: Path, what: str, difference: str) -> Mismatch:

@@ -202,8 +202,8 @@ class YokedDelivery(Wrapper[RobotState]):
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
         n, other, start = self.inside.noise_size, state.info[_OTHER], state.info[_START]
-        other = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
-        next_ = _where(jnp.logical_or(*other.ended), start, other.carried)
+        other_after = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
+        next_ = _where(jnp.logical_or(*other_after.ended), start, other_after.carried)
         after = self.inside.advance(uniforms[:n], state, action, simulator)
         return _remembering(after, {_OTHER: next_, _START: start})
 

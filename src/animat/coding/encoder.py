@@ -107,7 +107,9 @@ class Dealer:
         self._decks = [
             self._any
             if each.electrodes is None
-            else _Deck([_target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
+            else _Deck([Target((), NOTHING)], rng)
+            if each.electrodes == RESTING
+            else _Deck([Target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
             for each in encoder.conditions
         ]
 
@@ -123,10 +125,6 @@ class Dealer:
             return deck.hand(pulses)
         last = deck.hand(1)
         return [*self._any.hand(pulses - 1, but=last), *last]
-
-
-def _target(electrodes: tuple[int, ...], pattern: int) -> Target:
-    return Target((), NOTHING) if (electrodes,) == RESTING else Target(electrodes, pattern)
 
 
 class _Deck:

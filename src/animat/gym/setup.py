@@ -115,10 +115,10 @@ def set_up(
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     check_window(window_ms)
     if recordings is None:
-        reading: dict[str, Any] = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
-        reading["readouts"] = (readouts, None)
-        for name, (got, usual) in (reading | {"window_ms": (tuple(window_ms), DEFAULT_WINDOW_MS)}).items():
-            if got != usual:
+        window = None if tuple(window_ms) == DEFAULT_WINDOW_MS else window_ms
+        reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window}
+        for name, value in reading.items():
+            if value is not None:
                 raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
     if recordings is not None:
         by = None if conditions is None else conditions_named(conditions)

@@ -50,7 +50,7 @@ class All(Conditions):
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Put every pulse into condition 0."""
-        return _recorded(stimuli, np.zeros(len(stimuli), dtype=np.int64), [Condition("all", 0.0)])
+        return _with_stimuli(stimuli, np.zeros(len(stimuli), dtype=np.int64), [Condition("all", 0.0)])
 
 
 @dataclass(frozen=True)
@@ -164,8 +164,8 @@ class ByElectrode(Conditions):
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
         index = index_of_row[row_of.reshape(-1)]
         index[stimuli.is_rest] = index_of.get(RESTING[0], NO_CONDITION)
-        found = [Condition(listed(electrodes), float(i), electrodes=(electrodes,)) for i, electrodes in enumerate(sets)]
-        return _recorded(stimuli, index, abbreviated(found))
+        conditions = [Condition(listed(one), float(i), electrodes=(one,)) for i, one in enumerate(sets)]
+        return _with_stimuli(stimuli, index, abbreviated(conditions))
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,8 @@ class ByPattern(Conditions):
         index = np.full(len(stimuli), NO_CONDITION)
         for i, pattern in enumerate(patterns):
             index[stimuli.pattern == pattern] = i
-        found = [Condition(f"pattern {pattern}", float(pattern), electrodes=()) for pattern in patterns]
-        return _recorded(stimuli, index, found)
+        conditions = [Condition(f"pattern {pattern}", float(pattern), electrodes=()) for pattern in patterns]
+        return _with_stimuli(stimuli, index, conditions)
 
 
 @dataclass(frozen=True)
@@ -221,13 +221,12 @@ class ByBoth(Conditions):
         number = np.where(both, when.condition * len(where.conditions) + where.condition, NO_CONDITION)
         occurring = np.unique(number[both & stimuli.is_last_of_presentation])
         index = np.full(len(stimuli), NO_CONDITION)
-        found = []
+        conditions = []
         for i, each in enumerate(occurring.tolist()):
             index[number == each] = i
             at, on = when.conditions[each // len(where.conditions)], where.conditions[each % len(where.conditions)]
-            label = f"{at.label}, {on.label}"
-            found.append(Condition(label, float(i), "", at.frequencies_hz, on.electrodes))
-        return _recorded(stimuli, index, found)
+            conditions.append(Condition(f"{at.label}, {on.label}", float(i), "", at.frequencies_hz, on.electrodes))
+        return _with_stimuli(stimuli, index, conditions)
 
 
 def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Conditions:
@@ -281,13 +280,15 @@ def conditions_named(text: str) -> Conditions:
     )
 
 
-def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]) -> Assignment:
+def _with_stimuli(
+    stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]
+) -> Assignment:
     """An assignment whose conditions also describe their stimuli, as far as they did not yet."""
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]
     presented = np.repeat(of, np.diff(last, prepend=-1))
     presented[last] = NO_CONDITION  # Leaves the pulses before the last one.
-    found = []
+    described = []
     for i, condition in enumerate(conditions):
         rows = last[of == i]
         known_hz, electrodes = condition.frequencies_hz, condition.electrodes
@@ -299,8 +300,8 @@ def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions
         before = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
         ours = {frozenset(one) - {NOTHING} for one in electrodes or ()}
         only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in before)
-        found.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
-    return Assignment(index, tuple(found))
+        described.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
+    return Assignment(index, tuple(described))
 
 
 def _frequency(value_hz: float) -> Condition:

@@ -19,6 +19,7 @@ _ARTEFACT_MS = 20.0
 _QUIET_MS = 200.0
 _LEAST_QUIET_S = 1.0
 _ARTEFACT_AFTER_MS = 2.0
+_SEARCH_MS = 500.0
 _SUSTAINED_BINS = 3
 _BINS_MS = (1.0, 2.0, 5.0, 10.0)
 
@@ -117,21 +118,18 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
     return (float(spikes.sum()) / quiet_s if quiet_s >= _LEAST_QUIET_S else float("nan")), quiet_s
 
 
-def find_response(
-    recording: Recording, up_to_ms: float = 500.0, stimuli: Bool[np.ndarray, " stimuli"] | None = None
-) -> ResponseTime | None:
+def find_response(recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | None = None) -> ResponseTime | None:
     """When the culture first fires above its spontaneous rate after a stimulus; None if it does not, or is unknown.
 
     It is the first stretch, from 2 ms on, that begins with three successive bins above b + 3 sqrt(b), b the spikes
     expected spontaneously in a bin, and ends before three successive bins that are not. Bins are 1 ms wide, or up to
-    10 ms if spikes are few. Only stimuli without another pulse within the search are used; if these are few, the
-    search is shortened to the upper quartile of the intervals.
+    10 ms if spikes are few. Only stimuli without another pulse within the search, of 500 ms, are used; if these are
+    few, the search is shortened to the upper quartile of the intervals.
 
     Args:
-        up_to_ms: the end of the search, after the stimulus.
         stimuli: which pulses to take, shape (stimuli,); None for the last pulses of trials.
     """
-    table = recording.stimuli
+    table, up_to_ms = recording.stimuli, _SEARCH_MS
     rate_hz, _ = spontaneous_rate(recording)
     read = table.is_last_of_presentation & ~table.is_rest if stimuli is None else stimuli
     if not read.any() or math.isnan(rate_hz):

@@ -280,21 +280,18 @@ def _difference(responses: Responses) -> Iterator[Finding]:
         f"with one threshold the choice moves the mean command from {2 * lowest[1] - 1:+.2f} to "
         f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
     )
+    differ = "hardly differ" if spread < SMALL_DIFFERENCE else f"differ by {spread:.2f} at most"
+    message = f"the conditions {differ}: P(x >= P50) is {listed}; {reach}, the rest is chance"
     if spread < SMALL_DIFFERENCE:
-        message = (
-            f"the conditions hardly differ: P(x >= P50) is {listed}; {reach}, the rest is chance, so no policy can "
-            "steer a robot much better than at random: stimulate in ways that differ more"
-        )
+        message += ", so no policy can steer a robot much better than at random: stimulate in ways that differ more"
         yield Finding("no-difference", "warning", message, spread)
     elif spread < LITTLE_DIFFERENCE:
-        message = (
-            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
-            "a robot can hardly be steered: `animat inspect --optimum` computes how far; stimulate in ways that differ "
-            "more"
+        message += (
+            ", so a robot can hardly be steered: `animat inspect --optimum` computes how far; stimulate in ways that "
+            "differ more"
         )
         yield Finding("little-difference", "warning", message, spread)
     else:
-        message = f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance"
         yield Finding("difference", "note", message, spread)
 
 
