@@ -5,7 +5,7 @@ from __future__ import annotations
 from animat.columns import align_columns
 
 
-def test_words_stand_to_the_left_and_numbers_under_the_end_of_their_columns_name() -> None:
+def test_text_is_aligned_left_and_numbers_right_under_their_headings() -> None:
     assert align_columns(
         ["", "mean", "p", ""], [["policies", "96.0", "", ""], ["random", "-80.25", "0.001", "any action"]]
     ) == [

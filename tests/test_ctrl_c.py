@@ -49,7 +49,7 @@ def test_it_is_dropped_by_python_and_heard_here() -> None:
 
 
 @pytest.mark.parametrize("number", ASKING)
-def test_so_is_a_kill_and_where_a_weak_reference_is_told_of_an_end(number: signal.Signals) -> None:
+def test_so_is_a_kill_and_in_the_callback_of_a_weak_reference(number: signal.Signals) -> None:
     class Body:
         pass
 
@@ -165,7 +165,7 @@ def test_a_polite_kill_of_any_command_is_an_interrupt(tmp_path, monkeypatch, cap
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_an_interrupted_session_is_told_to_be_no_start_for_another(tmp_path, monkeypatch, capsys) -> None:
+def test_an_interrupted_session_is_reported_as_no_start_for_another(tmp_path, monkeypatch, capsys) -> None:
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
@@ -175,9 +175,9 @@ def test_an_interrupted_session_is_told_to_be_no_start_for_another(tmp_path, mon
     assert capsys.readouterr().err == "animat: interrupted; what was finished is kept\n"
     (tmp_path / "session.log").touch()
     assert animat(command) == 130
-    told = capsys.readouterr().err
-    assert told.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
-    assert f"its recording is not written yet: animat recover {tmp_path};" in told
+    error = capsys.readouterr().err
+    assert error.endswith("kept; a session cannot be resumed: start a new one in another folder\n")
+    assert f"its recording is not written yet: animat recover {tmp_path};" in error
     (tmp_path / "session.nwb").touch()
     assert animat(command) == 130
     assert "recover" not in capsys.readouterr().err

@@ -41,14 +41,14 @@ OTHERS: list[tuple[Kind, str, str]] = [
     ("recording", STATE_FILE, "recordings"),
     ("live", LIVE, "a live run"),
 ]
-"""Files that the modules write, what each belongs to, and how that is told."""
+"""Files that the modules write, what each belongs to, and its description."""
 
 
 @pytest.mark.parametrize(
-    ("kind", "mark", "told"), [(kind, *other) for kind in COMMANDS for of, *other in OTHERS if of != kind]
+    ("kind", "mark", "description"), [(kind, *other) for kind in COMMANDS for of, *other in OTHERS if of != kind]
 )
 def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
-    kind: Kind, mark: str, told: str, few_bootstraps: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: Kind, mark: str, description: str, few_bootstraps: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if kind == "session":
         write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
@@ -59,13 +59,13 @@ def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
     (out / mark).write_bytes(b"somebody's")
     expected, words = COMMANDS[kind]
     assert main([*(word.format(beside=tmp_path) for word in words), "--out", str(out)]) == 1
-    said = f"{out}: expected a folder for {expected}, got one with {told} ({mark}); choose another folder\n"
+    said = f"{out}: expected a folder for {expected}, got one with {description} ({mark}); choose another folder\n"
     assert capsys.readouterr().err.endswith(said)
     assert {file.name: file.read_bytes() for file in out.iterdir()} == {mark: b"somebody's"}
 
 
 @pytest.mark.parametrize("kind", COMMANDS)
-def test_ones_own_folder_an_empty_one_and_files_beside_are_taken(kind: Kind, tmp_path: Path) -> None:
+def test_a_folder_of_the_same_kind_an_empty_one_and_other_files_are_accepted(kind: Kind, tmp_path: Path) -> None:
     expect_no_other(tmp_path / "none", kind)
     for beside in (".p0.safetensors", ".session.log", "notes.txt", SELECTION_FILE, "raster.png", "best.toml"):
         (tmp_path / beside).touch()

@@ -561,7 +561,7 @@ def network(seed: int, spikes: float, n: int = 3000) -> Responses:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_fewer_the_spikes_the_more_the_stimulus_tells_of_what_was_answered(seed: int) -> None:
+def test_the_fewer_the_spikes_the_more_the_stimulus_weighs_in_the_trace(seed: int) -> None:
     many = fit_memory(network(seed, spikes=300)).memory
     few = fit_memory(network(seed, spikes=3)).memory
     # The network's own: what it remembers is its activity, which so many spikes tell as it is.
@@ -595,7 +595,7 @@ def test_without_memory_none_is_found_where_responses_are_of_few_spikes() -> Non
     assert found.count(NO_MEMORY) >= 36
 
 
-def test_the_optimum_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
+def test_the_optimum_of_a_custom_simulator_with_memory_is_refused() -> None:
     class Own(EmpiricalSimulator):
         has_memory = True
 
@@ -660,7 +660,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
 
 
 @pytest.mark.oracle
-def test_an_environment_without_neurons_has_its_optimum_whatever_simulator_is_beside_it() -> None:
+def test_an_environment_without_neurons_has_its_optimum_with_any_simulator() -> None:
     """As a case of its own, and beside one whose neurons remember."""
     alone = best_return(WithoutNeurons(Stairs(5), (-1.0, 1.0)), None, grid=STEPS, episodes=10)
     both = [(WithoutNeurons(Stairs(5), (-1.0, 1.0)), persistent()), (Animat(Stairs(5), Thresholds(1), 2), persistent())]
@@ -704,7 +704,7 @@ def test_conditions_in_blocks_are_not_taken_for_memory() -> None:
     assert not list(memory_findings(replace(blocks, conditions=(*blocks.conditions, Condition("none", 1.0, "Hz")))))
 
 
-def test_a_memory_of_blocks_is_told() -> None:
+def test_a_memory_of_blocks_is_reported() -> None:
     for order in ("mixed", "blocked"):
         responses = chain(200, after_low=(0.1, 0.5), after_high=(0.3, 0.9), presentation=Presentation(order))
         found = {finding.name for finding in fit_timeline([responses], kind="memory").findings}
@@ -712,7 +712,7 @@ def test_a_memory_of_blocks_is_told() -> None:
         assert "memory-of-blocks" not in {finding.name for finding in fit_timeline([responses]).findings}
 
 
-def test_what_a_simulator_with_memory_keeps_is_told_by_what_it_answers() -> None:
+def test_the_fidelity_of_a_simulator_with_memory_is_that_of_its_answers() -> None:
     (kept,) = fit_timeline([chain(2000, after_low=(0.1, 0.5), after_high=(0.5, 0.9))], kind="memory").fidelities
     np.testing.assert_allclose(kept.in_simulator, kept.in_data, atol=0.03)
     assert not np.array_equal(kept.in_simulator, kept.in_data)
@@ -738,7 +738,7 @@ def test_what_a_simulator_with_memory_keeps_is_what_many_draws_come_to() -> None
     np.testing.assert_allclose(fidelity(responses, simulator).in_simulator, above, atol=0.015)
 
 
-def test_too_few_to_draw_the_nearest_from_is_told() -> None:
+def test_too_few_neighbours_are_reported() -> None:
     few = chain(40, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
     # Always the nearest alone: what had an outlying history is drawn most often.
     kept = fidelity(few, fit_memory(few, memory=Memory(0.0, 0.0, 0.0)))
@@ -750,7 +750,7 @@ def test_too_few_to_draw_the_nearest_from_is_told() -> None:
     assert all(finding.name != "binning" for finding in fit_timeline([few], kind="memory").findings)
 
 
-def test_training_tells_what_is_remembered() -> None:
+def test_training_reports_the_memory() -> None:
     series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
@@ -760,8 +760,8 @@ def test_training_tells_what_is_remembered() -> None:
     n = int(np.median([np.count_nonzero(series[0].condition == c) for c in range(2)]))
     near = int(np.median([np.rint(len(series[0].rates_of(c)) ** neighbour_exponent) for c in range(2)]))
     assert first.endswith(f"draws from the {near} responses with the most similar history, of the {n} of a condition")
-    (told,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
-    assert told.endswith(". How much was stimulated in the last 1 s counts too")
+    (message,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
+    assert message.endswith(". How much was stimulated in the last 1 s counts too")
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 

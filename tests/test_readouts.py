@@ -1,4 +1,4 @@
-"""Readouts: groups of channels, read from the same windows, told by their electrodes; against counting by hand."""
+"""Readouts: groups of channels, read in the same windows, identified by electrode; against counts by hand."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_one_group_of_all_channels_is_read_to_the_bit_as_all_channels_are(record
     np.testing.assert_array_equal(responses.read_hz, responses.rate_hz)
 
 
-def test_channels_are_told_by_electrode_whatever_their_order(recording: Recording, halves: Readouts) -> None:
+def test_channels_are_identified_by_electrode_in_any_order(recording: Recording, halves: Readouts) -> None:
     other = reordered(recording, np.random.default_rng(0).permutation(len(recording.channels)))
     assert readouts_on("halves", other.channels) == halves
     here, there = (extract_responses(each, readouts=halves) for each in (recording, other))
@@ -195,7 +195,7 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("[[1], [2]]", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
         ("null", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
@@ -209,17 +209,17 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
         ('{"\\n": [1]}', ".names: expected a different printable name for each group of electrodes (1 in all)"),
     ],
 )
-def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) -> None:
+def test_a_file_of_no_readouts_is_named(text: str, expected: str, tmp_path: Path) -> None:
     (tmp_path / "groups.json").write_text(text)
     with pytest.raises(InvalidFile) as raised:
         read_readouts(tmp_path / "groups.json")
-    assert f"groups.json: readouts{told}" in str(raised.value) and "\n" not in str(raised.value)
+    assert f"groups.json: readouts{expected}" in str(raised.value) and "\n" not in str(raised.value)
     with pytest.raises(InvalidFile, match="named readouts are all, halves and quadrants"):
         read_readouts("thirds")
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "expected"),
     [
         (5, ": expected a table, got 5"),
         ({"names": ["a"]}, r".electrodes: expected a group of electrodes for each of the names \('a',\), got none"),
@@ -227,6 +227,6 @@ def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) ->
         ({"names": ["a"], "electrodes": [1]}, ".electrodes: expected a list, got 1"),
     ],
 )
-def test_data_of_no_readouts_are_refused(data: object, told: str) -> None:
-    with pytest.raises(InvalidArgument, match=f"^readouts{told}"):
+def test_data_of_no_readouts_are_refused(data: object, expected: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"^readouts{expected}"):
         Readouts.from_dict(data)

@@ -107,7 +107,7 @@ def test_every_draw_is_a_recorded_trial_with_all_its_readouts(kind: str) -> None
 
 
 def test_memory_chooses_the_trial_that_it_would_with_one_readout() -> None:
-    """What is remembered is of all channels: only what is told of the trial that is drawn is more."""
+    """The history is of all channels; a trial that is drawn only adds the responses of its readouts."""
     responses, memory = of_halves(), Memory(0.3, 0.5, 0.7)
     both = fit_memory(responses, memory=memory)
     one = fit_memory(replace(responses, readouts=Readouts(), readout_hz=None), memory=memory)
@@ -134,7 +134,7 @@ def test_percentiles_and_shares_are_of_each_readout() -> None:
         np.testing.assert_array_equal(drawn(silenced(simulator), 10), np.zeros((3, 10, 2)))
 
 
-def test_what_a_range_loses_is_told_with_its_readout() -> None:
+def test_what_a_range_loses_is_reported_with_its_readout() -> None:
     kept = fidelity(of_halves(), fit_simulator(of_halves(), kind="histogram", bins=2, range_hz=200.0))
     (finding,) = [each for each in kept.findings() if each.name == "binning"]
     assert " Hz on left from " in finding.message or " Hz on right from " in finding.message

@@ -31,7 +31,7 @@ def responses_of(
         [np.full(len(v), i) for i, v in enumerate(values_hz)] + [np.zeros(len(bursts_hz), int)]
     ).astype(int)
     is_burst = np.arange(len(x)) >= len(x) - len(bursts_hz)
-    told = {
+    columns = {
         "condition": condition,
         "rate_hz": x,
         "active_ratio": np.where(is_burst, 0.9, 0.1),
@@ -44,7 +44,7 @@ def responses_of(
         "presentation": Presentation("blocked"),
         "start_min": start_min,
     }
-    return Responses(**(told | changes))
+    return Responses(**(columns | changes))
 
 
 def draw(simulator: object, condition: int, n: int = 20_000, seed: int = 0) -> np.ndarray:

@@ -111,7 +111,7 @@ def autoregressive(rho: float, n: int, seed: int = 1) -> Responses:
 
 
 @pytest.mark.oracle
-def test_a_chain_with_memory_is_told_from_one_without() -> None:
+def test_a_chain_with_memory_is_distinguished_from_one_without() -> None:
     rho = 0.7
     remembering = validate(autoregressive(rho, 3_000))
     # Of a command, from the response before it: deciles of a normal distribution, over 2,000 places of the last one.
@@ -513,9 +513,9 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     given = ["validate", str(recorded), "--out", str(tmp_path / "figures"), "--json"]
     assert main(given) == 0
     printed = capsys.readouterr().out
-    told = json.loads(printed.splitlines()[-1], parse_constant=pytest.fail)["recordings"]
-    assert [each["name"] for each in told] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
-    for each in told:
+    recordings = json.loads(printed.splitlines()[-1], parse_constant=pytest.fail)["recordings"]
+    assert [each["name"] for each in recordings] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
+    for each in recordings:
         assert f"{each['name']}: {each['verdict']}" in printed
         assert each["verdict"].startswith("Cannot be trusted: conditions were presented in blocks")
         assert sum(each["simulators"]["histogram"]["pit"]) == pytest.approx(1)
@@ -569,8 +569,8 @@ def test_readouts_are_scored_each(recorded: Path, tmp_path: Path, capsys: pytest
     file, figures = recorded / "recording_0000_min.nwb", tmp_path / "figures"
     assert main(["validate", str(file), "--readouts", "halves", "--out", str(figures), "--json"]) == 0
     printed = capsys.readouterr().out
-    told = json.loads(printed.splitlines()[-1])["recordings"]
-    assert [each["name"] for each in told] == [f"{file.name}, left", f"{file.name}, right"]
+    recordings = json.loads(printed.splitlines()[-1])["recordings"]
+    assert [each["name"] for each in recordings] == [f"{file.name}, left", f"{file.name}, right"]
     assert len(list(figures.glob("*.png"))) == 2
     assert "left, right: " in printed
 

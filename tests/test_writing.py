@@ -35,7 +35,7 @@ def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_
 @pytest.mark.parametrize(
     "error", [OSError(28, "No space left on device"), ValueError("something else"), KeyboardInterrupt()]
 )
-def test_on_any_error_the_old_file_stays_and_nothing_lies_beside_it(tmp_path: Path, error: BaseException) -> None:
+def test_on_any_error_the_old_file_stays_and_nothing_is_left_behind(tmp_path: Path, error: BaseException) -> None:
     path = tmp_path / "b.txt"
     path.write_text("old")
     expected = InvalidFile if isinstance(error, OSError) else type(error)
