@@ -36,7 +36,7 @@ from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.quality.memory import memory_findings
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
@@ -129,7 +129,7 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memo
         rate_hz=x.astype(float),
         active_ratio=np.full(len(x), 0.1),
         is_burst=burst,
-        presented=Presented(every, every_x.astype(float), bursts, sixth == 0),
+        presented=Trials(every, every_x.astype(float), bursts, sixth == 0),
         place=place,
     )
     if any(not np.any((condition == c) & ~burst) for c in (0, 1)):
@@ -183,7 +183,7 @@ def loaded(n: int, seed: int, *, slope: float) -> Responses:
     condition = rng.integers(0, 3, n)
     x = 50.0 + 5.0 * condition + slope * (loads_by_hand(condition, 2.0) - 0.5) + rng.normal(0, 5, n)
     columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": np.zeros(n, bool)}
-    every = Presented(condition, x, columns["is_burst"], np.arange(n) == 0, np.cumsum(PERIODS_S[condition]))
+    every = Trials(condition, x, columns["is_burst"], np.arange(n) == 0, np.cumsum(PERIODS_S[condition]))
     return replace(responses_of(*[[1.0]] * 3), presented=every, place=np.arange(n), **columns)
 
 
@@ -215,7 +215,7 @@ def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> Non
     for seed in range(40):
         responses = chain(600, after_low=(0.1, 0.3, 0.2), after_high=(0.7, 0.9, 0.8), seed=seed)
         condition = responses.condition
-        every = Presented(
+        every = Trials(
             condition, responses.rate_hz, responses.is_burst, np.arange(600) == 0, np.cumsum(PERIODS_S[condition])
         )
         memory = fit_memory(replace(responses, presented=every, place=np.arange(600))).memory
@@ -231,7 +231,7 @@ def test_trials_further_apart_than_a_silence_have_a_load() -> None:
     condition = rng.integers(0, 2, 400)
     since_s = np.array([2.0, 0.05])[condition]
     x = 50.0 + 5.0 * condition + rng.normal(0, 5, 400)
-    every = Presented(condition, x, np.zeros(400, bool), since_s > 1.0, np.cumsum(since_s))
+    every = Trials(condition, x, np.zeros(400, bool), since_s > 1.0, np.cumsum(since_s))
     columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(400, 0.1), "is_burst": every.is_burst}
     responses = replace(responses_of([1.0], [1.0]), presented=every, place=np.arange(400), **columns)
     simulator = fit_memory(responses, memory=Memory(0.0, 0.0, 0.5, 1.0))
@@ -415,7 +415,7 @@ def test_presentations_that_do_not_fit_are_refused() -> None:
     with pytest.raises(Mismatch, match=r"responses.place: expected rows from 0 to 19, got 1 to 20"):
         replace(responses, presented=presented, place=place + 1)
     with pytest.raises(Mismatch, match=r"presented.is_rested: expected 20 values"):
-        Presented(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested[1:])
+        Trials(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested[1:])
 
 
 @pytest.mark.oracle

@@ -15,7 +15,7 @@ from animat.reality_gap.predicting import Predicted
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.responses.condition import Condition
 from animat.responses.readouts import Readouts
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.stimulation.protocol import Presentation
 
 CONDITIONS = (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))
@@ -79,7 +79,7 @@ def session(
         float("nan"),
         presentation=Presentation("mixed", 1),
         time_s=time_s,
-        presented=Presented(condition, told["rate_hz"], told["is_burst"], np.zeros(len(EVERY), bool)),
+        presented=Trials(condition, told["rate_hz"], told["is_burst"], np.zeros(len(EVERY), bool)),
         place=EVERY,
     )
     command = commands(told["rate_hz"][None], recorded)[0]

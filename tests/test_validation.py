@@ -33,7 +33,7 @@ from animat.report.validation import draw_validation, validation_text
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.stimulation.protocol import Presentation, Protocol
 from synthetic_recordings import write_synthetic_series
 from test_simulator import responses_of
@@ -220,7 +220,7 @@ def test_what_is_held_out_is_not_fitted_to() -> None:
 
     def responses(x: np.ndarray) -> Responses:
         burst = np.zeros(n, bool)
-        presented = Presented(every, x, burst, burst, time_s)
+        presented = Trials(every, x, burst, burst, time_s)
         return series(x[place], every[place], 2, presented=presented, place=place, time_s=time_s[place])
 
     for kind in ("histogram", "empirical", "memory"):
@@ -278,7 +278,7 @@ def test_a_free_run_remembers_its_own_answers() -> None:
         every[place],
         2,
         is_burst=burst[place],
-        presented=Presented(every, x, burst, rested, time_s),
+        presented=Trials(every, x, burst, rested, time_s),
         place=place,
         time_s=time_s[place],
     )

@@ -31,7 +31,7 @@ results reproducible to the bit. Options that `XLA_FLAGS` sets are left alone.
 def cache_folder() -> Path:
     """Where compiled programs are kept: `JAX_COMPILATION_CACHE_DIR`, or our folder in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    return Path(chosen) if chosen else _usual_cache() / "animat" / "xla"
+    return Path(chosen) if chosen else _user_cache() / "animat" / "xla"
 
 
 def keep_compilations() -> None:
@@ -65,12 +65,12 @@ def pynwb_importable() -> Iterator[None]:
     Its own cache is disabled: if two processes import it for the first time, one reads what the other has half written,
     and a process killed at that moment leaves a file that breaks every later import.
     """
-    usual = _usual_cache()
+    cache = _user_cache()
     with suppress(OSError):
-        usual.mkdir(parents=True, exist_ok=True)
+        cache.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         changed = {"PYNWB_NO_CACHE_DIR": "1"}
-        if not os.access(usual, os.W_OK | os.X_OK):
+        if not os.access(cache, os.W_OK | os.X_OK):
             changed["XDG_CACHE_HOME"] = folder
         before = {name: os.environ.get(name) for name in changed}
         os.environ.update(changed)
@@ -100,7 +100,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-def _usual_cache() -> Path:
+def _user_cache() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:

@@ -321,7 +321,7 @@ class _World:
             return cls(first, WithoutNeurons(body, first.commands))
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators for policies that act through neurons")
-        minute = float(timeline.start_min[timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)])
+        minute = float(timeline.start_min[timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)])
         findings = (*transfer.other_timeline(first, timeline), *transfer.not_of_a_loop(first, timeline, minute))
         fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)

@@ -24,7 +24,7 @@ from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
-from animat.responses.readouts import USUAL_READOUTS, Readouts
+from animat.responses.readouts import DEFAULT_READOUTS, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.host import HostRobot
@@ -122,11 +122,11 @@ def set_up(
                 raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
     if recordings is not None:
         by = None if conditions is None else conditions_named(conditions)
-        read = readouts or USUAL_READOUTS.get(body.n_commands, "all")
+        read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")
         timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=read), kind=kind)
         for message in warnings_once(timeline.findings):
             warnings.warn(message, stacklevel=2)
-        row = 0 if at_min is None else timeline.row_asked_for(at_min)
+        row = 0 if at_min is None else timeline.requested_row(at_min)
         simulator = timeline.at(timeline.start_min[row])
         labels = tuple(condition.label for condition in timeline.conditions)
     elif simulator is not None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.responses.conditions import NO_CONDITION
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 
 INITIAL_HISTORY = (0.5, 0.5)
 """Trace and load at the start of an episode: its warm-up was presented in random order, as in a recording.
@@ -54,7 +54,7 @@ class Loads(NamedTuple):
         every: at each trial, shape (presentations,).
         at: at each response, shape (responses,).
         after: after the trial before it, shape (responses,).
-        kept: the share left at the next trial, for a trial of each condition, shape (conditions,).
+        kept: the share that is left when a trial of each condition comes, shape (conditions,).
         added: by each trial; 0: there is no load.
     """
 
@@ -97,7 +97,7 @@ class Ranked:
         self, memory: Memory
     ) -> tuple[Float64[np.ndarray, " presentations"], Float64[np.ndarray, " presentations"]]:
         """The trace before each trial, and the increment by its response."""
-        presented: Presented = self._presented
+        presented: Trials = self._presented
         # For trials without a condition, the middle rank is as good as any.
         means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
         left = trace_increment(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)

@@ -81,7 +81,7 @@ class SimulatorTimeline:
         """The newest recording at a minute: the last one that started at or before it (before all: the first)."""
         return max(0, int(np.searchsorted(self.start_min, minute, side="right")) - 1)
 
-    def row_asked_for(self, minute: float) -> int:
+    def requested_row(self, minute: float) -> int:
         """The same for a minute that a user gave.
 
         Raises:
@@ -115,7 +115,7 @@ def room_for(series: Sequence[Responses]) -> int:
     return max(int(np.bincount(each.condition[~each.is_burst], minlength=1).max()) for each in series)
 
 
-def usual_kind(responses: Responses) -> Kind:
+def default_kind(responses: Responses) -> Kind:
     """The kind that suits a recording: one with memory, unless stimuli in blocks hide the memory."""
     return "histogram" if responses.is_blocked else "memory"
 
@@ -144,7 +144,7 @@ def fit_timeline(
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
-    kind = kind or usual_kind(first)
+    kind = kind or default_kind(first)
     for other in ordered[1:]:
         for name in ("conditions", "window_ms", "presentation", "readouts"):
             if getattr(other, name) != getattr(first, name):

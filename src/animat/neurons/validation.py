@@ -25,7 +25,7 @@ from animat.neurons.prediction import (
     transformed,
 )
 from animat.neurons.simulator import pooled_percentiles
-from animat.neurons.timeline import usual_kind
+from animat.neurons.timeline import default_kind
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -293,7 +293,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         _mean(lasted),
         shares_lasting(lasted),
         tuple(scores),
-        kind or usual_kind(responses),
+        kind or default_kind(responses),
         responses.is_blocked,
         band,
     )

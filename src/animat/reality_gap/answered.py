@@ -14,7 +14,7 @@ from animat.closed_loop.session import Session
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
 from animat.responses.extraction import SILENCE_S
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.robots.base import Robot
 
 
@@ -112,7 +112,7 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
     before_s = np.concatenate([[-np.inf], read_s[:-1]])
     is_rested = first_s - before_s > SILENCE_S
-    every = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
+    every = Trials(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
     responses = Responses(
         condition=every.condition[at],
         rate_hz=every.rate_hz[at],

@@ -105,7 +105,7 @@ class Calibration:
             first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
             trained_until = None if policy is None else policy.trained_until_min(first_min)
             at_min = last_min if policy is None else first_min if trained_until is None else trained_until
-        start_min = float(timeline.start_min[timeline.row_asked_for(at_min)])
+        start_min = float(timeline.start_min[timeline.requested_row(at_min)])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         recorded = simulator = timeline.at(start_min)

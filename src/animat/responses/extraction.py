@@ -15,7 +15,7 @@ from animat.responses.bursts import BurstSeparation, separate_bursts
 from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 
 SILENCE_S = 1.0
@@ -148,7 +148,7 @@ def _sorted(
         presentation=source.presentation,
         start_min=source.start_min,
         time_s=None if time_s is None else time_s[chosen],
-        presented=Presented(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
+        presented=Trials(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
         place=np.flatnonzero(chosen),
         by=str(by),
         burst_threshold=burst_threshold,

@@ -22,7 +22,7 @@ CUT_NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom
 """Names of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
 _MOST_BYTES = 2**20
 MOST_READOUTS = 64
-USUAL_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
+DEFAULT_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
 """By the number of commands that a robot takes."""
 
 Group = Annotated[tuple[Electrode, ...], Field(min_length=1)]

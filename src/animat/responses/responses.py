@@ -19,7 +19,7 @@ from animat.tables import briefly, read_only
 
 
 @dataclass(frozen=True, eq=False)
-class Presented:
+class Trials:
     """All trials of a recording in the order of time, which form the history of each response.
 
     Attributes:
@@ -94,7 +94,7 @@ class Responses:
     start_min: float = 0.0
     findings: tuple[Finding, ...] = ()
     time_s: Float64[np.ndarray, " responses"] | None = None
-    presented: Presented | None = None
+    presented: Trials | None = None
     place: Int64[np.ndarray, " responses"] | None = None
     by: str | None = None
     burst_threshold: float | None = None
@@ -143,11 +143,11 @@ class Responses:
         return self.presentation is not None and self.presentation.order == "blocked"
 
     @property
-    def presentations(self) -> tuple[Presented, Int64[np.ndarray, " responses"]]:
+    def presentations(self) -> tuple[Trials, Int64[np.ndarray, " responses"]]:
         """All trials of the recording in the order of time, and the index of each response among them."""
         if self.presented is not None and self.place is not None:
             return self.presented, self.place
-        every = Presented(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
+        every = Trials(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
         return every, np.arange(len(self))
 
     @property

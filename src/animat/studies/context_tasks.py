@@ -13,7 +13,7 @@ from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import train_alone
 from animat.progress import EqualPhases, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
-from animat.responses.readouts import USUAL_READOUTS
+from animat.responses.readouts import DEFAULT_READOUTS
 from animat.responses.responses import Responses
 from animat.studies.task import draw_seed
 
@@ -138,7 +138,7 @@ class RobotTask(ContextTask):
         from animat.responses.series import extract_series
 
         recordings = read_sources([self.recordings(folder, self.n_commands)])
-        return extract_series(recordings, readouts=USUAL_READOUTS[self.n_commands])
+        return extract_series(recordings, readouts=DEFAULT_READOUTS[self.n_commands])
 
     def drawn(self, what: str) -> int:
         """A seed of its own for each culture and robot: else sessions of all begin at the same few starts."""
