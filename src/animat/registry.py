@@ -79,7 +79,7 @@ class Registry(Generic[Thing]):
         self._registered[name] = kind
         if kind.__module__ == "__main__":
             # In a worker, __main__ is the worker; classes of a script are imported there by the script's file name.
-            copyreg.pickle(kind, self._reduced)
+            copyreg.pickle(kind, self._reduce)
 
     def add_family(self, name: str, family: type[Any]) -> None:
         """Register a family of things from elsewhere, each by its name there: `gymnasium:Pendulum-v1`.
@@ -224,9 +224,9 @@ class Registry(Generic[Thing]):
         if name in self._registered:
             return self._registered[name]
         if ":" in name:
-            return self._imported(name)
+            return self._import_class(name)
         for point in importlib.metadata.entry_points(group=self.entry_points, name=name):
-            found: Any = self._imported(point.value)
+            found: Any = self._import_class(point.value)
             if found.name != name:
                 raise InvalidArgument(
                     f"{self.noun}: expected {point.value} to have the name {name!r}, got {found.name!r}"
@@ -234,7 +234,7 @@ class Registry(Generic[Thing]):
             return found  # type: ignore[no-any-return]
         return None
 
-    def _imported(self, place: str) -> type[Thing]:
+    def _import_class(self, place: str) -> type[Thing]:
         for kind in self._registered.values():
             if place_of(kind) == place:
                 return kind
@@ -254,12 +254,12 @@ class Registry(Generic[Thing]):
         self.register(found)
         return found
 
-    def _reduced(self, thing: Thing) -> tuple[Any, ...]:
-        return self._remade, (place_of(type(thing)), dataclasses.asdict(thing))  # type: ignore[call-overload]
+    def _reduce(self, thing: Thing) -> tuple[Any, ...]:
+        return self._recreate, (place_of(type(thing)), dataclasses.asdict(thing))  # type: ignore[call-overload]
 
-    def _remade(self, place: str, parameters: dict[str, Any]) -> Thing:
+    def _recreate(self, place: str, parameters: dict[str, Any]) -> Thing:
         try:
-            return self._imported(place)(**parameters)
+            return self._import_class(place)(**parameters)
         except InvalidArgument as error:
             hint = "put what the script runs under `if __name__ == '__main__':`, as worker processes import it"
             raise InvalidArgument(f"{error}; {hint}") from error

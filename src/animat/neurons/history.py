@@ -150,7 +150,7 @@ def trace_increment(
     return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
 
 
-class Recorded(NamedTuple):
+class RecordedStates(NamedTuple):
     """The history state before each trial of a recording, for a simulator fitted to a part of it.
 
     Attributes:
@@ -163,7 +163,7 @@ class Recorded(NamedTuple):
     left: Float64[np.ndarray, " presentations"]
 
 
-def recorded_states(responses: Responses, memory: Memory) -> Recorded:
+def recorded_states(responses: Responses, memory: Memory) -> RecordedStates:
     """The history states of all trials of a recording.
 
     Args:
@@ -172,4 +172,4 @@ def recorded_states(responses: Responses, memory: Memory) -> Recorded:
     """
     ranked = Ranked(responses)
     traces, left = ranked.recorded(memory)
-    return Recorded(traces, ranked.loads(memory.load_s).every, left)
+    return RecordedStates(traces, ranked.loads(memory.load_s).every, left)

@@ -250,7 +250,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     percentiles = np.asarray(pooled_percentiles(halves.first))
     percentiles = percentiles if readout is None else percentiles[readout]
     simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}
-    distances, band = _of_chance(halves, rng)
+    distances, band = _chance_levels(halves, rng)
     probabilities: dict[str, Float64[np.ndarray, "held classes"]] = {}
     scores = []
     for each in (MARGINAL, *kinds):
@@ -332,7 +332,9 @@ def distance_from_uniform(transforms: Float64[np.ndarray, "held 2"]) -> float:
     return float(np.abs(share_below(transforms, at) - at).max())
 
 
-def _of_chance(halves: Halves, rng: np.random.Generator) -> tuple[Float64[np.ndarray, " chances"], tuple[float, float]]:
+def _chance_levels(
+    halves: Halves, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, " chances"], tuple[float, float]]:
     """Distances from uniform, and the middle 95 % of the bins' shares, if both halves have the same distributions.
 
     They are simulated with independent uniform responses, as many per condition and half as recorded: only the ranks of

@@ -109,7 +109,7 @@ def answered(session: Session, loop: Loop, policies: Collection[str]) -> Answere
     condition, rate_hz, is_burst, first_s, read_s = _columns(presented, 5)
     episode, at, late_s, active_ratio, moved = _columns(acted, 5)
     at = at.astype(np.int64)
-    x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
+    x_hz = loop.readouts.squeeze(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
     before_s = np.concatenate([[-np.inf], read_s[:-1]])
     is_rested = first_s - before_s > SILENCE_S
     every = Trials(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)

@@ -256,7 +256,7 @@ def conditions_named(text: str) -> Conditions:
         if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
             return ByBoth(when, where)
     if is_product:
-        raise _unread(text, "frequency or interval before x, and electrode or pattern after it")
+        raise _invalid(text, "frequency or interval before x, and electrode or pattern after it")
     name, _, rest = text.strip().partition(":")
     name, rest = name.strip(), rest.strip()
     if name == "all" and not rest:
@@ -269,13 +269,13 @@ def conditions_named(text: str) -> Conditions:
             return ByInterval(_floats(text, values))
         percent = _floats(text, tolerance.strip().removesuffix("%"))
         if len(percent) != 1 or not tolerance.strip().endswith("%"):
-            raise _unread(text, "one tolerance in per cent after +-, as in interval:5,10+-25%")
+            raise _invalid(text, "one tolerance in per cent after +-, as in interval:5,10+-25%")
         return ByInterval(_floats(text, values), percent[0] / 100)
     if name == "electrode":
         return ByElectrode(tuple(_integers(text, part, "+") for part in rest.split(",") if rest))
     if name == "pattern":
         return ByPattern(_integers(text, rest, ","))
-    raise _unread(
+    raise _invalid(
         text, "one of all, frequency, frequency:5,10, interval:5,10+-25%, electrode, pattern, frequency x pattern"
     )
 
@@ -325,18 +325,18 @@ def _floats(text: str, listed: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in listed.split(",")) if listed else ()
     except ValueError:
-        raise _unread(text, "numbers separated by commas, as in interval:5,10") from None
+        raise _invalid(text, "numbers separated by commas, as in interval:5,10") from None
 
 
 def _integers(text: str, listed: str, separator: str) -> tuple[int, ...]:
     try:
         numbers = tuple(int(part) for part in listed.split(separator)) if listed else ()
     except ValueError:
-        raise _unread(text, f"whole numbers separated by {separator!r}") from None
+        raise _invalid(text, f"whole numbers separated by {separator!r}") from None
     if any(abs(number) >= 2**63 for number in numbers):
-        raise _unread(text, "whole numbers of electrodes or patterns")
+        raise _invalid(text, "whole numbers of electrodes or patterns")
     return numbers
 
 
-def _unread(text: str, expected: str) -> InvalidArgument:
+def _invalid(text: str, expected: str) -> InvalidArgument:
     return InvalidArgument(f"conditions: expected {expected}; got {text!r}")

@@ -69,7 +69,7 @@ def extract_responses(
     presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
     # Trials without a condition are read too, as the history of others.
     rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
-    responses, assignment, bursts = _sorted(source, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    responses, assignment, bursts = _sort(source, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
     if not readouts.are_all and responses.time_s is not None:
         members = readouts.members(source.channels)
         readout_hz = readouts.read(source, members, responses.time_s, window_ms)
@@ -105,15 +105,15 @@ def _of_table(
     presented = np.flatnonzero(table.stimuli.is_last_of_presentation)
     rate_hz = table.values[presented].mean(axis=1) * scale
     active_ratio = np.mean(table.values[presented] > 0, axis=1)
-    responses, assignment, bursts = _sorted(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    responses, assignment, bursts = _sort(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
     if not readouts.are_all:
         members, values = readouts.members(table.channels), table.values[presented[responses.presentations[1]]]
         readout_hz = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1) * scale
-        responses = replace(responses, readouts=readouts, readout_hz=readouts.alone(readout_hz))
+        responses = replace(responses, readouts=readouts, readout_hz=readouts.squeeze(readout_hz))
     return replace(responses, findings=(*assumed, *findings_on(responses, table, assignment, bursts)))
 
 
-def _sorted(
+def _sort(
     source: Recording | ResponseTable,
     by: Conditions | None,
     window_ms: tuple[float, float],

@@ -113,9 +113,9 @@ class Readouts:
         channel = recording.spike_channels[spike]
         spikes = np.array([np.bincount(window[group[channel]], minlength=len(after_s)) for group in members])
         rate_hz = spikes.T / ((window_ms[1] - window_ms[0]) * 1e-3 * members.sum(axis=1))
-        return self.alone(rate_hz)
+        return self.squeeze(rate_hz)
 
-    def alone(self, values: Float64[np.ndarray, "*any readouts"]) -> Float64[np.ndarray, "*any_readouts"]:
+    def squeeze(self, values: Float64[np.ndarray, "*any readouts"]) -> Float64[np.ndarray, "*any_readouts"]:
         """Values of each group; for a single group, without the axis of readouts (the paper's shapes)."""
         return values[..., 0] if len(self) == 1 else values
 
