@@ -6,7 +6,7 @@ import statistics
 from typing import Any
 
 import peers
-from animat.lined_up import lined_up
+from animat.columns import align_columns
 
 
 def print_table(measured: dict[str, Any]) -> None:
@@ -61,4 +61,4 @@ def print_table(measured: dict[str, Any]) -> None:
             )
         rows[-1] = (*rows[-1][:2], f"{rows[-1][2]}; {steps:,.0f} steps each, best return {best:.0f}")
     print(f"{measured['machine']}")
-    print("\n".join(lined_up(("", "", ""), rows)[1:]))
+    print("\n".join(align_columns(("", "", ""), rows)[1:]))

@@ -23,8 +23,8 @@ from animat.cultures.observed import Observed, Spikes
 from animat.errors import InvalidArgument
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Memory, Ranked
+from animat.neurons.history_tracker import HistoryState
 from animat.neurons.memory import fit_memory
-from animat.neurons.remembering import Remembered
 from animat.neurons.simulator import fit_empirical
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
@@ -118,7 +118,7 @@ def test_thresholds_follow_the_newest_of_each_condition_and_nothing_else(data: s
     answered = list[Answered]()
     for condition in data.draw(st.lists(st.integers(0, len(sizes) - 1), max_size=30)):
         answered.append((condition, float(rng.gamma(5.0, 1.0)), 0.0))
-        thresholds.add(condition, Remembered(), np.array(answered[-1][1]))
+        thresholds.add(condition, HistoryState(), np.array(answered[-1][1]))
     np.testing.assert_allclose(thresholds.percentiles(), thresholds_after(recorded_hz, answered), rtol=1e-5)
 
 
@@ -133,7 +133,7 @@ def test_when_all_responses_rise_on_a_normal_scale_thresholds_rise_with_them(by:
         responses_hz, ranks = map(tuple, newest)
         thresholds = AdaptiveThresholds(replace(adjusted, responses_hz=responses_hz, ranks=ranks))
         for turn, x in enumerate(np.exp(rng.normal(size=60) + by)):
-            thresholds.add(turn % 2, Remembered(), np.array(x))
+            thresholds.add(turn % 2, HistoryState(), np.array(x))
         found.append(np.log(thresholds.percentiles()[5]))
 
     # Of each condition 70 are standard normal and 30 higher by `by`: of one of each P(x < y) = Phi(by / sqrt(2)).
@@ -153,12 +153,12 @@ def test_a_condition_that_is_no_longer_given_counts_less_and_less(adjusted: Adju
 
     for condition in (0, 1, 2):
         for _ in range(LATEST):
-            thresholds.add(condition, Remembered(), adjusted.sorted_hz[-5])
+            thresholds.add(condition, HistoryState(), adjusted.sorted_hz[-5])
     assert share() > 0.6
     # Those of the other two are as ever.
     for _ in range(300):
         condition = int(rng.integers(3, 5))
-        thresholds.add(condition, Remembered(), rng.choice(adjusted.responses_hz[condition]))
+        thresholds.add(condition, HistoryState(), rng.choice(adjusted.responses_hz[condition]))
     assert abs(share() - 0.5) < 0.15
 
 
@@ -166,7 +166,7 @@ def test_whatever_comes_thresholds_are_finite_and_in_order(adjusted: AdjustedRan
     for x in (-1.0, 1e6):
         thresholds = AdaptiveThresholds(adjusted)
         for condition in [*range(5)] * 100:
-            thresholds.add(condition, Remembered(), np.array(x))
+            thresholds.add(condition, HistoryState(), np.array(x))
             percentiles = thresholds.percentiles()
             assert np.all(np.isfinite(percentiles)) and np.all(np.diff(percentiles) >= 0)
 
@@ -188,7 +188,7 @@ def test_an_adjusted_rank_has_nothing_left_of_trace_and_load(recorded: Responses
 
 def test_without_memory_an_adjusted_rank_is_the_rank(adjusted: AdjustedRanks) -> None:
     np.testing.assert_array_equal(adjusted.slopes, 0.0)
-    came = Remembered(trace=0.9, load=2.0)
+    came = HistoryState(trace=0.9, load=2.0)
     assert adjusted.of_response(came, np.array(adjusted.sorted_hz[-1] + 1)) == pytest.approx(1.0)
 
 
@@ -196,7 +196,7 @@ def test_trial_by_trial_a_loop_finds_the_adjusted_ranks_of_the_recording(recorde
     adjusted = AdjustedRanks.of(recorded, fit_memory(recorded, memory=MEMORY))
     presented, place = recorded.presentations
     assert presented.time_s is not None
-    state, found, remembering = Remembered(), [], adjusted.remembering
+    state, found, remembering = HistoryState(), [], adjusted.remembering
     for condition, x, is_burst, is_rested, at_s in zip(
         presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, presented.time_s, strict=True
     ):
@@ -217,9 +217,9 @@ def test_two_readouts_adapt_each_by_its_own() -> None:
     together = AdaptiveThresholds(AdjustedRanks.of(both, fit_empirical(both)))
     alone = [AdaptiveThresholds(AdjustedRanks.of(each, fit_empirical(each))) for each in of_each]
     for condition, x in ((0, (3.0, 9.0)), (1, (12.0, 2.0)), (0, (1.0, 1.0))):
-        together.add(condition, Remembered(), np.array(x))
+        together.add(condition, HistoryState(), np.array(x))
         for each, own in zip(alone, x, strict=True):
-            each.add(condition, Remembered(), np.array(own))
+            each.add(condition, HistoryState(), np.array(own))
     assert together.percentiles().shape == (2, 11)
     np.testing.assert_array_equal(together.percentiles(), [each.percentiles() for each in alone])
 

@@ -546,12 +546,12 @@ BAD = {
     "a file for a folder": (
         lambda folder, *_: (folder / "taken").write_text("x"),
         ["record", "--out", "{folder}/taken"],
-        ["taken: cannot be made or read: it is no folder; choose another --out"],
+        ["taken: cannot be created or read: it is not a folder; choose another --out"],
     ),
     "a file for the folder of a cluster's address": (
         lambda folder, *_: (folder / "taken").write_text("x"),
         ["cluster", "local", "--file", "{folder}/taken/cluster.json"],
-        ["taken: cannot be written: ", "taken is no folder; choose another --file"],
+        ["taken: cannot be written: ", "taken is not a folder; choose another --file"],
     ),
     "a training's description that somebody edited": (
         lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),

@@ -13,14 +13,14 @@ import pytest
 
 import animat
 from animat import compilation, devices
-from animat.compilation import cache_folder, kept_njit
+from animat.compilation import cache_folder, cached_njit
 
 
 def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     def doubled(x: int) -> int:
         return 2 * x
 
-    kept = kept_njit(error_model="numpy")
+    kept = cached_njit(error_model="numpy")
     # As in a package of the system's, for a user without a home.
     monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
     with pytest.raises(RuntimeError, match="no locator available"):

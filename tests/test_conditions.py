@@ -160,8 +160,8 @@ def test_the_tolerance_can_be_typed_or_left_out() -> None:
         ("pattern:1.5", "expected whole numbers"),
         ("pattern:3,3", "each once"),
         (" x ".join(["frequency"] * 5_000), "expected frequency or interval before x"),
-        ("pattern:99999999999999999999", "expected whole numbers of an electrode or a pattern"),
-        ("electrode:1+99999999999999999999", "expected whole numbers of an electrode or a pattern"),
+        ("pattern:99999999999999999999", "expected whole numbers of electrodes or patterns"),
+        ("electrode:1+99999999999999999999", "expected whole numbers of electrodes or patterns"),
     ],
 )
 def test_what_cannot_be_read_says_what_was_expected(text: str, said: str) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from animat.cli import main as animat
-from animat.ctrl_c import heard_everywhere
+from animat.ctrl_c import interruptible
 
 pytestmark = pytest.mark.usefixtures("in_the_foreground")
 
@@ -42,7 +42,7 @@ def interrupt_while_collecting(number: signal.Signals = signal.SIGINT) -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_it_is_dropped_by_python_and_heard_here() -> None:
     interrupt_while_collecting()
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         interrupt_while_collecting()
         time.sleep(5.0)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -54,12 +54,12 @@ def test_so_is_a_kill_and_where_a_weak_reference_is_notified_of_an_end(number: s
         pass
 
     hook = sys.unraisablehook
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         interrupt_while_collecting(number)
         time.sleep(5.0)
     body = Body()
     reference = weakref.ref(body, lambda _: signal.raise_signal(number))
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         del body
         time.sleep(5.0)
     assert reference() is None
@@ -71,7 +71,7 @@ def test_an_import_is_not_cut_short(number: signal.Signals, tmp_path: Path, monk
     monkeypatch.syspath_prepend(tmp_path)
     name = f"interrupted_by_{number.name}"
     (tmp_path / f"{name}.py").write_text(f"import signal\nsignal.raise_signal({number})\nwhole = True\n")
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         importlib.import_module(name)
         time.sleep(5.0)
     assert sys.modules.pop(name).whole
@@ -84,7 +84,7 @@ def test_two_in_one_import_raise_once(tmp_path: Path, monkeypatch) -> None:
         "import signal, time\nfor _ in range(2):\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(0.1)\n"
     )
     closed = False
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         try:
             importlib.import_module("impatient")
             time.sleep(5.0)
@@ -100,7 +100,7 @@ def test_an_import_that_does_not_end_is(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "without_end.py").write_text(
         "import signal, time\nsignal.raise_signal(signal.SIGINT)\nwhile True:\n    time.sleep(5.0)\n"
     )
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         importlib.import_module("without_end")
 
 
@@ -131,7 +131,7 @@ sys.exit(main())
 
 
 def test_elsewhere_it_is_raised_at_once() -> None:
-    with pytest.raises(KeyboardInterrupt), heard_everywhere():
+    with pytest.raises(KeyboardInterrupt), interruptible():
         signal.raise_signal(signal.SIGINT)
 
 
@@ -139,7 +139,7 @@ def test_whoever_handles_it_already_goes_on_to() -> None:
     heard = []
     before = signal.signal(signal.SIGINT, lambda *_: heard.append(True))
     try:
-        with heard_everywhere():
+        with interruptible():
             signal.raise_signal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
@@ -148,7 +148,7 @@ def test_whoever_handles_it_already_goes_on_to() -> None:
 
 def test_where_it_is_ignored_it_stays_so() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with heard_everywhere():
+    with interruptible():
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 

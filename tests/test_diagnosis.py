@@ -116,7 +116,7 @@ def test_what_is_learned_does_not_depend_on_it(tmp_path: Path, monkeypatch: pyte
     assert np.isnan(without.learning_curve[:, 3:]).all()
 
 
-def test_policies_of_before_are_read_without_it(tmp_path: Path) -> None:
+def test_older_policies_are_read_without_it(tmp_path: Path) -> None:
     file = tmp_path / "p0.safetensors"
     policy = trained(replace(SHORT, policies=1, iterations=500), timeline_of(), tmp_path)["p0"]
     with safe_open(file, "numpy") as opened:

@@ -1,4 +1,4 @@
-"""What an action is as a stimulus: told by the recording, dealt out as recorded, refused where it is not known."""
+"""From an action to a stimulus: described by the recording, dealt out as recorded, refused if it is not known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from animat.coding.encoder import Dealer, Encoder
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.reading import read_recording
-from animat.responses.condition import Condition, other_stimulus
+from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.conditions import All, ByBoth, ByElectrode, ByFrequency, ByInterval, ByPattern, conditions_named
 from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
@@ -36,32 +36,32 @@ def table(frequency_hz: list[float], electrodes: list[list[int]], presentation: 
     return Stimuli(np.arange(n) / 10, np.array(frequency_hz), np.array(pattern), padded, given)
 
 
-def told(conditions: tuple[Condition, ...]) -> list[tuple[object, ...]]:
+def description(conditions: tuple[Condition, ...]) -> list[tuple[object, ...]]:
     return [(c.label, c.frequencies_hz, c.electrodes, c.only_last) for c in conditions]
 
 
-def test_a_condition_tells_the_stimuli_that_it_was_in_the_recording() -> None:
+def test_a_condition_describes_its_stimuli_in_the_recording() -> None:
     stimuli = table([5, 10, 5, 5], [[2, 1], [1, 2], [3, 4, 5], [3, 5, 4]])
-    assert told(ByPattern().assign(stimuli).conditions) == [
+    assert description(ByPattern().assign(stimuli).conditions) == [
         ("pattern 0", (5.0, 10.0), ((1, 2),), False),
         ("pattern 1", (5.0,), ((3, 4, 5),), False),
     ]
-    assert told(ByElectrode().assign(stimuli).conditions) == [
+    assert description(ByElectrode().assign(stimuli).conditions) == [
         ("electrodes 1+2", (5.0, 10.0), ((1, 2),), False),
         ("electrodes 3+4+5", (5.0,), ((3, 4, 5),), False),
     ]
-    assert told(ByFrequency().assign(stimuli).conditions) == [
+    assert description(ByFrequency().assign(stimuli).conditions) == [
         ("5 Hz", (5.0,), None, False),
         ("10 Hz", (10.0,), None, False),
     ]
-    assert told(ByInterval((10.0,)).assign(stimuli).conditions) == [("10 Hz", (10.0,), None, False)]
-    assert told(All().assign(stimuli).conditions) == [("all", (5.0, 10.0), None, False)]
+    assert description(ByInterval((10.0,)).assign(stimuli).conditions) == [("10 Hz", (10.0,), None, False)]
+    assert description(All().assign(stimuli).conditions) == [("all", (5.0, 10.0), None, False)]
 
 
 def test_what_the_recording_does_not_tell_is_not_known() -> None:
     stimuli = table([np.nan, np.nan], [[], [3, 4, 5]])
     stimuli = Stimuli(stimuli.time_s, stimuli.frequency_hz, np.array([7, 8]), stimuli.electrodes, np.arange(2))
-    assert told(ByPattern().assign(stimuli).conditions) == [
+    assert description(ByPattern().assign(stimuli).conditions) == [
         ("pattern 7", (), (), False),
         ("pattern 8", (), ((3, 4, 5),), False),
     ]
@@ -90,14 +90,14 @@ def test_products_are_the_combinations_that_occur() -> None:
     assert by == ByBoth(ByFrequency(), ByPattern())
     assigned = by.assign(stimuli)
     assert assigned.condition.tolist() == [0, 2, 1, 2, -1]
-    assert told(assigned.conditions) == [
+    assert description(assigned.conditions) == [
         ("5 Hz, pattern 0", (5.0,), ((1, 2),), False),
         ("5 Hz, pattern 1", (5.0,), ((3, 4, 5),), False),
         ("10 Hz, pattern 0", (10.0,), ((1, 2),), False),
     ]
     # Pulses 0.1 s apart, at no stated frequency: their intervals tell it.
     (last,) = conditions_named("interval:10 x electrode:1+2").assign(stimuli).conditions
-    assert told((last,)) == [("10 Hz, electrodes 1+2", (10.0,), ((1, 2),), False)]
+    assert description((last,)) == [("10 Hz, electrodes 1+2", (10.0,), ((1, 2),), False)]
     for text in ("frequency:5,80 x pattern:0,3", "interval:5,10+-25% x electrode:3,1+2"):
         assert str(conditions_named(text)) == text
     for text in ("pattern x frequency", "frequency x interval:5", "frequency x all", "frequency x "):
@@ -105,14 +105,14 @@ def test_products_are_the_combinations_that_occur() -> None:
             conditions_named(text)
 
 
-def test_conditions_of_before_are_equal_and_tell_nothing_of_their_stimuli() -> None:
+def test_older_conditions_are_equal_and_do_not_describe_their_stimuli() -> None:
     (known,) = ByPattern((1,)).assign(table([5], [[3, 4, 5]])).conditions
     before = Condition(label="pattern 1", value=1.0, unit="")
-    assert before == known and other_stimulus([before], [known]) is None
+    assert before == known and stimulus_mismatch([before], [known]) is None
     assert Condition("5 Hz", 5.0, "Hz").frequencies_hz == (5.0,)
     (moved,) = ByElectrode(((1, 2),)).assign(table([5], [[1, 2]])).conditions
     other = Condition("pattern 1", 1.0, "", (5.0,), moved.electrodes)
-    assert other_stimulus([known], [other]) == (
+    assert stimulus_mismatch([known], [other]) == (
         "expected pattern 1 at 5 Hz on the electrodes 3+4+5, got pattern 1 at 5 Hz on the electrodes 1+2"
     )
 
@@ -125,16 +125,16 @@ def test_a_condition_met_at_other_frequencies_too_is_no_other(
     one_hz: tuple[float, ...], other_hz: tuple[float, ...], is_other: bool
 ) -> None:
     one, other = (Condition("pattern 0", 0.0, "", at_hz, ((1, 2),)) for at_hz in (one_hz, other_hz))
-    assert (other_stimulus([one], [other]) is not None) is is_other
+    assert (stimulus_mismatch([one], [other]) is not None) is is_other
 
 
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"frequencies_hz": (0.0,)}, r"frequencies_hz: expected more than 0, got \(0\.0,\)"),
+        ({"frequencies_hz": (0.0,)}, r"frequencies_hz: expected numbers above 0, got \(0\.0,\)"),
         ({"frequencies_hz": ("x",)}, "frequencies_hz: expected a number, got 'x'"),
-        ({"electrodes": ((),)}, "electrodes: expected the numbers of one or more in each set"),
-        ({"electrodes": ((-1,),)}, "electrodes: expected the numbers of one or more in each set"),
+        ({"electrodes": ((),)}, "electrodes: expected sets of one or more electrode numbers"),
+        ({"electrodes": ((-1,),)}, "electrodes: expected sets of one or more electrode numbers"),
         ({"electrodes": ((1.5,),)}, "electrodes: expected a whole number, got 1.5"),
         ({"electrodes": 3}, "electrodes: expected a list, got 3"),
         ({"only_last": 1}, "only_last: expected true or false, got 1"),
@@ -209,7 +209,7 @@ def test_a_loop_over_patterns_is_read_as_any_recording_of_patterns(
         responses = extract_responses(read_recording(session.recording_file), by, loop.window_ms)
         assert responses.condition.tolist() == [tick.delivered for tick in session.ticks]
         np.testing.assert_array_equal(responses.rate_hz, [tick.rate_hz for tick in session.ticks])
-        assert other_stimulus(loop.conditions, responses.conditions) is None
+        assert stimulus_mismatch(loop.conditions, responses.conditions) is None
         assert all(c.only_last is only_last for c in responses.conditions)
     assert len({tick.delivered for tick in session.ticks}) == 3
 

@@ -10,8 +10,8 @@ from animat.cli import main
 from animat.closed_loop.session_data import LOG_FILE as SESSION
 from animat.cultures.series import SELECTION_FILE, STATE_FILE
 from animat.errors import Mismatch
+from animat.folder_kinds import MARKERS, Kind, expect_no_other
 from animat.live.plan import LOG_FILE as LIVE
-from animat.marks import MARKS, Kind, expect_no_other
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.studies.cultures import MANIFEST as CULTURES
 from animat.studies.folder import MANIFEST as STUDY
@@ -41,14 +41,14 @@ OTHERS: list[tuple[Kind, str, str]] = [
     ("recording", STATE_FILE, "recordings"),
     ("live", LIVE, "a live run"),
 ]
-"""Files that the modules write, what each belongs to, and how that is told."""
+"""Files that the modules write, what each belongs to, and its description."""
 
 
 @pytest.mark.parametrize(
-    ("kind", "mark", "told"), [(kind, *other) for kind in COMMANDS for of, *other in OTHERS if of != kind]
+    ("kind", "mark", "description"), [(kind, *other) for kind in COMMANDS for of, *other in OTHERS if of != kind]
 )
 def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
-    kind: Kind, mark: str, told: str, few_bootstraps: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: Kind, mark: str, description: str, few_bootstraps: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if kind == "session":
         write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
@@ -59,13 +59,13 @@ def test_a_folder_of_another_kind_is_refused_and_stays_as_it_is(
     (out / mark).write_bytes(b"somebody's")
     expected, words = COMMANDS[kind]
     assert main([*(word.format(beside=tmp_path) for word in words), "--out", str(out)]) == 1
-    said = f"{out}: expected a folder for {expected}, got one of {told} ({mark}); choose another folder\n"
+    said = f"{out}: expected a folder for {expected}, got one with {description} ({mark}); choose another folder\n"
     assert capsys.readouterr().err.endswith(said)
     assert {file.name: file.read_bytes() for file in out.iterdir()} == {mark: b"somebody's"}
 
 
 @pytest.mark.parametrize("kind", COMMANDS)
-def test_ones_own_folder_an_empty_one_and_files_beside_are_taken(kind: Kind, tmp_path: Path) -> None:
+def test_a_folder_of_the_same_kind_an_empty_one_and_other_files_are_accepted(kind: Kind, tmp_path: Path) -> None:
     expect_no_other(tmp_path / "none", kind)
     for beside in (".p0.safetensors", ".session.log", "notes.txt", SELECTION_FILE, "raster.png", "best.toml"):
         (tmp_path / beside).touch()
@@ -75,7 +75,7 @@ def test_ones_own_folder_an_empty_one_and_files_beside_are_taken(kind: Kind, tmp
     expect_no_other(tmp_path, kind)
     (tmp_path / LIVE).touch()
     (tmp_path / TUNING).touch()
-    with pytest.raises(Mismatch, match=r"got one of a tuning \(tune.json\), a live run \(live.log\); choose"):
+    with pytest.raises(Mismatch, match=r"got one with a tuning \(tune.json\), a live run \(live.log\); choose"):
         expect_no_other(tmp_path, kind)
     # What goes on may have had another's work put beside it, by former versions or by hand.
     (tmp_path / next(mark for of, mark, _ in OTHERS if of == kind)).touch()
@@ -83,4 +83,4 @@ def test_ones_own_folder_an_empty_one_and_files_beside_are_taken(kind: Kind, tmp
 
 
 def test_every_kind_is_tried() -> None:
-    assert {kind for kind, *_ in OTHERS} == set(MARKS)
+    assert {kind for kind, *_ in OTHERS} == set(MARKERS)

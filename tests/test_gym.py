@@ -219,7 +219,7 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
         ({"window_ms": (2.0, 8.0)}, "window_ms: expected only with recordings"),
         ({"kind": "empirical"}, "kind: expected only with recordings"),
         ({"name": 3.0}, "cartpole: expected parameters among .*, got 'name'"),
-        ({"simulator": "memory"}, "simulator: expected a simulator, and `kind` for the name of one, got 'memory'"),
+        ({"simulator": "memory"}, "simulator: expected a simulator; `kind` takes the name of one, got 'memory'"),
         ({"recordings": 3}, "recordings: expected a path or several, got 3"),
         ({"recordings": ["r", None]}, "recordings: expected a path or several, got None"),
         ({"delivery": "late"}, "delivery: expected 'chosen' or 'shuffled', got 'late'"),
@@ -276,7 +276,7 @@ def test_a_vector_is_of_a_whole_number_and_starts_as_one() -> None:
     with pytest.raises(InvalidArgument, match=r"num_envs: expected a whole number, got 1\.5"):
         gymnasium.make_vec("Animat/Cartpole-v0", num_envs=1.5)
     envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=np.int64(2))
-    with pytest.raises(InvalidArgument, match="options: expected no 'reset_mask': all episodes are started at once"):
+    with pytest.raises(InvalidArgument, match="options: expected no 'reset_mask': all episodes are started together"):
         envs.reset(options={"reset_mask": np.array([True, False])})
 
 
@@ -340,7 +340,7 @@ def test_a_vector_has_gymnasiums_form(id_: str) -> None:
         assert set(info) == {"delivered", "rate_hz", "command", "_delivered", "_rate_hz", "_command"}
 
 
-def test_an_ended_episode_starts_anew_in_the_step_after() -> None:
+def test_an_ended_episode_is_followed_by_a_new_one_in_the_next_step() -> None:
     envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=16)
     envs.reset(seed=1)
     ended = np.zeros(16, bool)
@@ -438,9 +438,9 @@ def test_what_is_found_in_several_recordings_is_warned_of_once(tmp_path: Path) -
     for number in range(3):
         synthetic = synthetic_recording(1, start_min=30.0 * number, patterns=4, channels=16)
         write_nwb(synthetic, tmp_path / f"{number}.nwb")
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as warned:
         gymnasium.make("Animat/Cartpole-v0", recordings=tmp_path)
-    few = [str(each.message) for each in told if "a distribution takes 30 or more" in str(each.message)]
+    few = [str(each.message) for each in warned if "a distribution needs 30 or more" in str(each.message)]
     assert len(few) == 1
     assert few[0].endswith("more like it)")
 

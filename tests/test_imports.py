@@ -15,15 +15,15 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "animat"
 
 GROUND = (
+    "columns",
     "compilation",
     "ctrl_c",
     "devices",
     "differences",
     "errors",
     "extras",
-    "late",
-    "lined_up",
-    "marks",
+    "folder_kinds",
+    "lazy",
     "plain_file",
     "process",
     "progress",

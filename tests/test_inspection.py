@@ -111,7 +111,7 @@ def test_a_window_without_the_response_says_where_it_is() -> None:
     assert not {"dead-window", "response-elsewhere"} & set(names(extract_responses(blanked, window_ms=(30, 70))))
 
 
-def test_a_window_on_a_later_wave_is_told_of_the_first() -> None:
+def test_a_window_on_a_later_wave_is_warned_about_the_first() -> None:
     source = answering({5: 30.0, 10: 40.0}, window_s=(0.010, 0.030))
     wave = np.column_stack([np.repeat(source.stimuli.time_s, 10) + 0.085, np.zeros(10 * len(source.stimuli))])
     spikes = np.vstack([np.column_stack([source.spike_times_s, source.spike_channels]), wave])
@@ -161,11 +161,11 @@ def test_stimuli_without_a_condition_are_counted() -> None:
     assert names(extract_responses(source, ByPattern((7,))))["no-condition"] == "refuse"
     none = message(source, "no-condition", by=ByPattern((7,)))
     there = "the recording has pattern 0, pattern 1: choose others (--conditions"
-    assert f"no stimulus of 3 belongs to the conditions pattern:7; {there}" in none
+    assert f"none of 3 stimuli belongs to the conditions pattern:7; {there}" in none
     # What other kinds could be had is not a list of what the recording has.
     for by in (ByElectrode(), ByInterval((7.0,)), Nothing()):
         none = message(source, "no-condition", by=by)
-        assert f"no stimulus of 3 belongs to the conditions {by}: choose others (--conditions" in none
+        assert f"none of 3 stimuli belongs to the conditions {by}: choose others (--conditions" in none
 
 
 def test_empty_and_thin_conditions() -> None:
@@ -177,7 +177,7 @@ def test_empty_and_thin_conditions() -> None:
     thin = extract_responses(answering({5: 10.0, 10: 14.0}, n=29), burst_threshold=1)
     assert names(thin)["few-samples"] == "warning"
     one = message(answering({5: 10.0, 10: 14.0}, n=1), "few-samples", burst_threshold=1)
-    assert one.endswith("1 non-burst response; a distribution takes 30 or more")
+    assert one.endswith("1 non-burst response; a distribution needs 30 or more")
     assert "few-samples" not in names(extract_responses(answering({5: 10.0, 10: 14.0}, n=30), burst_threshold=1))
 
 
@@ -222,7 +222,7 @@ def test_burst_separation_that_separates_nothing_is_said_so() -> None:
     assert responses.threshold == 1
 
 
-def test_where_every_response_is_kept_no_separability_is_told_and_no_panel_of_bursts_drawn() -> None:
+def test_if_every_response_is_kept_no_separability_is_reported_and_no_panel_of_bursts_drawn() -> None:
     source = answering({5: 20.0, 10: 20.0}, n=300)
     for threshold, is_known in ((1.0, False), (None, True)):
         inspection = inspect_recording(source, burst_threshold=threshold)
@@ -242,7 +242,7 @@ def test_stimuli_of_no_condition_are_drawn_and_nothing_is_fitted_to_them() -> No
         fit_empirical(none)
 
 
-def test_bursts_that_are_too_few_are_told_from_none() -> None:
+def test_too_few_bursts_are_distinguished_from_none() -> None:
     # Of 103 stimuli three make every channel fire.
     spikes = [(t, c) for t in range(1, 104) for c in range(40) if t > 100 or c < 4]
     at = [(t + 0.005, c) for t, c in spikes]
@@ -333,7 +333,7 @@ def test_figures_name_units_and_conditions() -> None:
 
 
 def test_a_raster_of_many_spikes_shades_rates_and_names_only_conditions_with_rows() -> None:
-    """Dots run into one where there are more than can be told apart."""
+    """Dots run into one if there are more than can be distinguished."""
     few = answering({5: 10.0, 10: 10.0})
     lower = axes_of(draw_raster(few, extract_responses(few)))[1]
     assert len(lower.images) == 0 and len(lower.collections) == 1

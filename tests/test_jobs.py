@@ -153,7 +153,7 @@ def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
         (
             Starve(),
             AnimatError,
-            r"job: out of memory \(256. PiB more were asked for\): it grows with policies \(10\), culture.channels "
+            r"job: out of memory \(256. PiB more were requested\): it grows with policies \(10\), culture.channels "
             r"\(256\): ask for less, or use a machine with more memory",
         ),
         (

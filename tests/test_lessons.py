@@ -407,7 +407,7 @@ def test_recordings_are_drawn_of_those_that_shadowing_would_have_used() -> None:
         ("recordings_min = [0, 10]", "recordings_min: expected only where shadowing is 'drawn'"),
         ("until_return = 121", "until_return: expected at most 120, the highest return of cartpole, got 121"),
         ("sucess = 0.8", "sucess: no such setting"),
-        ("starts.angle_rad = [", "expected TOML, got a mistake"),
+        ("starts.angle_rad = [", "expected TOML, got malformed text"),
     ],
 )
 def test_lessons_that_cannot_be_taught_are_refused_in_one_line(lesson: str, said: str, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import pytest
 import stand_in_cl
 import stand_in_maxlab
 from animat.cli import main
-from animat.ctrl_c import heard_everywhere
+from animat.ctrl_c import interruptible
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MaxOneCulture
@@ -310,7 +310,7 @@ def test_a_kill_while_it_is_recorded_closes_the_culture(
 def test_a_hang_up_that_is_ignored_stays_so() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with heard_everywhere():
+        with interruptible():
             os.kill(os.getpid(), signal.SIGHUP)
             time.sleep(0.01)
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN

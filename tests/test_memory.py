@@ -36,7 +36,7 @@ from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.quality.memory import memory_findings
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
@@ -129,7 +129,7 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memo
         rate_hz=x.astype(float),
         active_ratio=np.full(len(x), 0.1),
         is_burst=burst,
-        presented=Presented(every, every_x.astype(float), bursts, sixth == 0),
+        presented=Trials(every, every_x.astype(float), bursts, sixth == 0),
         place=place,
     )
     if any(not np.any((condition == c) & ~burst) for c in (0, 1)):
@@ -183,7 +183,7 @@ def loaded(n: int, seed: int, *, slope: float) -> Responses:
     condition = rng.integers(0, 3, n)
     x = 50.0 + 5.0 * condition + slope * (loads_by_hand(condition, 2.0) - 0.5) + rng.normal(0, 5, n)
     columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(n, 0.1), "is_burst": np.zeros(n, bool)}
-    every = Presented(condition, x, columns["is_burst"], np.arange(n) == 0, np.cumsum(PERIODS_S[condition]))
+    every = Trials(condition, x, columns["is_burst"], np.arange(n) == 0, np.cumsum(PERIODS_S[condition]))
     return replace(responses_of(*[[1.0]] * 3), presented=every, place=np.arange(n), **columns)
 
 
@@ -215,7 +215,7 @@ def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> Non
     for seed in range(40):
         responses = chain(600, after_low=(0.1, 0.3, 0.2), after_high=(0.7, 0.9, 0.8), seed=seed)
         condition = responses.condition
-        every = Presented(
+        every = Trials(
             condition, responses.rate_hz, responses.is_burst, np.arange(600) == 0, np.cumsum(PERIODS_S[condition])
         )
         memory = fit_memory(replace(responses, presented=every, place=np.arange(600))).memory
@@ -231,7 +231,7 @@ def test_trials_further_apart_than_a_silence_have_a_load() -> None:
     condition = rng.integers(0, 2, 400)
     since_s = np.array([2.0, 0.05])[condition]
     x = 50.0 + 5.0 * condition + rng.normal(0, 5, 400)
-    every = Presented(condition, x, np.zeros(400, bool), since_s > 1.0, np.cumsum(since_s))
+    every = Trials(condition, x, np.zeros(400, bool), since_s > 1.0, np.cumsum(since_s))
     columns = {"condition": condition, "rate_hz": x, "active_ratio": np.full(400, 0.1), "is_burst": every.is_burst}
     responses = replace(responses_of([1.0], [1.0]), presented=every, place=np.arange(400), **columns)
     simulator = fit_memory(responses, memory=Memory(0.0, 0.0, 0.5, 1.0))
@@ -415,7 +415,7 @@ def test_presentations_that_do_not_fit_are_refused() -> None:
     with pytest.raises(Mismatch, match=r"responses.place: expected rows from 0 to 19, got 1 to 20"):
         replace(responses, presented=presented, place=place + 1)
     with pytest.raises(Mismatch, match=r"presented.is_rested: expected 20 values"):
-        Presented(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested[1:])
+        Trials(presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested[1:])
 
 
 @pytest.mark.oracle
@@ -561,7 +561,7 @@ def network(seed: int, spikes: float, n: int = 3000) -> Responses:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_fewer_the_spikes_the_more_the_stimulus_tells_of_what_was_answered(seed: int) -> None:
+def test_the_fewer_the_spikes_the_more_the_stimulus_weighs_in_the_trace(seed: int) -> None:
     many = fit_memory(network(seed, spikes=300)).memory
     few = fit_memory(network(seed, spikes=3)).memory
     # The network's own: what it remembers is its activity, which so many spikes tell as it is.
@@ -595,7 +595,7 @@ def test_without_memory_none_is_found_where_responses_are_of_few_spikes() -> Non
     assert found.count(NO_MEMORY) >= 36
 
 
-def test_the_optimum_of_a_simulator_of_ones_own_that_remembers_is_refused() -> None:
+def test_the_optimum_of_a_custom_simulator_with_memory_is_refused() -> None:
     class Own(EmpiricalSimulator):
         has_memory = True
 
@@ -660,7 +660,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
 
 
 @pytest.mark.oracle
-def test_an_environment_without_neurons_has_its_optimum_whatever_simulator_is_beside_it() -> None:
+def test_an_environment_without_neurons_has_its_optimum_with_any_simulator() -> None:
     """As a case of its own, and beside one whose neurons remember."""
     alone = best_return(WithoutNeurons(Stairs(5), (-1.0, 1.0)), None, grid=STEPS, episodes=10)
     both = [(WithoutNeurons(Stairs(5), (-1.0, 1.0)), persistent()), (Animat(Stairs(5), Thresholds(1), 2), persistent())]
@@ -704,7 +704,7 @@ def test_conditions_in_blocks_are_not_taken_for_memory() -> None:
     assert not list(memory_findings(replace(blocks, conditions=(*blocks.conditions, Condition("none", 1.0, "Hz")))))
 
 
-def test_a_memory_of_blocks_is_told() -> None:
+def test_a_memory_of_blocks_is_reported() -> None:
     for order in ("mixed", "blocked"):
         responses = chain(200, after_low=(0.1, 0.5), after_high=(0.3, 0.9), presentation=Presentation(order))
         found = {finding.name for finding in fit_timeline([responses], kind="memory").findings}
@@ -712,7 +712,7 @@ def test_a_memory_of_blocks_is_told() -> None:
         assert "memory-of-blocks" not in {finding.name for finding in fit_timeline([responses]).findings}
 
 
-def test_what_a_simulator_with_memory_keeps_is_told_by_what_it_answers() -> None:
+def test_the_fidelity_of_a_simulator_with_memory_is_that_of_its_answers() -> None:
     (kept,) = fit_timeline([chain(2000, after_low=(0.1, 0.5), after_high=(0.5, 0.9))], kind="memory").fidelities
     np.testing.assert_allclose(kept.in_simulator, kept.in_data, atol=0.03)
     assert not np.array_equal(kept.in_simulator, kept.in_data)
@@ -738,7 +738,7 @@ def test_what_a_simulator_with_memory_keeps_is_what_many_draws_come_to() -> None
     np.testing.assert_allclose(fidelity(responses, simulator).in_simulator, above, atol=0.015)
 
 
-def test_too_few_to_draw_the_nearest_from_is_told() -> None:
+def test_too_few_neighbours_are_reported() -> None:
     few = chain(40, after_low=(0.1, 0.5), after_high=(0.5, 0.9))
     # Always the nearest alone: what had an outlying history is drawn most often.
     kept = fidelity(few, fit_memory(few, memory=Memory(0.0, 0.0, 0.0)))
@@ -750,7 +750,7 @@ def test_too_few_to_draw_the_nearest_from_is_told() -> None:
     assert all(finding.name != "binning" for finding in fit_timeline([few], kind="memory").findings)
 
 
-def test_training_tells_what_is_remembered() -> None:
+def test_training_reports_the_memory() -> None:
     series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
@@ -759,9 +759,9 @@ def test_training_tells_what_is_remembered() -> None:
     assert f"counts {decay:.2g} times as much as the next one, and its stimulus {weight:.2g} times as" in first
     n = int(np.median([np.count_nonzero(series[0].condition == c) for c in range(2)]))
     near = int(np.median([np.rint(len(series[0].rates_of(c)) ** neighbour_exponent) for c in range(2)]))
-    assert first.endswith(f"draws from the {near} responses with the most similar history, out of {n} per condition")
-    (told,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
-    assert told.endswith(". The amount of stimulation in the last 1 s counts too")
+    assert first.endswith(f"draws from the {near} responses with the most similar history, of the {n} of a condition")
+    (message,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
+    assert message.endswith(". How much was stimulated in the last 1 s counts too")
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.differences import description_in
+from animat.differences import read_description
 from animat.errors import InvalidFile
 from animat.execution.receipts import Receipt, receipt_path
 from animat.execution.task import reported
@@ -31,7 +31,7 @@ def journal(path: Path) -> Any:
 
 
 @pytest.mark.parametrize(
-    "read", [lambda path: description_in(path, "study"), lambda path: read_typed(path, Results), receipt, journal]
+    "read", [lambda path: read_description(path, "study"), lambda path: read_typed(path, Results), receipt, journal]
 )
 def test_it_is_a_line(read: Callable[[Path], Any], tmp_path: Path) -> None:
     path = tmp_path / "file.json"

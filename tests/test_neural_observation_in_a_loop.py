@@ -17,9 +17,9 @@ from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.neurons.history import Memory, Ranked
+from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import fit_memory
-from animat.neurons.remembering import Remembered, Remembering
 from animat.reality_gap import Calibration, run_policies
 from animat.reality_gap.predicting import EPISODES, roll_out_seed
 from animat.recordings.recording import Recording
@@ -50,16 +50,16 @@ def responses(recording: Recording) -> Responses:
 
 
 @pytest.fixture(scope="module")
-def remembering(responses: Responses) -> Remembering:
-    return Remembering.of(responses, fit_memory(responses, memory=MEMORY))
+def remembering(responses: Responses) -> HistoryTracker:
+    return HistoryTracker.of(responses, fit_memory(responses, memory=MEMORY))
 
 
-def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, remembering: Remembering) -> None:
+def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, remembering: HistoryTracker) -> None:
     ranked = Ranked(responses)
     traces, loads = ranked.recorded(MEMORY)[0], ranked.loads(MEMORY.load_s)
     presented, _ = responses.presentations
     assert presented.time_s is not None and presented.is_burst.any()
-    state = Remembered()
+    state = HistoryState()
     for row, at_s in enumerate(presented.time_s.tolist()):
         # The load falls up to the trial; what a policy sees is that after the trial before it.
         came = remembering.when(state, at_s, is_rested=bool(presented.is_rested[row]))
@@ -71,8 +71,8 @@ def test_trial_by_trial_it_is_the_state_of_the_recording(responses: Responses, r
 
 def test_trials_without_a_condition_are_remembered_too(responses: Responses) -> None:
     some = responses.only([0, 4])
-    of_some = Remembering.of(some, fit_memory(some, memory=MEMORY))
-    (presented, place), state, states = some.presentations, Remembered(), []
+    of_some = HistoryTracker.of(some, fit_memory(some, memory=MEMORY))
+    (presented, place), state, states = some.presentations, HistoryState(), []
     assert presented.time_s is not None and (presented.condition == NO_CONDITION).any()
     columns = (presented.condition, presented.rate_hz, presented.is_burst, presented.is_rested, presented.time_s)
     for condition, rate_hz, is_burst, is_rested, at_s in zip(*columns, strict=True):
@@ -83,11 +83,11 @@ def test_trials_without_a_condition_are_remembered_too(responses: Responses) -> 
 
 
 def test_without_memory_it_is_what_simulators_without_memory_show(responses: Responses) -> None:
-    blank = Remembering.of(responses, fit_simulator(responses, kind="histogram", bins=20, range_hz=None))
-    state = blank.after(Remembered(), 2, 30.0, is_burst=False)
-    assert blank.observed(state) == blank.observed(Remembered()) == (0.5, 0.5)
-    no_load = Remembering.of(responses, fit_memory(responses, memory=MEMORY._replace(load_s=0.0)))
-    assert no_load.observed(no_load.after(Remembered(), 2, 30.0, is_burst=False))[1] == 0.5
+    blank = HistoryTracker.of(responses, fit_simulator(responses, kind="histogram", bins=20, range_hz=None))
+    state = blank.after(HistoryState(), 2, 30.0, is_burst=False)
+    assert blank.observed(state) == blank.observed(HistoryState()) == (0.5, 0.5)
+    no_load = HistoryTracker.of(responses, fit_memory(responses, memory=MEMORY._replace(load_s=0.0)))
+    assert no_load.observed(no_load.after(HistoryState(), 2, 30.0, is_burst=False))[1] == 0.5
 
 
 class Watching:
@@ -104,7 +104,7 @@ class Watching:
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory, remembering: Remembering) -> tuple[Session, Watching]:
+def ran(tmp_path_factory: pytest.TempPathFactory, remembering: HistoryTracker) -> tuple[Session, Watching]:
     watching, loop = Watching(), replace(loop_of(robot=SHORT, burst_threshold=0.95), remembering=remembering)
     agents = [Agent("watching", "sees", watching), Agent("random", "does not", AnyCondition(5))]
     with FakeCulture() as culture:
@@ -112,7 +112,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory, remembering: Remembering) -> t
 
 
 def test_what_is_shown_follows_from_what_was_answered_before(
-    ran: tuple[Session, Watching], remembering: Remembering
+    ran: tuple[Session, Watching], remembering: HistoryTracker
 ) -> None:
     """Computed again from the log, with SciPy's ranks."""
     session, watching = ran
@@ -151,7 +151,7 @@ def test_policies_that_see_are_predicted_and_run(
     tmp_path: Path, responses: Responses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.reality_gap.calibration.BOOTSTRAPS", 3)
-    monkeypatch.setattr("animat.neurons.memory._found", lambda ranked: MEMORY)
+    monkeypatch.setattr("animat.neurons.memory._find_memory", lambda ranked: MEMORY)
     given: dict[str, Any] = {"presentation": None, "neural_observation": True}
     rng = np.random.default_rng(4)
     weights = tuple(rng.standard_normal(s).astype(np.float32) for s in ((6, 16), (16, 16), (16, 5)))

@@ -126,10 +126,10 @@ def test_names_stand_for_robots_and_mappings() -> None:
 @pytest.mark.parametrize(
     ("robot", "mapping", "words"),
     [
-        (Slider(), Thresholds(1), "^robot: expected one that is registered.* got Slider, .*register_robot.*in memory"),
-        (Cartpole(), Push(), "^mapping: expected one that is registered.* got Push, .*register_mapping.*in memory"),
+        (Slider(), Thresholds(1), "^robot: expected a registered one.* got Slider, .*register_robot.*in memory"),
+        (Cartpole(), Push(), "^mapping: expected a registered one.* got Push, .*register_mapping.*in memory"),
         # The name of another, which would be loaded in its place.
-        (slider(name="cartpole"), Thresholds(1), "^robot: expected one that is registered.* got Changed"),
+        (slider(name="cartpole"), Thresholds(1), "^robot: expected a registered one.* got Changed"),
     ],
 )
 def test_what_could_not_be_loaded_again_is_refused_before_the_first_iteration(
@@ -147,7 +147,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
     assert list(policies) == ["p0"] and progress.told[-1] == (60, 60)
     for policy in policies.values():
         assert policy.act(np.zeros(1, np.float32), np.random.default_rng(0)) in range(3)
-        with pytest.raises(InvalidArgument, match="expected one that is registered"):
+        with pytest.raises(InvalidArgument, match="expected a registered one"):
             policy.save(tmp_path / "p0.safetensors")
     assert not list(tmp_path.iterdir())
 
@@ -297,9 +297,15 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
             lambda x: -x / 100,
             "expected commands that never fall as the response rises, got -0 at 0 Hz and -0.0",
         ),
-        (lambda x: 0.5 * (x > np.median(x)), "expected the same for one response as among several, 0.5, got 0.0"),
+        (
+            lambda x: 0.5 * (x > np.median(x)),
+            "expected the same command for a single response as in an array, 0.5, got 0.0",
+        ),
         (lambda x: np.tanh(np.asarray(x)), "expected it to run under jax.jit, got TracerArrayConversionError"),
-        (lambda x: x * 0 + isinstance(x, np.ndarray), "expected the same for one response as among several, 1, got 0"),
+        (
+            lambda x: x * 0 + isinstance(x, np.ndarray),
+            "expected the same command for a single response as in an array, 1, got 0",
+        ),
         (lambda x: x * np.nan, "expected 25 commands from -1 to 1"),
         (lambda x: x.command, "expected commands, got AttributeError"),
     ],

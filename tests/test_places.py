@@ -73,7 +73,7 @@ def test_invalid_places_are_refused_and_their_file_is_named(given_: object, tmp_
     file.write_text("[[1, 2]")
     with pytest.raises(
         InvalidFile,
-        match=r"places\.json: places: expected JSON such as .*, got a mistake: .* line 1 column 8",
+        match=r"places\.json: places: expected JSON such as .*, got malformed text: .* line 1 column 8",
     ):
         read_places(str(file))
     with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):

@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from animat.progress import Bar, InTurn, Part, Phase, Speed, in_phase
+from animat.progress import Bar, EqualPhases, Part, Phase, Speed, in_phase
 
 SCRIPT = """
 from animat.progress import Bar
@@ -28,7 +28,7 @@ with Bar("counting") as progress:
 PHASES = """
 import time
 from animat.progress import Bar, in_phase
-with Bar("never told of") as progress:
+with Bar("silent") as progress:
     progress = in_phase(progress, "predicting")
     progress.update(1, 4, "p0")
     loop = in_phase(progress, "closed loop", 30, "episodes")
@@ -72,7 +72,7 @@ def test_each_phase_has_a_bar_that_fits_the_terminal(columns: int) -> None:
     _, drawn = drawn_by(PHASES, columns)
     lines = [line.rstrip() for line in re.split(r"[\r\n]+", drawn)]
     assert max(map(len, lines)) <= columns
-    assert "never told of" not in drawn
+    assert "silent" not in drawn
     if columns == 80:
         assert any(re.match(r"predicting  ━+ 100 % 0:00:00", line) for line in lines)
         assert any(re.match(r"closed loop [━╸╺]+   3 % 0:00:0", line) for line in lines)
@@ -92,29 +92,29 @@ def test_a_line_comes_every_ten_seconds_where_there_is_no_terminal(
         in_phase(progress, "again", 400, "apples")
         for now_s in (41.0, 43.0, 55.0, 65.0):
             progress.update((now_s - 41) / 2, 100)
-    told = [
+    lines = [
         "counting: 20 %, 40 s left, at 10 s",
         "counting: 42 %, 29 s left, at 21 s",
         "counting: 80 %, 10 s left, at 40 s",
         "again: 7 %, 28 of 400 apples, 2.0 a second, 3 min left",
         "again: 12 %, 48 of 400 apples, 2.0 a second, 3 min left",
     ]
-    assert capsys.readouterr() == ("", "\n".join(told) + "\n")
+    assert capsys.readouterr() == ("", "\n".join(lines) + "\n")
 
 
-def test_work_that_reports_nothing_for_long_is_told_of_too(
+def test_work_that_reports_nothing_for_long_gets_lines_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("animat.progress.LINE_EVERY_S", 0.02)
-    monkeypatch.setattr("animat.progress._LOOK_EVERY_S", 0.01)
-    told = ""
+    monkeypatch.setattr("animat.progress._CHECK_EVERY_S", 0.01)
+    lines = ""
     with Bar("solving") as progress:
         progress.update(0, 1, "optimal return")
         until_s = time.monotonic() + 5
-        while told.count("\n") < 2 and time.monotonic() < until_s:
+        while lines.count("\n") < 2 and time.monotonic() < until_s:
             time.sleep(0.01)
-            told += capsys.readouterr().err
-    assert told.startswith("solving: 0 %, optimal return\n" * 2)
+            lines += capsys.readouterr().err
+    assert lines.startswith("solving: 0 %, optimal return\n" * 2)
 
 
 def test_nothing_is_said_about_the_rest_before_there_is_something_to_tell_by(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,11 +160,11 @@ def test_the_speed_of_the_last_minute_is_that_of_no_more(monkeypatch: pytest.Mon
 
 
 def test_parts_make_up_the_whole() -> None:
-    told: list[tuple[float, float, str]] = []
+    reports: list[tuple[float, float, str]] = []
 
     class Kept:
         def update(self, done: float, total: float, note: str = "") -> None:
-            told.append((done, total, note))
+            reports.append((done, total, note))
 
     whole = Kept()
     for before, units, note in ((0, 2, "first"), (2, 6, "")):
@@ -174,7 +174,7 @@ def test_parts_make_up_the_whole() -> None:
             within = Part(part, half, 1, 2)
             within.update(1, 2)
             within.update(2, 2, "done")
-    assert told == [
+    assert reports == [
         (0.5, 8, "first"), (1.0, 8, "done"), (1.5, 8, "first"), (2.0, 8, "done"),
         (3.5, 8, ""), (5.0, 8, "done"), (6.5, 8, ""), (8.0, 8, "done"),
     ]  # fmt: skip
@@ -187,7 +187,7 @@ def test_phases_of_a_part_never_go_back() -> None:
         def update(self, done: float, total: float, note: str = "") -> None:
             seen.append(done / total)
 
-    whole = InTurn(Seen(), 4)
+    whole = EqualPhases(Seen(), 4)
     for done in (0, 5, 10):
         whole.update(done, 10)
     # Of a phase that tells nothing nothing is added.

@@ -169,10 +169,10 @@ def test_a_protocol_with_more_pulses_than_a_recording_can_have_is_refused() -> N
 PHASE = {"duration_us": 200, "amplitude_ua": -1}
 
 NOT_PROTOCOLS = {
-    "": "protocol: expected JSON, got a mistake: Expecting value: line 1 column 1",
-    '{"pulses": 1': "protocol: expected JSON, got a mistake: Expecting ',' delimiter: line 1 column 13",
+    "": "protocol: expected JSON, got malformed text: Expecting value: line 1 column 1",
+    '{"pulses": 1': "protocol: expected JSON, got malformed text: Expecting ',' delimiter: line 1 column 13",
     "[5, 10]": "protocol: expected what Protocol.to_json writes",
-    "[" * 100_000: "protocol: expected JSON, got a mistake: maximum recursion depth exceeded",
+    "[" * 100_000: "protocol: expected JSON, got malformed text: maximum recursion depth exceeded",
     '{"pulse_s": 1}': "pulse_s: no such setting at the top; expected some of frequencies_hz",
     '{"self": 1}': "self: no such setting at the top",
     '{"pulses": 1, "pulses": 2}': "protocol: expected each name once, got pulses twice",

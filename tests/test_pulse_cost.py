@@ -270,7 +270,7 @@ def test_a_cost_is_of_neurons_whose_electrodes_are_known(tmp_path: Path) -> None
         Training("cartpole", None, pulse_cost=0.1)
     asked = Training("cartpole", "1-threshold", pulse_cost=0.1, iterations=500, algorithm=SMALL)
     with pytest.raises(
-        UnusableData, match=r"pulse_cost: expected conditions that say the electrodes .*, got 5 Hz, 10 Hz"
+        UnusableData, match=r"pulse_cost: expected conditions that state the electrodes .*, got 5 Hz, 10 Hz"
     ):
         trained(asked, timeline_of(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -434,7 +434,7 @@ def test_a_cost_of_frequencies_is_refused_in_a_line(tmp_path: Path, capsys: pyte
     asked = ["train", "cartpole", "--recordings", str(tmp_path / "one.nwb"), "--out", str(tmp_path / "out")]
     assert main([*asked, "--pulse-cost", "0.1", "--burst-threshold", "1"]) == 1
     assert (
-        "--pulse-cost: expected conditions that say the electrodes of all their pulses, got 5 Hz"
+        "--pulse-cost: expected conditions that state the electrodes of all their pulses, got 5 Hz"
         in capsys.readouterr().err
     )
     assert not (tmp_path / "out").exists()

@@ -88,7 +88,7 @@ def test_a_burst_that_falls_on_a_stimulus_is_no_artefact(hit: int) -> None:
 
 
 @pytest.mark.parametrize(("until_ms", "severity"), [(2.0, "note"), (3.0, "note"), (6.0, "warning")])
-def test_a_blanked_stretch_is_told_from_a_quiet_culture(until_ms: float, severity: str) -> None:
+def test_a_blanked_stretch_is_distinguished_from_a_quiet_culture(until_ms: float, severity: str) -> None:
     source = answering({5: 30.0, 10: 60.0}, n=150)
     spikes = spikes_of(source)
     since = since_ms(source, spikes[:, 0])
@@ -99,7 +99,7 @@ def test_a_blanked_stretch_is_told_from_a_quiet_culture(until_ms: float, severit
     assert "blanked-window" not in findings(source)
 
 
-def test_a_condition_whose_window_is_dead_is_told_though_the_others_respond() -> None:
+def test_a_condition_with_a_dead_window_is_reported_though_the_others_respond() -> None:
     rng = np.random.default_rng(7)
     stimulus_s = 0.5 + 0.5 * np.arange(200)
     frequency_hz = np.tile([5.0, 10.0], 100)

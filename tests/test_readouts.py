@@ -1,4 +1,4 @@
-"""Readouts: groups of channels, read from the same windows, told by their electrodes; against counting by hand."""
+"""Readouts: groups of channels, read in the same windows, identified by electrode; against counts by hand."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_one_group_of_all_channels_is_read_to_the_bit_as_all_channels_are(record
     np.testing.assert_array_equal(responses.read_hz, responses.rate_hz)
 
 
-def test_channels_are_told_by_electrode_whatever_their_order(recording: Recording, halves: Readouts) -> None:
+def test_channels_are_identified_by_electrode_in_any_order(recording: Recording, halves: Readouts) -> None:
     other = reordered(recording, np.random.default_rng(0).permutation(len(recording.channels)))
     assert readouts_on("halves", other.channels) == halves
     here, there = (extract_responses(each, readouts=halves) for each in (recording, other))
@@ -108,7 +108,7 @@ def test_responses_that_are_chosen_keep_their_readouts(recording: Recording, hal
         assert set(map(tuple, anew.read_of(condition).tolist())) <= known
     with pytest.raises(Mismatch, match=r"readout_hz: expected shape"):
         replace(responses, readout_hz=responses.rate_hz)
-    with pytest.raises(Mismatch, match="readout_hz: expected some where"):
+    with pytest.raises(Mismatch, match="readout_hz: expected if, and only if, readouts"):
         replace(responses, readout_hz=None)
 
 
@@ -138,7 +138,7 @@ def test_few_responses_cannot_tell_whether_conditions_separate_readouts() -> Non
     left = number < np.where(responses.condition == 0, 16, 28)
     both_hz = np.stack([left, number % 2 == 0], axis=-1).astype(np.float64)
     (found,) = _readouts(replace(responses, readout_hz=both_hz))
-    assert "so few responses cannot tell whether they separate" in found.message
+    assert "there are too few responses to know if they separate" in found.message
 
 
 def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, halves: Readouts) -> None:
@@ -154,9 +154,7 @@ def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, 
         spike_times_s=recording.spike_times_s[kept],
         spike_channels=np.searchsorted(rows, recording.spike_channels[kept]),
     )
-    with pytest.raises(
-        Mismatch, match=rf"^readouts: .*none that read 1 of its 16 \({gone}\); 31 are read .* at 10 min\)$"
-    ):
+    with pytest.raises(Mismatch, match=rf"^readouts: .*none for 1 of its 16 \({gone}\); 31 are read .* at 10 min\)$"):
         extract_series([recording, fewer], readouts="halves")
 
 
@@ -179,7 +177,7 @@ def test_names_of_readouts_are_known_or_refused(recording: Recording) -> None:
     with pytest.raises(InvalidArgument, match=r"^electrodes: expected a list, got 1$"):
         Readouts(("a", "b"), (1, 2))  # type: ignore[arg-type]
     with pytest.raises(
-        InvalidArgument, match=r"^electrodes: expected a group of them for each of the names \('a',\), got none$"
+        InvalidArgument, match=r"^electrodes: expected a group of electrodes for each of the names \('a',\), got none$"
     ):
         Readouts(("a",))
 
@@ -197,38 +195,38 @@ def test_readouts_come_from_a_file_and_go_through_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("[[1], [2]]", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
         ("null", ": expected all, halves, quadrants, or groups of electrodes as JSON"),
-        ("{", ": expected JSON, got a mistake"),
+        ("{", ": expected JSON, got malformed text"),
         ("{}", ".names: expected at least 1, got"),
         ('{"a": []}', ".a: expected at least 1, got"),
         ('{"a": [1], "b": [1.5]}', ".b: expected a whole number, got 1.5"),
         ('{"a": 1}', ".a: expected a list, got 1"),
         ('{"": [1]}', ".names: expected at least 1 character, got ''"),
         ('{"a": [1], "a": [2]}', ": expected each name once, got a twice"),
-        ('{"\\n": [1]}', ".names: expected a printable name for each group of electrodes (1 in all)"),
+        ('{"\\n": [1]}', ".names: expected a different printable name for each group of electrodes (1 in all)"),
     ],
 )
-def test_a_file_of_no_readouts_is_named(text: str, told: str, tmp_path: Path) -> None:
+def test_a_file_of_no_readouts_is_named(text: str, expected: str, tmp_path: Path) -> None:
     (tmp_path / "groups.json").write_text(text)
     with pytest.raises(InvalidFile) as raised:
         read_readouts(tmp_path / "groups.json")
-    assert f"groups.json: readouts{told}" in str(raised.value) and "\n" not in str(raised.value)
-    with pytest.raises(InvalidFile, match="names are all, halves and quadrants"):
+    assert f"groups.json: readouts{expected}" in str(raised.value) and "\n" not in str(raised.value)
+    with pytest.raises(InvalidFile, match="named readouts are all, halves and quadrants"):
         read_readouts("thirds")
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "expected"),
     [
         (5, ": expected a table, got 5"),
-        ({"names": ["a"]}, r".electrodes: expected a group of them for each of the names \('a',\), got none"),
+        ({"names": ["a"]}, r".electrodes: expected a group of electrodes for each of the names \('a',\), got none"),
         ({"names": "ab", "electrodes": [[1], [2]]}, ".names: expected a list, got 'ab'"),
         ({"names": ["a"], "electrodes": [1]}, ".electrodes: expected a list, got 1"),
     ],
 )
-def test_data_of_no_readouts_are_refused(data: object, told: str) -> None:
-    with pytest.raises(InvalidArgument, match=f"^readouts{told}"):
+def test_data_of_no_readouts_are_refused(data: object, expected: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"^readouts{expected}"):
         Readouts.from_dict(data)

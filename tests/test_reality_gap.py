@@ -35,7 +35,6 @@ from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.evaluation.verdict import EpisodeComparison
 from animat.neurons.kinds import Kind
-from animat.neurons.remembering import Remembered
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
@@ -285,7 +284,7 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
             commands.append(float(mapping.command(np.float32(tick.rate_hz), thresholds.percentiles())))
         if not tick.is_burst:
             # Two pulses per trial: neurons have no memory.
-            thresholds.add(tick.delivered, Remembered(), np.array(tick.rate_hz))
+            thresholds.add(tick.delivered, HistoryState(), np.array(tick.rate_hz))
     found = read_responses(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])

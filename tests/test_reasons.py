@@ -15,7 +15,7 @@ from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.reality_gap.session_responses import CommandSums, SessionResponses
 from animat.responses.condition import Condition
 from animat.responses.readouts import Readouts
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.stimulation.protocol import Presentation
 
 CONDITIONS = (Condition("5 Hz", 5.0, "Hz"), Condition("80 Hz", 80.0, "Hz"))
@@ -79,7 +79,7 @@ def session(
         float("nan"),
         presentation=Presentation("mixed", 1),
         time_s=time_s,
-        presented=Presented(condition, data["rate_hz"], data["is_burst"], np.zeros(len(EVERY), bool)),
+        presented=Trials(condition, data["rate_hz"], data["is_burst"], np.zeros(len(EVERY), bool)),
         place=EVERY,
     )
     command = commands(data["rate_hz"][None], recorded)[0]
@@ -120,7 +120,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         "10 % of 800 responses were bursts (2 % in the recording), which the prediction leaves out",
     ),
     "trend": ({"rate_hz": falling, "returns": worse}, "13 min: responses to 80 Hz fall by "),
-    "memory": ({"rate_hz": remembering}, "the culture remembers: after a response that passes the median"),
+    "memory": ({"rate_hz": remembering}, "the culture remembers: of the responses after one that passes the median"),
     "answers": (
         {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
         "conditions lead to different mean commands than predicted: 80 Hz to ",

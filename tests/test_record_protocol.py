@@ -118,7 +118,7 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
         (
             '{"pulses": 2,\n"order" "mixed"}',
             [],
-            "mine.json: protocol: expected JSON, got a mistake: Expecting ':' delimiter: line 2 column 9",
+            "mine.json: protocol: expected JSON, got malformed text: Expecting ':' delimiter: line 2 column 9",
         ),
         (
             '{"frequency_hz": [5]}',

@@ -280,7 +280,7 @@ def test_a_full_disk_leaves_the_old_file_intact(synthetic: Recording, tmp_path: 
         check=False,
     )
     assert done.returncode == 3, done.stderr
-    assert "a.nwb: cannot be written: File too large; what stood there before is unchanged" in done.stdout
+    assert "a.nwb: cannot be written: File too large; any previous file is unchanged" in done.stdout
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["a.nwb"]
     assert read_nwb(path).equals(synthetic)

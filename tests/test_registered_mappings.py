@@ -166,8 +166,8 @@ def test_a_file_makes_nothing_be_imported(data: Any, package: Path) -> None:
         ("import animat", "import animat; 1 / 0", "my_changed:Steep to be importable, got ZeroDivisionError"),
         ("def command", "def order", "expected the methods of a mapping, got a class without command"),
         ("@dataclass(frozen=True)", "", "expected a frozen dataclass"),
-        ('name = "steep"', 'name = "none"', "no other mapping has, got 'none', which is animat's own"),
-        ('name = "steep"', 'name = "linear"', "no other mapping has, got 'linear', which is animat's own"),
+        ('name = "steep"', 'name = "none"', "no other mapping has, got 'none', which is part of animat"),
+        ('name = "steep"', 'name = "linear"', "no other mapping has, got 'linear', which is part of animat"),
         ("return ", "return 1 / 0 * ", "^Steep.command: expected commands, got ZeroDivisionError: "),
         ("return ", "return -", "^Steep.command: expected commands that never fall as the response rises, got "),
         ("return ", "return 2 * ", "^Steep.command: expected 25 commands from -1 to 1, got "),
@@ -193,6 +193,6 @@ def test_what_is_not_registered_is_not_named_by_a_file(package: Path) -> None:
     at = written(package, "@animat.register_mapping\n", "")
     kind = type(mapping_named(at))
     forget()
-    with pytest.raises(InvalidArgument, match=r"expected one that is registered.* got Steep, .*register_mapping"):
+    with pytest.raises(InvalidArgument, match=r"expected a registered one.* got Steep, .*register_mapping"):
         train(Training("cartpole", kind(), algorithm=SMALL), timeline_of(), package / "out")
     assert not (package / "out").exists()

@@ -131,15 +131,15 @@ def test_the_command_line_trains_evaluates_and_runs_it(package: Path, capsys: An
     asked = ["--recordings", "recordings", "--robot", ROVER, "--episodes", "2", "--json"]
     assert main(["evaluate", *asked, "--optimum"]) == 0
     said = capsys.readouterr().out
-    told = json.loads(said.splitlines()[-1])
-    assert told["robot"] == "rover" and told["optimum"] is None and "value_grid" in told["no_optimum"]
+    data = json.loads(said.splitlines()[-1])
+    assert data["robot"] == "rover" and data["optimum"] is None and "value_grid" in data["no_optimum"]
     assert "no heuristic policy among the controls: rover has no method `heuristic`" in said
     forget()
     assert main(["run", *asked, "--culture", "replay"]) == 0
     said = capsys.readouterr().out
-    told = json.loads(said.splitlines()[-1])
-    assert "heuristic" not in {row["name"] for row in told["rows"]}
-    assert {"no-heuristic", "no-optimum"} <= {finding["name"] for finding in told["findings"]}
+    data = json.loads(said.splitlines()[-1])
+    assert "heuristic" not in {row["name"] for row in data["rows"]}
+    assert {"no-heuristic", "no-optimum"} <= {finding["name"] for finding in data["findings"]}
     assert "no optimal return: rover has no method `value_grid`" in said
 
 
@@ -211,7 +211,7 @@ def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> No
     class Here(type(robot_named(ROVER))):  # type: ignore[misc]
         name = "here"
 
-    with pytest.raises(InvalidArgument, match=r"at the top of a file.*<locals>\.Here.*in memory"):
+    with pytest.raises(InvalidArgument, match=r"at the top level of a file.*<locals>\.Here.*in memory"):
         train(Training(Here(), None, algorithm=SMALL), None, package / "out")
 
 
@@ -244,12 +244,12 @@ def test_robots_are_listed_with_what_each_can_do(
     # A package that is broken hides no robot, and ends with status 1.
     assert main(["robots", "--json"]) == 1
     said, _, line = capsys.readouterr().out.strip().rpartition("\n")
-    told = json.loads(line)
-    assert list(told["robots"]) == ["arm", "cartpole", "detour", "navigation", "shuttle", "swing-up", "wheels", "rover"]
-    assert told["robots"]["cartpole"]["can"] == ["heuristic", "value_grid", "draw", "draw_paths"]
-    assert told["robots"]["rover"]["can"] == [] and told["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
+    data = json.loads(line)
+    assert list(data["robots"]) == ["arm", "cartpole", "detour", "navigation", "shuttle", "swing-up", "wheels", "rover"]
+    assert data["robots"]["cartpole"]["can"] == ["heuristic", "value_grid", "draw", "draw_paths"]
+    assert data["robots"]["rover"]["can"] == [] and data["robots"]["rover"]["observes"] == [{"name": "x", "unit": "m"}]
     assert "  no heuristic policy among the controls: rover has no method `heuristic`" in said
-    assert "ModuleNotFoundError" in told["unusable"]["tank"] and "tank cannot be used: " in said
+    assert "ModuleNotFoundError" in data["unusable"]["tank"] and "tank cannot be used: " in said
     observation_spec = property(lambda self: ("x",))
     monkeypatch.setattr(type(robot_named("rover")), "observation_spec", observation_spec)
     assert main(["robots"]) == 1
@@ -263,7 +263,7 @@ def test_robots_are_listed_with_what_each_can_do(
     [
         ("my_nowhere:Rover", "expected my_nowhere:Rover to be importable, got ModuleNotFoundError"),
         ("my_package.robots:Tank", "Tank to be importable, got AttributeError"),
-        ("my_package.robots:At", "expected a class made of animat.Robot, got <class"),
+        ("my_package.robots:At", "expected a subclass of animat.Robot, got <class"),
         ("my_package.robots:", "to be importable, got "),
         (":Rover", "to be importable, got ValueError"),
         ("./my_package/robots.py:Rover", "such as robots:Rover, got a file, './my_package/robots.py:Rover'"),

@@ -125,7 +125,7 @@ def test_what_policies_see_of_the_neurons_is_remembered_as_the_loop_has_it(monke
         recorded = extract_responses(culture.record(PROTOCOL, 0), burst_threshold=0.95)
     own_hz, other = np.sort(recorded.non_burst_rate_hz), Memory(0.15, 1.0, 0.8, 0.0)
     found = lambda ranked: MEMORY if np.array_equal(ranked.sorted_hz, own_hz) else other  # noqa: E731
-    monkeypatch.setattr("animat.neurons.memory._found", found)
+    monkeypatch.setattr("animat.neurons.memory._find_memory", found)
     weights = tuple(np.zeros(size, np.float32) for size in ((6, 16), (16, 16), (16, 5)))
     seeing = policy_of(
         0, [recorded], Cartpole(), weights=weights, scales=np.ones(6, np.float32), neural_observation=True

@@ -221,7 +221,7 @@ def test_a_transposed_table_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("by", "window_ms", "message"),
     [
-        (ByInterval((5.0,)), (2.0, 10.0), "expected others than intervals, as the table has no times"),
+        (ByInterval((5.0,)), (2.0, 10.0), "expected no intervals, as the table has no stimulus times"),
         (ByPattern(), (2.0, 12.0), "expected 1 to 9, in which the table's spikes were counted, got 2 to 12"),
     ],
 )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from animat.coding.decoder import Decoder, decoded
+from animat.coding.decoder import Decoder, decode
 from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
@@ -107,7 +107,7 @@ def test_every_draw_is_a_recorded_trial_with_all_its_readouts(kind: str) -> None
 
 
 def test_memory_chooses_the_trial_that_it_would_with_one_readout() -> None:
-    """What is remembered is of all channels: only what is told of the trial that is drawn is more."""
+    """The history is of all channels; a trial that is drawn only adds the responses of its readouts."""
     responses, memory = of_halves(), Memory(0.3, 0.5, 0.7)
     both = fit_memory(responses, memory=memory)
     one = fit_memory(replace(responses, readouts=Readouts(), readout_hz=None), memory=memory)
@@ -134,7 +134,7 @@ def test_percentiles_and_shares_are_of_each_readout() -> None:
         np.testing.assert_array_equal(drawn(silenced(simulator), 10), np.zeros((3, 10, 2)))
 
 
-def test_what_a_range_loses_is_told_with_its_readout() -> None:
+def test_what_a_range_loses_is_reported_with_its_readout() -> None:
     kept = fidelity(of_halves(), fit_simulator(of_halves(), kind="histogram", bins=2, range_hz=200.0))
     (finding,) = [each for each in kept.findings() if each.name == "binning"]
     assert " Hz on left from " in finding.message or " Hz on right from " in finding.message
@@ -160,12 +160,12 @@ def test_each_command_is_the_mapping_s_of_its_readout(mapping: Mapping) -> None:
     x = rng.gamma(4, 5, (7, 2)).astype(np.float32)
     percentiles = np.sort(rng.gamma(4, 5, (2, 11)), axis=1).astype(np.float32)
     commands = Decoder(mapping, HALVES).command(x, percentiles)
-    of_jax = jax.jit(lambda x, p: decoded(mapping, x, p))(x, percentiles)
+    of_jax = jax.jit(lambda x, p: decode(mapping, x, p))(x, percentiles)
     for d in range(2):
         np.testing.assert_array_equal(commands[:, d], mapping.command(x[:, d], percentiles[d]))
     np.testing.assert_allclose(of_jax, commands, atol=1e-6)
     assert Decoder(mapping, HALVES).percentiles_shape == (2, 11) and Decoder(mapping).percentiles_shape == (11,)
-    assert decoded(mapping, x[0, 0], percentiles[0]) == mapping.command(x[0, 0], percentiles[0])
+    assert decode(mapping, x[0, 0], percentiles[0]) == mapping.command(x[0, 0], percentiles[0])
 
 
 @pytest.mark.oracle
@@ -176,7 +176,7 @@ def test_mean_commands_are_those_of_many_draws() -> None:
     sample = jax.jit(jax.vmap(simulator.sample, (0, None)))
     for c in actions:
         x = sample(keys, jnp.int32(c))
-        u: Any = decoded(Thresholds(9), x, simulator.percentiles)
+        u: Any = decode(Thresholds(9), x, simulator.percentiles)
         np.testing.assert_allclose(means[c], u.mean(axis=0), atol=0.05)
 
 

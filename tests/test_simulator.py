@@ -31,7 +31,7 @@ def responses_of(
         [np.full(len(v), i) for i, v in enumerate(values_hz)] + [np.zeros(len(bursts_hz), int)]
     ).astype(int)
     is_burst = np.arange(len(x)) >= len(x) - len(bursts_hz)
-    told = {
+    columns = {
         "condition": condition,
         "rate_hz": x,
         "active_ratio": np.where(is_burst, 0.9, 0.1),
@@ -44,7 +44,7 @@ def responses_of(
         "presentation": Presentation("blocked"),
         "start_min": start_min,
     }
-    return Responses(**(told | changes))
+    return Responses(**(columns | changes))
 
 
 def draw(simulator: object, condition: int, n: int = 20_000, seed: int = 0) -> np.ndarray:
@@ -217,14 +217,14 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
         (
             lambda: fit_timeline("recordings"),  # type: ignore[arg-type]
             InvalidArgument,
-            "series: expected a list of responses, as animat.extract_series makes, got 'recordings'",
+            "series: expected a list of responses, as animat.extract_series returns, got 'recordings'",
         ),
         (lambda: fit_timeline(responses_of([1.0])), InvalidArgument, "series: expected a list of responses"),  # type: ignore[arg-type]
         (lambda: fit_timeline([3]), InvalidArgument, "series: expected a list of responses, .* got 3"),  # type: ignore[list-item]
         (
             lambda: extract_series("recordings"),  # type: ignore[arg-type]
             InvalidArgument,
-            "recordings: expected a list of recordings, as animat.read_recordings makes, got 'recordings'",
+            "recordings: expected a list of recordings, as animat.read_recordings returns, got 'recordings'",
         ),
         (lambda: extract_series(["recordings"]), InvalidArgument, "recordings: expected .* got 'recordings'"),  # type: ignore[list-item]
         (lambda: fit_timeline([responses_of([1.0])], kind="gamma"), InvalidArgument, "kind"),  # type: ignore[arg-type]

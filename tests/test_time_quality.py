@@ -154,7 +154,7 @@ def test_recordings_of_two_simulated_cultures_are_not_one_series(tmp_path: Path)
         dataclasses.replace(recording, culture=RecordedCulture("virtual", seed))
         for seed, recording in enumerate(made, start=1)
     )
-    with pytest.raises(UnusableData, match=r"got simulated ones of seeds 1, 2; .* --allow several-cultures"):
+    with pytest.raises(UnusableData, match=r"got simulated ones with seeds 1, 2; .* --allow several-cultures"):
         extract_series([one, other])
     assert len(extract_series([one, other], allow=["several-cultures"])) == 2
 

@@ -368,7 +368,7 @@ def test_the_command_line_reads_halves(tmp_path: Path, monkeypatch: pytest.Monke
         "episode_limit=8",
     ]
     assert main(["train", "my_wheels:Wheels", *few, "--readouts", "all"]) == 1
-    assert "expected 2, one for each command of two-wheels, got 1; halves make two" in capsys.readouterr().err
+    assert "expected 2, one for each command of two-wheels, got 1; halves are two" in capsys.readouterr().err
     # Two commands read halves, unless asked otherwise.
     assert main(["train", "my_wheels:Wheels", *few]) == 0
     assert "5 Hz: left 0." in capsys.readouterr().out

@@ -33,7 +33,7 @@ from animat.report.validation import draw_validation, validation_text
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import Readouts
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.stimulation.protocol import Presentation, Protocol
 from synthetic_recordings import write_synthetic_series
 from test_simulator import responses_of
@@ -111,7 +111,7 @@ def autoregressive(rho: float, n: int, seed: int = 1) -> Responses:
 
 
 @pytest.mark.oracle
-def test_a_chain_with_memory_is_told_from_one_without() -> None:
+def test_a_chain_with_memory_is_distinguished_from_one_without() -> None:
     rho = 0.7
     remembering = validate(autoregressive(rho, 3_000))
     # Of a command, from the response before it: deciles of a normal distribution, over 2,000 places of the last one.
@@ -220,7 +220,7 @@ def test_what_is_held_out_is_not_fitted_to() -> None:
 
     def responses(x: np.ndarray) -> Responses:
         burst = np.zeros(n, bool)
-        presented = Presented(every, x, burst, burst, time_s)
+        presented = Trials(every, x, burst, burst, time_s)
         return series(x[place], every[place], 2, presented=presented, place=place, time_s=time_s[place])
 
     for kind in ("histogram", "empirical", "memory"):
@@ -278,7 +278,7 @@ def test_a_free_run_remembers_its_own_answers() -> None:
         every[place],
         2,
         is_burst=burst[place],
-        presented=Presented(every, x, burst, rested, time_s),
+        presented=Trials(every, x, burst, rested, time_s),
         place=place,
         time_s=time_s[place],
     )
@@ -479,7 +479,9 @@ def test_several_readouts_by_hand() -> None:
         each = [stats.spearmanr(part[:, 0], part[:, 1]).statistic for part in parts]
         assert found[0] == pytest.approx(np.average(each, weights=[len(part) for part in parts]))
     for asked in (None, 2):
-        with pytest.raises(InvalidArgument, match=f"readout: expected which of 2 readouts, None of one, got {asked}"):
+        with pytest.raises(
+            InvalidArgument, match=f"readout: expected one of 2 readouts, or None if there is only one, got {asked}"
+        ):
             validate(responses, readout=asked)
 
 
@@ -511,9 +513,9 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     given = ["validate", str(recorded), "--out", str(tmp_path / "figures"), "--json"]
     assert main(given) == 0
     printed = capsys.readouterr().out
-    told = json.loads(printed.splitlines()[-1], parse_constant=pytest.fail)["recordings"]
-    assert [each["name"] for each in told] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
-    for each in told:
+    recordings = json.loads(printed.splitlines()[-1], parse_constant=pytest.fail)["recordings"]
+    assert [each["name"] for each in recordings] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
+    for each in recordings:
         assert f"{each['name']}: {each['verdict']}" in printed
         assert each["verdict"].startswith("Cannot be trusted: conditions were presented in blocks")
         assert sum(each["simulators"]["histogram"]["pit"]) == pytest.approx(1)
@@ -567,8 +569,8 @@ def test_readouts_are_scored_each(recorded: Path, tmp_path: Path, capsys: pytest
     file, figures = recorded / "recording_0000_min.nwb", tmp_path / "figures"
     assert main(["validate", str(file), "--readouts", "halves", "--out", str(figures), "--json"]) == 0
     printed = capsys.readouterr().out
-    told = json.loads(printed.splitlines()[-1])["recordings"]
-    assert [each["name"] for each in told] == [f"{file.name}, left", f"{file.name}, right"]
+    recordings = json.loads(printed.splitlines()[-1])["recordings"]
+    assert [each["name"] for each in recordings] == [f"{file.name}, left", f"{file.name}, right"]
     assert len(list(figures.glob("*.png"))) == 2
     assert "left, right: " in printed
 

@@ -104,7 +104,7 @@ class Tired(Wrapper[Any]):
         return after._replace(info={**after.info, "pushes": pushes})
 
 
-def test_a_wrapper_of_ones_own_remembers() -> None:
+def test_a_custom_wrapper_remembers() -> None:
     """Up, down, up, down: the stairs have no end, but for the limit."""
     for environment in (Tired(EpisodeLimit(DIRECT_FOR_SEVEN)), EpisodeLimit(Tired(DIRECT_FOR_SEVEN))):
         up = roll_out(environment, None, Constant(jnp.array([1])), 1, episodes=2, seed=0)
@@ -114,7 +114,7 @@ def test_a_wrapper_of_ones_own_remembers() -> None:
 
 @pytest.mark.parametrize("wrapper", [ShuffledDelivery, NeuralObservation])
 def test_what_is_of_neurons_is_refused_without_them(wrapper: type[Wrapper[Any]]) -> None:
-    with pytest.raises(InvalidArgument, match="inside: expected an Animat, whose neurons answer, got WithoutNeurons"):
+    with pytest.raises(InvalidArgument, match="inside: expected an Animat, which has neurons, got WithoutNeurons"):
         wrapper(EpisodeLimit(DIRECT))
 
 
@@ -219,10 +219,10 @@ def test_a_neural_observation_is_of_neurons() -> None:
 def test_a_file_that_is_wrong_about_what_its_policy_sees_is_refused(seeing: Policy, tmp_path: Path) -> None:
     seeing.save(tmp_path / "p0.safetensors")
     whole = (tmp_path / "p0.safetensors").read_bytes()
-    told = b'\\"neural_observation\\": true'
+    field = b'\\"neural_observation\\": true'
     # Told again by its provenance, further on.
-    assert whole.count(told) == 2
+    assert whole.count(field) == 2
     for other in (b"0   ", b"null", b"[5] "):
-        (tmp_path / "other.safetensors").write_bytes(whole.replace(told, told.replace(b"true", other), 1))
+        (tmp_path / "other.safetensors").write_bytes(whole.replace(field, field.replace(b"true", other), 1))
         with pytest.raises(InvalidFile, match=r"a whole policy, got one that does not fit together: (weights|neural)"):
             Policy.load(tmp_path / "other.safetensors")

@@ -35,7 +35,7 @@ def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_
 @pytest.mark.parametrize(
     "error", [OSError(28, "No space left on device"), ValueError("something else"), KeyboardInterrupt()]
 )
-def test_on_any_error_the_old_file_stays_and_nothing_lies_beside_it(tmp_path: Path, error: BaseException) -> None:
+def test_on_any_error_the_old_file_stays_and_nothing_is_left_behind(tmp_path: Path, error: BaseException) -> None:
     path = tmp_path / "b.txt"
     path.write_text("old")
     expected = InvalidFile if isinstance(error, OSError) else type(error)
@@ -44,7 +44,7 @@ def test_on_any_error_the_old_file_stays_and_nothing_lies_beside_it(tmp_path: Pa
         raise error
     if expected is InvalidFile:
         assert str(raised.value) == (
-            f"{path}: cannot be written: No space left on device; what stood there before is unchanged"
+            f"{path}: cannot be written: No space left on device; any previous file is unchanged"
         )
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["b.txt"]
@@ -188,5 +188,5 @@ def test_a_leftover_that_cannot_be_removed_stays(tmp_path: Path, monkeypatch: py
 def test_a_folder_that_is_a_file_or_below_one_cannot_be_held(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("")
     for path in (tmp_path / "a", tmp_path / "a" / "b"):
-        with pytest.raises(InvalidFile, match="cannot be made"), exclusive_lock(path):
+        with pytest.raises(InvalidFile, match="cannot be created"), exclusive_lock(path):
             pass

@@ -1,6 +1,6 @@
 """Drive a robot with a living neuronal culture: record, simulate, train, evaluate, close the loop.
 
-The public names stand in `__init__.pyi`, in the order of the story. Nothing heavy is imported before a name is used.
+The public names are listed in `__init__.pyi`, in the order of the story. Nothing heavy is imported before it is used.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _MODULE_OF = {
 
 __all__ = list(_MODULE_OF)
 
-# Gymnasium has known plugins only by their import since 1.0. Nothing of an environment is loaded by this.
+# Since Gymnasium 1.0 plugins must be imported to be known. This loads no environment.
 register_environments()
 
 

@@ -1,4 +1,4 @@
-"""The public names in the order of the story, each from where it is imported when it is used."""
+"""The public names in the order of the story, each with the module it is imported from when it is used."""
 
 # ruff: noqa: I001
 

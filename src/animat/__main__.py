@@ -1,14 +1,14 @@
-"""`python -m animat` is the command `animat`."""
+"""`python -m animat` runs the command `animat`."""
 
 import sys
 
-from animat.ctrl_c import heard_everywhere
+from animat.ctrl_c import interruptible
 
 
 def main() -> int:
-    """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it in a line, also while it is being loaded."""
+    """Run one command (`animat.cli.main`); Ctrl-C or a kill ends it with one line, even while it is being loaded."""
     try:
-        with heard_everywhere():
+        with interruptible():
             from animat.cli import main as run
 
             return run()

@@ -1,4 +1,4 @@
-"""Compiled programs: kept on disk, so that each is compiled once a machine and not once a run, and soon compiled."""
+"""Compiled programs: cached on disk, so that each is compiled once per machine, not once per run; and compiled fast."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ COMPILER_OPTIONS = {
     for option, value in (_DETERMINISTIC if may_use_gpu() else _FAST_TO_COMPILE).items()
     if f"--{option}" not in os.environ.get("XLA_FLAGS", "")
 }
-"""For programs of loops over small networks, as options of `jax.jit`.
+"""Options of `jax.jit` for programs that loop over small networks.
 
-On a processor: a fifth less time to compile, and as fast. At level 2 LLVM looks longer at what XLA made, and finds
-nothing; several parts are for more cores than a worker has. XLA for GPUs refuses a level below 2; there, the same bits
-each time. What `XLA_FLAGS` says of them is left as it is.
+On a CPU they compile in a fifth less time and run as fast: LLVM's level 2 takes longer and gains nothing, and splitting
+code generation is for more cores than a worker has. XLA for GPUs refuses a level below 2; there, the option makes
+results reproducible to the bit. Options that `XLA_FLAGS` sets are left alone.
 """
 
 
 def cache_folder() -> Path:
-    """Where compiled programs are kept: `JAX_COMPILATION_CACHE_DIR`, or a folder of ours in the user's cache."""
+    """Where compiled programs are kept: `JAX_COMPILATION_CACHE_DIR`, or our folder in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    return Path(chosen) if chosen else _usual_cache() / "animat" / "xla"
+    return Path(chosen) if chosen else _user_cache() / "animat" / "xla"
 
 
 def keep_compilations() -> None:
-    """Let JAX keep what it compiles in `cache_folder()`, if that can be written; for a process that will compile.
+    """Let JAX keep what it compiles in `cache_folder()`, if that is writable; for a process that will compile.
 
-    Where it cannot, each process compiles anew, a few seconds each.
+    Otherwise each process compiles everything again, which takes a few seconds.
 
-    What is imported by now is taken out of the garbage collector's view, too: looking through all of JAX, again and
-    again, was a quarter of the time of tracing.
+    It also hides everything imported so far from the garbage collector: scanning all of JAX again and again took a
+    quarter of the tracing time.
     """
     import jax
 
@@ -51,7 +51,7 @@ def keep_compilations() -> None:
     except OSError:
         return
     if not os.access(folder, os.W_OK | os.X_OK):
-        # JAX would warn of every program that it cannot keep.
+        # JAX would warn about every program that it cannot keep.
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -60,17 +60,17 @@ def keep_compilations() -> None:
 
 @contextmanager
 def pynwb_importable() -> Iterator[None]:
-    """As long as this lasts, pynwb can be imported: it cannot without a folder for the user's cache.
+    """Make pynwb importable within this context, even without a writable cache folder of the user.
 
-    Its own cache there is left out: of two processes that import it for the first time, one reads what the other has
-    half written, and a process that is killed then leaves a file with which no import works again.
+    Its own cache is disabled: if two processes import it for the first time, one reads what the other has half written,
+    and a process killed at that moment leaves a file that breaks every later import.
     """
-    usual = _usual_cache()
+    cache = _user_cache()
     with suppress(OSError):
-        usual.mkdir(parents=True, exist_ok=True)
+        cache.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         changed = {"PYNWB_NO_CACHE_DIR": "1"}
-        if not os.access(usual, os.W_OK | os.X_OK):
+        if not os.access(cache, os.W_OK | os.X_OK):
             changed["XDG_CACHE_HOME"] = folder
         before = {name: os.environ.get(name) for name in changed}
         os.environ.update(changed)
@@ -84,10 +84,10 @@ def pynwb_importable() -> Iterator[None]:
                     os.environ[name] = value
 
 
-def kept_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit` that keeps what it compiles beside the source or in the user's cache.
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit` with its cache next to the source or in the user's cache.
 
-    Where neither can be written (a package of the system's, no home), each process compiles anew, instead of failing.
+    If neither is writable (a system package, no home), each process compiles again instead of failing.
     """
     import numba
 
@@ -100,9 +100,9 @@ def kept_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-def _usual_cache() -> Path:
+def _user_cache() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
-        # Nobody's home is known: a place that nothing can be written to.
+        # The home folder is unknown: return a place that cannot be written to.
         return Path(os.devnull)

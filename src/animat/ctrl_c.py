@@ -1,7 +1,7 @@
-"""Ctrl-C, a polite kill and a terminal that is gone: each ends a command by an exception, wherever Python is just then.
+"""Ctrl-C, SIGTERM and a closed terminal: each ends a command with an exception, whatever Python is executing.
 
-What is ignored when the program starts stays ignored: `nohup` has it go on when the terminal is gone, and a script has
-its jobs in the background go on when Ctrl-C ends what is in front. SIGTERM always ends it.
+Signals that are ignored when the program starts stay ignored: with `nohup` it survives the end of the terminal, and a
+script's background jobs survive the Ctrl-C that ends its foreground job. SIGTERM always ends it.
 """
 
 from __future__ import annotations
@@ -17,34 +17,37 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-# A hang-up comes where the terminal goes (an ssh session that breaks off); not every system has it.
+# A hang-up comes when the terminal closes (a lost ssh session); not every system has it.
 KILLS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
 
-_AGAIN_S = 0.05
+_RETRY_S = 0.05
 _LONGEST_IMPORT_S = 10.0
 
 
 @contextmanager
-def heard_everywhere() -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt, a moment later where Python would drop it.
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt, a moment later if Python would drop it.
 
-    What is raised in a callback of the garbage collector (JAX has one) or in a finaliser is told to a hook, and Python
-    goes on as if nothing had been. An import is not cut short, unless it takes long: what is half imported may crash as
-    Python exits, and libraries make another error of it. Ctrl-C is left alone where it does not raise already.
+    An exception in a callback of the garbage collector (JAX has one) or in a finaliser goes to a hook, and Python
+    carries on as if nothing had happened. An import is not cut short unless it takes long: a half-imported module may
+    crash as Python exits, and libraries turn the exception into another. Ctrl-C is left alone if it did not raise
+    before.
     """
-    told, waits_since_s, is_asking = sys.unraisablehook, 0.0, False
+    previous_hook, waits_since_s, will_retry = sys.unraisablehook, 0.0, False
 
-    def ask_again() -> None:
-        nonlocal is_asking
-        if not is_asking:
-            is_asking = True
-            _thread.start_new_thread(in_a_moment, ())
+    def retry() -> None:
+        nonlocal will_retry
+        if not will_retry:
+            will_retry = True
+            _thread.start_new_thread(retry_later, ())
 
-    def in_a_moment() -> None:
-        nonlocal is_asking
-        time.sleep(_AGAIN_S)
-        is_asking = False
-        _raise_again()
+    def retry_later() -> None:
+        nonlocal will_retry
+        time.sleep(_RETRY_S)
+        will_retry = False
+        # SIGTERM is never ignored; if nobody handles it any more, the command has ended.
+        if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+            os.kill(os.getpid(), signal.SIGTERM)
 
     def interrupt(_number: int, frame: FrameType | None) -> None:
         nonlocal waits_since_s
@@ -52,27 +55,27 @@ def heard_everywhere() -> Iterator[None]:
         if not _is_importing(frame) or time.monotonic() > waits_since_s + _LONGEST_IMPORT_S:
             waits_since_s = 0.0
             raise KeyboardInterrupt
-        # Not a `Thread`: it takes a lock, which what was interrupted may hold.
-        ask_again()
+        # Not a `Thread`: it takes a lock, which the interrupted code may hold.
+        retry()
 
-    def dropped(unraisable: Any) -> None:
+    def hook(unraisable: Any) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            ask_again()
+            retry()
         else:
-            told(unraisable)
+            previous_hook(unraisable)
 
     raising = (signal.SIGINT,) if signal.getsignal(signal.SIGINT) is signal.default_int_handler else ()
     with handled((*raising, *KILLS), interrupt):
-        sys.unraisablehook = dropped
+        sys.unraisablehook = hook
         try:
             yield
         finally:
-            sys.unraisablehook = told
+            sys.unraisablehook = previous_hook
 
 
 @contextmanager
 def handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) -> Iterator[None]:
-    """Handle these signals, but not Ctrl-C and SIGHUP where they are ignored, and none outside of the main thread."""
+    """Handle these signals, except an ignored Ctrl-C or SIGHUP; outside the main thread handle none."""
     # Only the main thread may set handlers, and only it is interrupted.
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -84,12 +87,6 @@ def handled(numbers: tuple[signal.Signals, ...], handler: Callable[..., None]) -
     finally:
         for number, old in zip(numbers, before, strict=True):
             signal.signal(number, old)
-
-
-def _raise_again() -> None:
-    # Of the signals here it is never ignored; where nobody handles it any more, the command has ended.
-    if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
-        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _is_importing(frame: FrameType | None) -> bool:

@@ -1,4 +1,4 @@
-"""Which devices of a machine JAX may use: its GPU is for training (`animat.execution.gpu`), cores are for the rest."""
+"""Which devices JAX may use: the GPU for training (`animat.execution.gpu`), CPU cores for everything else."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ import os
 
 
 def may_use_gpu() -> bool:
-    """Whether JAX looks for a GPU in a process like this one: there is a plugin, and `JAX_PLATFORMS` allows it."""
+    """Whether JAX looks for a GPU in a process like this one: a plugin is installed and `JAX_PLATFORMS` allows it."""
     first = os.environ.get("JAX_PLATFORMS", "").split(",")[0]
     return first != "cpu" and importlib.util.find_spec("jax_plugins") is not None
 
 
 GPU_IS_ALLOWED = may_use_gpu()
-"""As whoever started this process wants it."""
+"""Whether the user who started this process allows a GPU."""
 
 
 def stay_on_cores() -> None:
-    """Keep JAX off the GPU in this process, before it is imported; training, in one of its own, has the GPU's memory.
+    """Keep JAX off the GPU in this process, before JAX is imported; training, in a separate process, has its memory.
 
-    So recordings, simulators and evaluations have the same bits with a GPU and without, and whatever else
-    `JAX_PLATFORMS` asks for.
+    So recordings, simulators and evaluations are identical to the bit with and without a GPU, whatever
+    `JAX_PLATFORMS` requests.
     """
     os.environ["JAX_PLATFORMS"] = "cpu"
 
 
 def gpu_here() -> str | None:
-    """The kind of GPU that JAX uses in this process, as last bits depend on it; None for cores."""
+    """The kind of GPU that JAX uses in this process, on which the last bits depend; None for CPU cores."""
     if not may_use_gpu():
         return None
     import jax

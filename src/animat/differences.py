@@ -1,4 +1,4 @@
-"""Where two descriptions differ, said to somebody whose folder holds another thing than was asked for."""
+"""Where two descriptions differ, for the error about a folder that holds something else than was requested."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LONGEST = 60
 
 
 class _Nothing:
-    """What stands where a key is missing."""
+    """The value of a missing key."""
 
     def __repr__(self) -> str:
         return "nothing"
@@ -24,16 +24,16 @@ _NOTHING = _Nothing()
 
 
 def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Collection[str] = ()) -> str:
-    """The first place where two pieces of plain data differ, such as `training.seed: 1 there, 2 now`.
+    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`.
 
     Args:
-        found: what is there: numbers, texts, lists and dictionaries of such.
-        wanted: what was asked for.
-        name: of both, for the front of the sentence.
+        found: the data in the folder: numbers, strings, and lists and dictionaries of these.
+        wanted: the data requested now.
+        name: of both, for the beginning of the message.
         ignoring: keys that do not matter, at any depth.
 
     Returns:
-        The place and both values, cut short where they are long; nothing (an empty text) where they are the same.
+        The place and both values, abbreviated if long; an empty string if there is no difference.
     """
     if isinstance(found, dict) and isinstance(wanted, dict):
         pairs = [
@@ -41,23 +41,23 @@ def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Colle
             for key in sorted(set(found) | set(wanted))
             if key not in ignoring
         ]
-    elif isinstance(found, list) and isinstance(wanted, list) and _are_entered(found, wanted):
-        # What both have; of different lengths they differ at the latest where one ends.
+    # Short lists of different lengths are shown as a whole.
+    elif (
+        isinstance(found, list)
+        and isinstance(wanted, list)
+        and (len(found) == len(wanted) or max(len(repr(found)), len(repr(wanted))) > _LONGEST)
+    ):
+        # The entries that both have, then the lengths.
         pairs = [(one, other, f"{name}[{i}]") for i, (one, other) in enumerate(zip(found, wanted, strict=False))]
         pairs += [(len(found), len(wanted), f"{name}, how many")]
     else:
         return "" if found == wanted else f"{name}: {_short(found)} there, {_short(wanted)} now"
-    told = (first_difference(one, other, place, ignoring=ignoring) for one, other, place in pairs)
-    return next((difference for difference in told if difference), "")
-
-
-def _are_entered(found: list[Any], wanted: list[Any]) -> bool:
-    """Whether lists are compared entry by entry: not where they are told as a whole, of different lengths but short."""
-    return len(found) == len(wanted) or max(len(repr(found)), len(repr(wanted))) > _LONGEST
+    differences = (first_difference(one, other, place, ignoring=ignoring) for one, other, place in pairs)
+    return next(filter(None, differences), "")
 
 
 def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
-    """SHA-256 over plain data, and bytes beside."""
+    """SHA-256 over plain data and further bytes."""
     digest = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
     for part in more:
         digest.update(part)
@@ -65,28 +65,28 @@ def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
 
 
 def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
-    """Plain data by way of JSON, in which a tuple and a list are the same, with a fingerprint over all of it."""
-    told: dict[str, Any] = json.loads(json.dumps(description))
-    return told | {"fingerprint": fingerprint_of(told)}
+    """Plain data with a fingerprint over all of it, converted by way of JSON, which has no tuples."""
+    data: dict[str, Any] = json.loads(json.dumps(description))
+    return data | {"fingerprint": fingerprint_of(data)}
 
 
-def description_in(path: Path, what: str) -> dict[str, Any] | None:
-    """What a file of JSON says of the folder that it lies in, with its fingerprint; None if there is none.
+def read_description(path: Path, what: str) -> dict[str, Any] | None:
+    """Read the JSON description of the folder that a file is in, with its fingerprint; None if there is no such file.
 
-    What the folder holds, such as a `study`, is for the message of an InvalidFile, if it cannot be read.
+    `what` names the folder's content, such as `study`, in the message of the InvalidFile raised if it cannot be read.
     """
     if not path.exists():
         return None
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-        _ = found["fingerprint"]
+        description: dict[str, Any] = json.loads(path.read_text())
+        _ = description["fingerprint"]
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise InvalidFile(f"{path}: expected a {what}'s description, got a file that cannot be read") from error
-    return found
+    return description
 
 
-def of_another(folder: Path, what: str, difference: str) -> Mismatch:
-    """The error of a folder that holds another study or training than was asked for."""
+def folder_mismatch(folder: Path, what: str, difference: str) -> Mismatch:
+    """The error for a folder that holds a different study or training from the one requested."""
     return Mismatch(
         f"{folder}: expected a folder of this {what}, got one of another ({difference}); give another folder, or "
         "remove this one"

@@ -1,4 +1,4 @@
-"""What a policy acts in: neurons, mapping and robot as one environment (`Animat`), pure and jittable."""
+"""What a policy acts in: neurons, mapping and robot as a single environment (`Animat`), pure and jittable."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from animat.coding.decoder import decoded, expect_fit, expect_one_command
+from animat.coding.decoder import decode, expect_fit, expect_one_command
 from animat.coding.mapping import Mapping
 from animat.errors import InvalidArgument
-from animat.neurons.history import AT_FIRST
+from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import Answer, NeuronSimulator
 from animat.robots.base import Quantity, Robot
 
@@ -25,16 +25,16 @@ Number = Float[Array, ""]
 Flag = Bool[Array, ""]
 
 
-_OF_THE_LAST = ("delivered", "rate_hz", "command")
-"""In an environment's `info`: what the last iteration did, and the next one does not ask for."""
+_NOT_CARRIED = ("delivered", "rate_hz", "command")
+"""Entries of `info` about the last iteration, which the next one does not need."""
 
 
 class Ended(NamedTuple):
-    """Whether an episode has ended, and how: never in both ways.
+    """Whether an episode has ended, and how: at most one of the two is True.
 
     Attributes:
-        terminated: by itself (fell, reached).
-        truncated: it was cut off (`animat.wrappers.EpisodeLimit`).
+        terminated: the task ended by itself (fell, reached).
+        truncated: the episode was cut off (`animat.wrappers.EpisodeLimit`).
     """
 
     terminated: Flag
@@ -42,12 +42,12 @@ class Ended(NamedTuple):
 
 
 class Responded(NamedTuple):
-    """What comes of an action before the robot moves.
+    """The result of an action before the robot moves.
 
     Attributes:
-        delivered: the condition that reached the neurons (the action itself, where there are none).
-        answer: of the neurons.
-        command: what the robot is moved by.
+        delivered: the condition that reached the neurons (the action itself, without neurons).
+        answer: the response of the neurons.
+        command: the command that moves the robot.
     """
 
     delivered: Array
@@ -56,17 +56,17 @@ class Responded(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where an episode stands, and what the iteration did that led there (at the start: nothing, all of it 0).
+    """The state of an episode, and what the iteration that led to it did (all 0 at the start).
 
     Attributes:
         robot: the state of the robot.
-        iteration: how many are done.
-        neurons: what they remember, see `animat.neurons.simulator.Answer`.
-        reward: in the task's own units.
-        ended: whether the episode has.
-        info: by name. `delivered`: the condition that reached the neurons (the action itself, where there are none).
-            `rate_hz`: the response x, Hz per channel (NaN without neurons); of several readouts, shape (readouts,).
-            `command`: the motor command u in [-1, 1]; of several, shape (commands,). And what a wrapper remembers.
+        iteration: the number of iterations done.
+        neurons: their history state, see `animat.neurons.simulator.Answer`.
+        reward: in the task's units.
+        ended: whether the episode has ended.
+        info: by name. `delivered`: the condition that reached the neurons (the action itself, without neurons).
+            `rate_hz`: the response x, Hz per channel (NaN without neurons); with several readouts, shape (readouts,).
+            `command`: the motor command u in [-1, 1]; with several, shape (commands,). Wrappers add what they remember.
     """
 
     robot: Any
@@ -78,16 +78,16 @@ class State(NamedTuple):
 
     @property
     def carried(self) -> State:
-        """What the next iteration asks for, alone: a compiled loop that carries no more is the smaller for it."""
-        remembered = {name: value for name, value in self.info.items() if name not in _OF_THE_LAST}
+        """Only what the next iteration needs, which keeps compiled loops small."""
+        remembered = {name: value for name, value in self.info.items() if name not in _NOT_CARRIED}
         return self._replace(reward=None, ended=None, info=remembered)  # type: ignore[arg-type]
 
 
 class Environment(abc.ABC, Generic[RobotState]):
-    """What a policy acts in: a robot, moved through neurons (`Animat`) or directly (`WithoutNeurons`), or a wrapper.
+    """What a policy acts in: a robot, moved by neurons (`Animat`) or directly (`WithoutNeurons`), or a wrapper.
 
     Everything in it is static; the simulator is an argument of each step, so refreshing it changes data, not code.
-    Episodes go on until the task ends by itself, unless a wrapper cuts them off (`animat.wrappers`).
+    Episodes continue until the task ends by itself, unless a wrapper cuts them off (`animat.wrappers`).
     """
 
     robot: Robot[RobotState]
@@ -95,16 +95,16 @@ class Environment(abc.ABC, Generic[RobotState]):
     @property
     @abc.abstractmethod
     def n_actions(self) -> int | None:
-        """How many discrete actions there are; None: continuous ones in [-1, 1], one a command."""
+        """The number of discrete actions; None: continuous actions in [-1, 1], one per command."""
 
     @property
     @abc.abstractmethod
     def noise_size(self) -> int:
-        """How many uniforms in [0, 1) one iteration consumes."""
+        """The number of uniforms in [0, 1) that one iteration consumes."""
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
-        """What the numbers of an observation are, in order; those of the robot come first."""
+        """The quantities of an observation, in order; those of the robot come first."""
         return self.robot.observation_spec
 
     def observe(self, state: State) -> Float[Array, " observations"]:
@@ -118,7 +118,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         return State(
             self.robot.reset(key),
             jnp.int32(0),
-            jnp.array(AT_FIRST, jnp.float32),
+            jnp.array(INITIAL_HISTORY, jnp.float32),
             jnp.float32(0.0),
             Ended(jnp.bool_(False), jnp.bool_(False)),
             {"delivered": delivered, "rate_hz": rest, "command": rest},
@@ -126,16 +126,16 @@ class Environment(abc.ABC, Generic[RobotState]):
 
     @abc.abstractmethod
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
-        """What comes of an action before the robot moves; arguments as in `advance`."""
+        """The result of an action before the robot moves; arguments as in `advance`."""
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
-        """One iteration, its random numbers handed in: training draws them for many iterations at once.
+        """One iteration, with its random numbers as an argument: training draws them for many iterations at once.
 
         Args:
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration; `State.carried` is enough.
             action: an index, or the commands.
-            simulator: the neurons; None without.
+            simulator: of the neurons; None without neurons.
         """
         delivered, answer, command = self.respond(uniforms, state, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
@@ -150,23 +150,23 @@ class Environment(abc.ABC, Generic[RobotState]):
 
     @property
     def n_drawn(self) -> int:
-        """How many uniforms drawing an action takes: one, or one for each continuous command."""
+        """The number of uniforms for drawing an action: one, or one for each continuous command."""
         return 1 if self.n_actions is not None else self.robot.n_commands
 
     @property
     def scales(self) -> Float[np.ndarray, " observations"]:
-        """What a policy divides an observation by, so that its numbers are of order one."""
+        """The divisors with which a policy scales observations to order one."""
         return np.array([quantity.scale for quantity in self.observation_spec], np.float32)
 
 
 @dataclass(frozen=True)
 class Animat(Environment[RobotState]):
-    """A robot that moves as neurons answer to the condition the agent picks.
+    """A robot moved by the responses of neurons to the conditions that the agent picks.
 
     Attributes:
         robot: the body and its task.
         mapping: from the response of a readout to a motor command.
-        n_conditions: how many conditions the agent picks from.
+        n_conditions: the number of conditions that the agent picks from.
     """
 
     robot: Robot[RobotState]
@@ -179,16 +179,16 @@ class Animat(Environment[RobotState]):
 
     @property
     def noise_size(self) -> int:
-        # The last one is for who draws what is delivered (`ShuffledDelivery`): with it or without, robot and neurons
-        # meet the same random numbers.
+        # The last one is for drawing the delivered condition (`ShuffledDelivery`): with or without it, robot and
+        # neurons get the same random numbers.
         return self.robot.noise_size + 2
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
         if simulator is None:
-            raise InvalidArgument("simulator: an Animat needs the neurons to answer, got None")
+            raise InvalidArgument("simulator: expected a neuron simulator, which an Animat needs, got None")
         expect_fit(self.robot.name, self.robot.n_commands, simulator.n_readouts)
         answer = simulator.answer(action, uniforms[self.robot.noise_size], state.neurons)
-        command = decoded(self.mapping, answer.rate_hz, simulator.percentiles)
+        command = decode(self.mapping, answer.rate_hz, simulator.percentiles)
         return Responded(action, answer, command)
 
 
@@ -198,11 +198,11 @@ class WithoutNeurons(Environment[RobotState]):
 
     Attributes:
         robot: the body and its task.
-        commands: the commands to pick from, such as (-1, 1) for the cartpole; None: any in [-1, 1], of as many
-            dimensions as the robot takes commands.
+        commands: the commands to pick from, such as (-1, 1) for the cartpole; None: continuous commands in [-1, 1], as
+            many as the robot takes.
 
     Raises:
-        InvalidArgument: for commands to pick from, and a robot that takes several at once.
+        InvalidArgument: for commands to pick from with a robot that takes several at once.
     """
 
     robot: Robot[RobotState]
@@ -221,6 +221,6 @@ class WithoutNeurons(Environment[RobotState]):
         return self.robot.noise_size
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
-        nothing = Answer(jnp.float32(jnp.nan), state.neurons)
+        no_answer = Answer(jnp.float32(jnp.nan), state.neurons)
         command = action if self.commands is None else jnp.asarray(self.commands, jnp.float32)[action]
-        return Responded(action, nothing, jnp.clip(command, -1.0, 1.0))
+        return Responded(action, no_answer, jnp.clip(command, -1.0, 1.0))

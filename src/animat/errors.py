@@ -1,4 +1,4 @@
-"""The errors of animat: each names the argument or file, what was expected, what came, and what to do."""
+"""The errors of animat: each names the argument or file, what was expected, what came, and what to do about it."""
 
 from __future__ import annotations
 
@@ -10,31 +10,29 @@ from typing import Any
 
 
 class AnimatError(Exception):
-    """Base of every error that a user can cause and mend; the command line prints it in one line.
-
-    The message names the argument or file, what was expected, what came, and what to do.
+    """Base of every error that a user can cause and fix; the command line prints it in one line.
 
     Attributes:
-        is_admitted: of an error of `Culture.deliver`: its guard had admitted stimuli, which may have been delivered.
+        is_admitted: for errors of `Culture.deliver`: its guard had admitted stimuli, which may have been delivered.
     """
 
     is_admitted = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Not made again by its arguments, which are others than its message: it goes from process to process.
+        # Errors travel between processes, and some take other arguments than their message.
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class InvalidArgument(AnimatError, ValueError):
-    """An argument, option or configuration value is outside what it may be."""
+    """An argument, option or configuration value is not allowed."""
 
 
 class InvalidFile(AnimatError):
-    """A file is missing, damaged, of another kind, or does not hold what it should."""
+    """A file is missing, damaged, of the wrong kind, or lacks what it should hold."""
 
 
 class UnusableData(AnimatError):
-    """Data were read, but what was asked of them cannot be done (a dead window, no stimuli, an empty condition)."""
+    """Data were read but cannot be used as requested (a dead window, no stimuli, an empty condition)."""
 
 
 class Mismatch(AnimatError):
@@ -42,7 +40,7 @@ class Mismatch(AnimatError):
 
 
 class UnsafeStimulus(AnimatError):
-    """A stimulus is outside what the culture's safety limits allow; nothing of the request was delivered.
+    """A stimulus exceeds the culture's safety limits; nothing of the request was delivered.
 
     Attributes:
         limit: the name of the limit, a field of `animat.cultures.safety.Limits` or `"sites"`, `"overlap"`, `"stopped"`.
@@ -54,78 +52,78 @@ class UnsafeStimulus(AnimatError):
 
 
 class BudgetSpent(AnimatError):
-    """A stimulation budget does not hold what was asked for; nothing of the request was delivered."""
+    """A request exceeds what is left of a stimulation budget; nothing of it was delivered."""
 
 
 class LoopEnded(AnimatError):
-    """A closed loop ended before its time, by a fault or a person; all of its ticks are in its folder."""
+    """A closed loop ended early, through a fault or a person; all of its ticks are in its folder."""
 
 
 class DeviceFailed(AnimatError):
-    """A device cannot be used or failed while it was (no driver, no connection, a pulse that did not come)."""
+    """A device cannot be used, or failed during use (no driver, no connection, a missing pulse)."""
 
 
 class BodyFailed(AnimatError):
-    """A body of somebody else (`gymnasium:...`) raised, hung, or gave no finite numbers; what was finished stays."""
+    """A third-party body (`gymnasium:...`) raised, hung, or returned non-finite numbers; finished work is kept."""
 
 
 def in_min(minutes: float) -> str:
-    """A time on the culture's clock as messages and tables have it: with two decimals at most."""
+    """A time on the culture's clock for messages and tables, with at most two decimals."""
     return f"{round(minutes, 2):.10g} min"
 
 
 def shown(value: object) -> str:
-    """A value as a message shows it: in one line, and cut where it is longer than anyone reads."""
+    """A value for a message: on one line, and cut if it is long."""
     try:
         text = re.sub(r"\s*\n\s*", " ", repr(value))
     except (ValueError, RecursionError):
-        # Python writes no whole number of more than 4,300 digits, and nothing that is nested without end.
+        # Python cannot write whole numbers of more than 4,300 digits, nor endlessly nested values.
         text = f"a number of {value.bit_length():,} bits" if isinstance(value, int) else f"a {type(value).__name__}"
     return text if len(text) <= 80 else f"{text[:80]}... ({len(text):,} characters)"
 
 
 def some_of(names: Sequence[object], most: int = 8) -> str:
-    """The first of some names, and dots where there are more."""
+    """The first names of a list, and dots if there are more."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
 
 
 def expect_kind(what: str, given: object, kind: Any, words: str) -> None:
-    """Refuse what is of another kind than an argument should be, such as a path in the place of what is read from it.
+    """Refuse an argument of the wrong type, such as a path in place of the recording that it holds.
 
     Raises:
-        InvalidArgument: naming the argument, what was expected, in `words`, and what came.
+        InvalidArgument: naming the argument, what was expected (`words`) and what came.
     """
     if not isinstance(given, kind):
         raise InvalidArgument(f"{what}: expected {words}, got {shown(given)}")
 
 
 def expect_several(what: str, given: Any, kind: Any, words: str) -> tuple[Any, ...]:
-    """The same of several, all of one kind, which are returned; a text and a table of names are none."""
+    """The same for several values, all of one type, which are returned; a string or a mapping is not several."""
     expect_kind(what, given, Iterable, words)
-    several = (given,) if isinstance(given, str | bytes | Mapping) else tuple(given)
-    for each in several:
-        expect_kind(what, each, kind, words)
-    return several
+    values = (given,) if isinstance(given, str | bytes | Mapping) else tuple(given)
+    for value in values:
+        expect_kind(what, value, kind, words)
+    return values
 
 
 def did_you_mean(word: str, among: Iterable[str]) -> str:
-    """The end of a message on a word that is none of those expected: the nearest of them, if any is near."""
+    """The end of a message about an unknown word: the most similar of those expected, if any is similar."""
     near = difflib.get_close_matches(word, list(among), n=1, cutoff=0.7)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def first_line(error: BaseException) -> str:
-    """What somebody else's code raised: its type, and the first line of what it says."""
+    """An error of third-party code: its type and the first line of its message."""
     lines = str(error).strip().splitlines() or ["no more is known"]
     return f"{type(error).__name__}: {lines[0]}"
 
 
 def out_of_memory(error: BaseException) -> str | None:
-    """That memory was too little, with how much was asked for at the last where that is told; None for another error.
+    """A message if memory ran out, with the size of the failed request if it is known; None for any other error.
 
-    JAX has an error of its own for it (RESOURCE_EXHAUSTED), which is known by its words: it is not imported for this.
+    JAX has its own error for this (RESOURCE_EXHAUSTED), recognised by its text so that JAX need not be imported.
     """
     if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
         return None
-    asked = re.search(r"llocat\w+ ([\d.]+ ?\w*)", str(error))
-    return f"out of memory ({asked[1]} more were asked for)" if asked else "out of memory"
+    request = re.search(r"llocat\w+ ([\d.]+ ?\w*)", str(error))
+    return f"out of memory ({request[1]} more were requested)" if request else "out of memory"

@@ -9,7 +9,7 @@ from animat.errors import AnimatError
 
 
 def expect_extra(module: str, *, package: str, extra: str, what: str) -> Any:
-    """A module of a package that an extra brings, for what needs it; AnimatError, saying how to install it."""
+    """Import a module that an extra installs; raise AnimatError, saying how to install it, if it is missing."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Files that are read: plain ones of a bounded size, so that no device, pipe or lie about a size is waited for."""
+"""Reading plain files of a bounded size, so that no device, pipe or false size blocks or fills the memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from animat.errors import InvalidFile
 
 
 def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> Path:
-    """Refuse whatever cannot be read to its end: a folder, a device, a pipe, no file at all, or too many bytes.
+    """Refuse anything that cannot be read to its end: a folder, a device, a pipe, a missing or too large file.
 
     Raises:
         InvalidFile: naming the file and what it is.
@@ -26,8 +26,8 @@ def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = Non
         raise InvalidFile(f"{path}: no such file") from error
     except (OSError, ValueError) as error:
         # A name too long for the system is an OSError, one with a zero byte a ValueError.
-        said = error.strerror if isinstance(error, OSError) else error
-        raise InvalidFile(f"{str(path)[:200]!r}: cannot be read: {said}") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InvalidFile(f"{str(path)[:200]!r}: cannot be read: {reason}") from error
     if kind is not None:
         raise InvalidFile(f"{path}: expected a file, got {kind}")
     if most_bytes is not None and size > most_bytes:
@@ -36,21 +36,21 @@ def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = Non
 
 
 def expect_no_file(folder: Path, what: str) -> None:
-    """Raise InvalidFile if a file is in the place of a folder for something."""
+    """Raise InvalidFile if the folder for something is a file."""
     if folder.exists() and not folder.is_dir():
         raise InvalidFile(f"{folder}: expected a folder for {what}, got a file")
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder is there; not, and no error either, for a name that the system cannot have."""
+    """Whether a folder exists; False, without an error, for an impossible name."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
         return False
 
 
-def is_nothing(path: Path) -> bool:
-    """Whether no file or folder has this name; it is no error where the system cannot have such a name."""
+def is_absent(path: Path) -> bool:
+    """Whether no file or folder has this name; False, without an error, for an impossible name."""
     try:
         return not path.exists()
     except (OSError, ValueError):
@@ -58,11 +58,11 @@ def is_nothing(path: Path) -> bool:
 
 
 def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
-    """The text of a file, in UTF-8; raises InvalidFile for what is no file of text, or a larger one."""
+    """The text of a file in UTF-8; raises InvalidFile if it is not a text file or too large."""
     path = expect_plain_file(path, most_bytes)
     try:
         with path.open("rb") as file:
-            # What a system makes up while it is read has no size until then.
+            # Files that the system generates on reading have no size before.
             content = file.read(most_bytes + 1)
         if len(content) > most_bytes:
             raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
@@ -74,13 +74,13 @@ def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
 
 
 def read_toml(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:
-    """A TOML file as plain data; raises InvalidFile if it cannot be read or is no TOML."""
+    """A TOML file as plain data; raises InvalidFile if it cannot be read or is not TOML."""
     text = read_plain_text(path, most_bytes)
     try:
         return tomllib.loads(text)
     except RecursionError as error:
-        raise InvalidFile(f"{path}: expected TOML, got lists or tables nested without end") from error
+        raise InvalidFile(f"{path}: expected TOML, got lists or tables nested too deeply") from error
     except ValueError as error:
-        # Also a number of more digits than Python reads.
-        said = str(error).partition(";")[0]
-        raise InvalidFile(f"{path}: expected TOML, got a mistake: {said}") from error
+        # Also for a number with more digits than Python reads.
+        reason = str(error).partition(";")[0]
+        raise InvalidFile(f"{path}: expected TOML, got malformed text: {reason}") from error

@@ -1,7 +1,7 @@
-"""A process that does what it is told: on one core, on the GPU, or a plain Python, as the one that reads HDF5.
+"""A process that executes calls: on one core, on the GPU, or as plain Python, such as the one that reads HDF5.
 
-It is `python -m animat.process CPU`, `gpu` in the place of the core, or `plain`. Calls come pickled on its standard
-input, from the process that started it; what they return or raise goes out so too.
+It runs as `python -m animat.process CORE`, or with `gpu` or `plain` in place of the core. Calls arrive pickled on its
+standard input, from the process that started it; what they return or raise is pickled on its standard output.
 """
 
 from __future__ import annotations
@@ -19,42 +19,42 @@ from pathlib import Path
 from typing import Any, Literal
 
 _LARGEST_MIB = 800
-"""A process on a core that has grown beyond it is spent: compiled programs and tables of past work stay in it."""
+"""A process on a core that has grown larger is spent: it keeps compiled programs and tables of past work."""
 
 
 class Process:
-    """A process for calls, which imports from where this one does.
+    """A process that executes calls, with the same import path as this one.
 
     Args:
-        where: a core that it is pinned to; `gpu`: pinned to no core, and it may use the GPU; `plain`: neither, and what
-            it says on standard error goes nowhere.
+        where: the core it is pinned to; `gpu`: not pinned, and may use the GPU; `plain`: neither, and its standard
+            error is discarded.
     """
 
     def __init__(self, where: int | Literal["gpu", "plain"]) -> None:
         self._is_on_core, is_plain = isinstance(where, int), where == "plain"
-        # A plain one finds what is installed, whatever lies in the working folder. Several threads would only take
-        # memory, which is limited.
+        # A plain process imports installed packages, whatever is in the working folder. Several threads would only use
+        # up memory, which is limited.
         options = ["-P", "-W", "ignore"] if is_plain else []
         threads = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS") if is_plain else ()
-        # A script's own folder, or the working one: robots may lie there.
+        # These include the script's folder or the working folder, where robots may be.
         paths = os.pathsep.join(path for path in sys.path if path and isinstance(path, str))
         self._popen = subprocess.Popen(
             [sys.executable, *options, "-m", "animat.process", str(where)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL if is_plain else None,
-            # In a group of its own: Ctrl-C reaches this process alone, which then ends the other without a word.
+            # In its own group: Ctrl-C reaches only this process, which then ends the other silently.
             process_group=0,
             env=os.environ | dict.fromkeys(threads, "1") | {"PYTHONPATH": paths},
         )
         self.kill = self._popen.kill
 
     def answer(self, call: bytes, within_s: float | None = None) -> Any:
-        """What a call returns: a function, its arguments and its named ones, pickled.
+        """Execute a call, a pickled (function, arguments, named arguments), and return its result.
 
         Raises:
-            BrokenExecutor: if the process ends over it.
-            TimeoutError: if the answer does not come in time; the process is then ended.
+            BrokenExecutor: if the process ends during the call.
+            TimeoutError: if the answer does not come in time; the process is then killed.
             Exception: what the call raised.
         """
         assert self._popen.stdin is not None and self._popen.stdout is not None
@@ -67,7 +67,7 @@ class Process:
         except (BrokenPipeError, EOFError) as error:
             raise BrokenExecutor(f"its process ended with status {self._popen.wait()}") from error
         except BaseException as error:
-            self.kill()  # It may well go on, with nobody to hear it.
+            self.kill()  # It may still be running, with nobody to read its answer.
             status = self._popen.wait()
             if isinstance(error, pickle.UnpicklingError):
                 raise BrokenExecutor(f"its process ended with status {status}") from error
@@ -79,7 +79,7 @@ class Process:
 
     @property
     def is_spent(self) -> bool:
-        """Whether it has ended, or, on a core, grown large."""
+        """Whether it has ended or, on a core, has grown too large."""
         if self._popen.poll() is not None:
             return True
         if not self._is_on_core:
@@ -88,9 +88,9 @@ class Process:
         return resident_pages * os.sysconf("SC_PAGE_SIZE") / 2**20 > _LARGEST_MIB
 
     def end(self) -> None:
-        """End it, and let go of it."""
+        """Kill it and release its resources."""
         self.kill()
-        # It closes both pipes, one of which may be broken.
+        # This closes both pipes, one of which may be broken.
         with suppress(BrokenPipeError), self._popen:
             pass
 
@@ -103,7 +103,7 @@ def main(where: str) -> int:
         from animat.compilation import keep_compilations
 
         keep_compilations()
-    # What libraries and robots print goes to standard error from now on.
+    # From now on, what libraries and robots print goes to standard error.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     while True:
@@ -116,7 +116,7 @@ def main(where: str) -> int:
 
 
 def answer(work: bytes) -> bytes:
-    """Pickled: what a call returned, and no error; or nothing, and the error."""
+    """Execute a pickled call; returns, pickled, its result and None, or None and its error."""
     try:
         function, args, kwargs = pickle.loads(work)
         return pickle.dumps((function(*args, **kwargs), None))
@@ -128,25 +128,25 @@ def answer(work: bytes) -> bytes:
 
 
 def pin_worker(core: int | None) -> None:
-    """Make this process a worker: on one core without a GPU, or on the GPU; gone when the one that started it is.
+    """Make this process a worker on one core, or on the GPU (None), that ends with the process that started it.
 
-    To be called before JAX or BLAS are loaded.
+    Call it before JAX or BLAS is loaded.
     """
     if core is None:
         os.environ.pop("JAX_PLATFORMS", None)
-        # Others may have some of its memory; and products of numbers of 32 bits are to be such.
+        # Leave memory to other processes, and compute products of 32-bit numbers in 32 bits.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
         os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     else:
-        # They size their threads by the cores they may use, and one pinned core beats two shared ones.
+        # Libraries start as many threads as there are usable cores, and one pinned core beats two shared ones.
         os.sched_setaffinity(0, {core})
-        # A few networks of 64 units keep a core busy and no GPU; workers, one a core, would all take the same one.
+        # A few networks of 64 units do not fill a GPU, and all workers would take the same one.
         os.environ["JAX_PLATFORMS"] = "cpu"
     end_with_parent()
 
 
 def end_with_parent() -> None:
-    """When the thread that started this process ends, and so when its process does, the kernel kills this one."""
+    """Let the kernel kill this process when the thread, and so the process, that started it ends."""
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 

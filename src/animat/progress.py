@@ -1,4 +1,4 @@
-"""Progress of long work as an object that is handed in: silent, or a bar or lines with an estimate of the time left."""
+"""Progress of long work, as an object passed to it: silent, or a bar or lines with an estimate of the time left."""
 
 from __future__ import annotations
 
@@ -15,90 +15,90 @@ if TYPE_CHECKING:
     from rich.live import Live
 
 LINE_EVERY_S = 10.0
-"""Between lines, where there is no terminal."""
-_LOOK_EVERY_S = 1.0
+"""Between lines, if there is no terminal."""
+_CHECK_EVERY_S = 1.0
 _BAR_WIDTH = 24
-_OF_USE = 2 / 3
-"""Of the time that passed: how fast the beginning went is of less use for the rest."""
+_RECENT = 2 / 3
+"""Share of the elapsed time that the speed is measured over: how fast the beginning went says less about the rest."""
 _ROUNDING = 1e-9
-"""Of all work: what sums of parts may be off by is no progress."""
+"""Share of all work that sums of parts may be off by; this much is not progress."""
 _FEWEST_MOVED = 0.01
-"""Of all work: with less done nothing sensible can be said about the rest."""
+"""Share of all work that must be done before anything can be said about the rest."""
 
 
 class Progress(Protocol):
-    """What long work reports to: how far it is, of how much, and a few words on how it goes."""
+    """What long work reports to: how much of it is done, and a few words on how it is going."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Say that `done` of `total` units of work are finished; `note` is a short remark, such as the last return."""
+        """Report that `done` of `total` units of work are finished; `note` is a remark, such as the last return."""
 
 
 class Silent:
-    """A progress that says nothing."""
+    """A progress that shows nothing."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
         """Ignore the report."""
 
 
 class Part:
-    """A part of longer work, as a progress: so many units of the whole's total, after those before it.
+    """A part of longer work, as a progress: `units` of the whole's total, after the `before` ones before it.
 
-    Where the part itself says nothing, `note` is said.
+    `note` is shown when the part itself has none.
     """
 
     def __init__(self, whole: Progress, before: float, units: float, total: float, note: str = "") -> None:
         self._whole, self._before, self._units, self._total, self._note = whole, before, units, total, note
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Move the whole on by as much."""
+        """Advance the whole by the same amount."""
         self._whole.update(self._before + self._units * done / total, self._total, note or self._note)
 
 
-class InTurn:
-    """Work in so many phases as one progress that never goes back: each phase is an equal part of the whole."""
+class EqualPhases:
+    """Work in several phases as one progress that never goes back: each phase is an equal part of the whole."""
 
     def __init__(self, whole: Progress, phases: int) -> None:
         self._whole, self._last = whole, phases - 1
-        self._phase, self._was_told = 0, False
+        self._phase, self._has_reported = 0, False
 
     def begin(self) -> None:
-        """The next phase begins, if anything was told of the one before."""
-        self._phase = min(self._phase + self._was_told, self._last)
-        self._was_told = False
+        """Begin the next phase, if the current one has reported anything."""
+        self._phase = min(self._phase + self._has_reported, self._last)
+        self._has_reported = False
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Move the whole on by as much of the phase."""
-        self._was_told = True
+        """Advance the whole by the phase's share."""
+        self._has_reported = True
         self._whole.update(self._phase + done / total, self._last + 1, note)
 
 
 def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: str = "") -> Progress:
-    """The progress of another phase of the work, whose length says nothing about that of the others.
+    """The progress of the next phase of the work, whose length says nothing about that of the others.
 
-    A `Bar` shows each phase by itself, one below the other, and `InTurn` lets each be a part of the whole; any other
-    progress is told the phases one after the other.
+    A `Bar` shows each phase separately, one below the other, and for `EqualPhases` each is a part of the whole; any
+    other progress receives the reports of all phases one after the other.
 
     Args:
         progress: of the whole work; None: silent.
         title: a word or two.
-        amount: how much is done in the phase, where there is a number that tells more than a share; 0: none.
+        amount: how much is done in the phase, if a number says more than a share; 0: none.
         unit: of the amount, in the plural.
     """
     if isinstance(progress, Bar):
         progress.begin(title, amount, unit)
-    elif isinstance(progress, InTurn):
+    elif isinstance(progress, EqualPhases):
         progress.begin()
     return Silent() if progress is None else progress
 
 
 class Speed:
-    """How fast work goes on: over the later two thirds of the time since it first moved.
+    """The speed of work, over the later two thirds of the time since it first moved.
 
-    What was before, compiling and the part of a checkpoint that is gone on from, says nothing about the rest. Work is
-    measured as a share of its whole, or in larger units.
+    What came before, such as compilation and the work loaded from a checkpoint, says nothing about the rest. Work is
+    measured as a share of the whole, or in larger units.
 
     Args:
-        most_s: over so many seconds at most.
+        most_s: the longest time it is measured over, in seconds.
     """
 
     def __init__(self, most_s: float = math.inf) -> None:
@@ -108,7 +108,7 @@ class Speed:
         self._has_moved = False
 
     def see(self, done: float) -> None:
-        """Take in how much is done; where that is less than before, other work has begun."""
+        """Record how much is done; if that is less than before, new work has begun."""
         now_s, self._done = time.monotonic(), done
         if self._seen and done < self._seen[-1][1]:
             self._seen.clear()
@@ -118,7 +118,7 @@ class Speed:
             self._has_moved = True
         if not self._seen:
             self._began_s = now_s
-        over_s = min(_OF_USE * (now_s - self._began_s), self._most_s)
+        over_s = min(_RECENT * (now_s - self._began_s), self._most_s)
         if not self._seen or now_s - self._seen[-1][0] >= max(0.5, over_s / 130):
             self._seen.append((now_s, done))
         while len(self._seen) > 1 and self._seen[1][0] <= now_s - over_s:
@@ -126,7 +126,7 @@ class Speed:
 
     @property
     def per_s(self) -> float | None:
-        """How much is done a second; None as long as too little is to tell."""
+        """How much is done per second; None while too little is done to know."""
         if not self._seen:
             return None
         since_s, before = self._seen[0]
@@ -134,51 +134,50 @@ class Speed:
         return moved / passed_s if passed_s > 0 and moved >= _FEWEST_MOVED else None
 
     def left_s(self, left: float) -> float | None:
-        """Until so much more is done; None where that is not known."""
+        """Seconds until `left` more is done; None if unknown."""
         return None if self.per_s is None else left / self.per_s
 
 
 class Phase:
-    """One phase of work, and what can be said about it."""
+    """One phase of work and its progress."""
 
     def __init__(self, title: str, amount: float = 0.0, unit: str = "") -> None:
         self.title, self.share, self.note = title, 0.0, ""
-        self.was_told = False
-        """Whether anything was reported of it."""
+        self.has_reported = False
         self._amount, self._unit = amount, unit
         self._began_s, self._ended_s = time.monotonic(), float("inf")
         self._speed = Speed()
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Take in a report."""
-        # Sums of parts may be a rounding beyond either end.
-        self.share, self.note, self.was_told = min(1.0, max(0.0, done / total)), note, True
+        """Record a report."""
+        # Sums of parts may pass either end by a rounding error.
+        self.share, self.note, self.has_reported = min(1.0, max(0.0, done / total)), note, True
         self._speed.see(self.share)
 
     def end(self) -> None:
-        """It is done."""
+        """Mark it as done."""
         self.share, self.note, self._ended_s = 1.0, "", time.monotonic()
 
     @property
     def passed_s(self) -> float:
-        """Seconds that it has taken."""
+        """Seconds it has taken."""
         return min(time.monotonic(), self._ended_s) - self._began_s
 
     def counted(self) -> list[str]:
-        """How much is done, and how fast, where that is known."""
+        """How much is done, and how fast if that is known."""
         if not self._amount:
             return []
-        told = [f"{self.share * self._amount:,.0f} of {self._amount:,.0f} {self._unit}"]
+        done = f"{self.share * self._amount:,.0f} of {self._amount:,.0f} {self._unit}"
         per_s = self._speed.per_s
-        return told if per_s is None else [*told, rate_in_words(per_s * self._amount)]
+        return [done] if per_s is None else [done, format_rate(per_s * self._amount)]
 
     def left(self) -> str:
-        """How long the rest would take at the speed so far; empty where that cannot be told."""
+        """The time left at the current speed; empty if unknown."""
         left_s = self._speed.left_s(1 - self.share)
-        return f"{duration_in_words(left_s)} left" if left_s else ""
+        return f"{format_duration(left_s)} left" if left_s else ""
 
 
-def rate_in_words(per_s: float) -> str:
+def format_rate(per_s: float) -> str:
     """A rate, such as `5,300 a second` or `2.1 a minute`."""
     for unit, seconds in (("second", 1), ("minute", 60)):
         if (rate := per_s * seconds) >= 1:
@@ -186,7 +185,7 @@ def rate_in_words(per_s: float) -> str:
     return f"{per_s * 3600:.1f} an hour"
 
 
-def duration_in_words(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A duration, such as `80 s`, `12 min` or `3.4 h`."""
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -194,20 +193,20 @@ def duration_in_words(seconds: float) -> str:
 
 
 class Bar:
-    """A progress bar on standard error, with the time left; where that is not a terminal, a line every ten seconds.
+    """A progress bar on standard error, with the time left; if that is not a terminal, a line every ten seconds.
 
         training: 34 %, 81,600 of 240,000 iterations, 1,940 a second, 82 s left, return 101.2
 
-    Use it as a context manager: `with Bar("training") as progress: ...`. Each phase of the work (`in_phase`) has a bar
-    of its own.
+    Use it as a context manager: `with Bar("training") as progress: ...`. Each phase of the work (`in_phase`) has its
+    own bar.
     """
 
     def __init__(self, title: str) -> None:
         self._phases = [Phase(title)]
         self._live: Live | None = None
         self._is_over = threading.Event()
-        self._told_s = time.monotonic()
-        self._telling = threading.Lock()
+        self._printed_s = time.monotonic()
+        self._printing = threading.Lock()
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
@@ -217,43 +216,43 @@ class Bar:
             self._live = Live(
                 get_renderable=self._drawn,
                 console=Console(stderr=True),
-                # What is printed appears above the bar; a file or a pipe that it goes to gets it as ever.
+                # Printed text appears above the bar; if standard output is a file or a pipe, it is unaffected.
                 redirect_stdout=sys.stdout.isatty(),
             )
             self._live.start()
         else:
-            # Work that reports nothing for long is told of too.
-            threading.Thread(target=self._look, name="progress", daemon=True).start()
+            # Work that reports nothing for a long time needs lines too.
+            threading.Thread(target=self._keep_printing, name="progress", daemon=True).start()
         return self
 
     def begin(self, title: str, amount: float = 0.0, unit: str = "") -> None:
-        """Begin another phase; the one before is done. See `in_phase`."""
+        """Begin another phase; the current one is done. See `in_phase`."""
         self._phases[-1].end()
-        # One of which nothing was said is not shown.
-        self._phases = [*(phase for phase in self._phases if phase.was_told), Phase(title, amount, unit)]
+        # Phases that reported nothing are not shown.
+        self._phases = [*(phase for phase in self._phases if phase.has_reported), Phase(title, amount, unit)]
 
     def update(self, done: float, total: float, note: str = "") -> None:
         """Move the bar to `done` of `total`."""
         self._phases[-1].update(done, total, note)
         if self._live is None:
-            self._tell()
+            self._print_line()
 
-    def _look(self) -> None:
-        while not self._is_over.wait(_LOOK_EVERY_S):
-            self._tell()
+    def _keep_printing(self) -> None:
+        while not self._is_over.wait(_CHECK_EVERY_S):
+            self._print_line()
 
-    def _tell(self) -> None:
-        """A line, if the last one is old enough."""
-        with self._telling:
+    def _print_line(self) -> None:
+        """Print a line if the last one is old enough."""
+        with self._printing:
             now_s, phase = time.monotonic(), self._phases[-1]
-            if now_s - self._told_s < LINE_EVERY_S:
+            if now_s - self._printed_s < LINE_EVERY_S:
                 return
-            self._told_s = now_s
-            told = [f"{100 * phase.share:.0f} %", *phase.counted(), phase.left(), phase.note]
-            print(f"{phase.title}: {', '.join(filter(None, told))}", file=sys.stderr, flush=True)
+            self._printed_s = now_s
+            parts = [f"{100 * phase.share:.0f} %", *phase.counted(), phase.left(), phase.note]
+            print(f"{phase.title}: {', '.join(filter(None, parts))}", file=sys.stderr, flush=True)
 
     def _drawn(self) -> RenderableType:
-        """The phases one below the other, and below the last what is known besides, cut to the terminal's width."""
+        """The phases one below the other, then further details of the last, cut to the terminal's width."""
         from rich.console import Group
         from rich.progress_bar import ProgressBar
         from rich.table import Table
@@ -270,8 +269,8 @@ class Bar:
                 Text(f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"),
                 Text(phase.left(), no_wrap=True),
             )
-        told = ", ".join(filter(None, [*phases[-1].counted(), phases[-1].note]))
-        return Group(table, Text(told, no_wrap=True, overflow="ellipsis")) if told else table
+        details = ", ".join(filter(None, [*phases[-1].counted(), phases[-1].note]))
+        return Group(table, Text(details, no_wrap=True, overflow="ellipsis")) if details else table
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -1,4 +1,4 @@
-"""Records that go to files: pydantic checks every field by its annotation, and the first mistake is told in a line."""
+"""Records that are written to files: pydantic checks every field, and the first error is reported in one line."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def _plain(value: Any) -> Any:
 Whole = Annotated[int, Strict(), BeforeValidator(_plain)]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False), BeforeValidator(_plain)]
 Flag = Annotated[bool, Strict()]
-"""As a file has them, or numpy: a whole number is good for a number, and nothing else is turned into anything."""
+"""Strict types, from a file or from numpy: a whole number is accepted as a number; nothing else is converted."""
 Positive = Annotated[Number, Field(gt=0)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Seed = Annotated[Whole, Field(ge=0, le=2**32 - 1)]
-"""JAX takes 32 bits of a seed: beyond them two seeds would give the same draws."""
+"""JAX uses 32 bits of a seed: beyond them, two seeds would give the same draws."""
 
 _EXPECTED = {
     "bool_type": "true or false",
@@ -59,17 +59,17 @@ _EXPECTED = {
     "too_short": "at least {min_length:,}",
     "tuple_type": "a list",
 }
-"""What a field is expected to be, by the type of pydantic's error."""
+"""What was expected, by the type of pydantic's error."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(Field,))
 def record(kind: type[T]) -> type[T]:
-    """A decorator: makes a class a frozen dataclass whose fields are checked whoever makes it, Python or a file.
+    """A decorator that makes a class a frozen dataclass whose fields are checked, whether set by Python or a file.
 
-    Making one raises InvalidArgument, naming the field, what was expected and what came. What no annotation says is
-    checked in `__post_init__`, which raises InvalidArgument too.
+    Invalid values raise InvalidArgument, naming the field, what was expected and what came. What annotations cannot
+    express is checked in `__post_init__`, which also raises InvalidArgument.
     """
-    # A record of a subclass is made anew: its attributes could change after they were checked.
+    # An instance of a subclass is copied: its attributes could change after they were checked.
     config = ConfigDict(extra="forbid", revalidate_instances="subclass-instances")
     made: Any = dataclass(frozen=True, config=config)(kind)
     checked = made.__init__
@@ -78,16 +78,16 @@ def record(kind: type[T]) -> type[T]:
         try:
             checked(self, *arguments, **named)
         except ValidationError as error:
-            raise InvalidArgument(_told(error, made)) from error
+            raise InvalidArgument(_message(error, made)) from error
 
     made.__init__ = __init__
     return made  # type: ignore[no-any-return]
 
 
 def read_record(kind: type[T], data: Any, where: str = "") -> T:
-    """A record, or any other type, from plain data as a file holds them; what is left out has its default.
+    """A record, or any other type, from plain data as in a file; missing fields take their defaults.
 
-    `where` is what a message calls the whole.
+    `where` is the name of the whole in messages.
 
     Raises:
         InvalidArgument: naming the key, what was expected and what came.
@@ -95,35 +95,35 @@ def read_record(kind: type[T], data: Any, where: str = "") -> T:
     try:
         return TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
-        raise InvalidArgument(_told(error, kind, where)) from error
+        raise InvalidArgument(_message(error, kind, where)) from error
 
 
 def json_data(text: str, what: str, like: str = "JSON") -> Any:
-    """Plain data from JSON, which messages call `what`, and expect to be `like`.
+    """Plain data from JSON; in messages it is called `what`, and `like` is what was expected.
 
     Raises:
-        InvalidArgument: for what is not JSON, with the place of the mistake, or a name that is given twice.
+        InvalidArgument: for text that is not JSON, with the place of the error, or a repeated name.
     """
     try:
         return json.loads(text, object_pairs_hook=_each_once)
     except InvalidArgument as error:
         raise InvalidArgument(f"{what}: {error}") from error
     except (ValueError, RecursionError) as error:
-        # Also a number of more digits than Python reads, where it advises to have it read more.
-        said = str(error).partition("; use sys.")[0]
-        raise InvalidArgument(f"{what}: expected {like}, got a mistake: {said}") from error
+        # Also for a number with more digits than Python reads; its advice on that is cut off.
+        reason = str(error).partition("; use sys.")[0]
+        raise InvalidArgument(f"{what}: expected {like}, got malformed text: {reason}") from error
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; of a name that is given twice, one value would be dropped in silence."""
-    if twice := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
-        raise InvalidArgument(f"expected each name once, got {_key(twice[0])} twice")
+    """A JSON object; of a repeated name, one value would be dropped silently."""
+    if repeated := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
+        raise InvalidArgument(f"expected each name once, got {_key(repeated[0])} twice")
     return dict(pairs)
 
 
 @contextmanager
 def in_file(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Raises InvalidFile, which names the file, for an argument that is invalid within."""
+    """Turn an InvalidArgument raised in this context into an InvalidFile that names the file."""
     try:
         yield
     except InvalidArgument as error:
@@ -131,7 +131,7 @@ def in_file(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def as_json(value: Any) -> Any:
-    """The same plain data with None for numbers that JSON has no word for (NaN, infinite)."""
+    """The same plain data with None for numbers that JSON cannot express (NaN, infinity)."""
     if isinstance(value, dict):
         return {key: as_json(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -140,18 +140,18 @@ def as_json(value: Any) -> Any:
 
 
 def write_json(path: Path, value: Any) -> Path:
-    """Write plain data as JSON, complete or absent, None for numbers that it has no word for; returns the path."""
+    """Write plain data as JSON (see `as_json`), complete or absent; returns the path."""
     return write_whole(path, json.dumps(as_json(value), indent=1, sort_keys=True) + "\n")
 
 
-def _told(error: ValidationError, kind: Any, within: str = "") -> str:
-    """The first mistake: where it is, what was expected, and what came."""
+def _message(error: ValidationError, kind: Any, within: str = "") -> str:
+    """The first error: where it is, what was expected, and what came."""
     mistake = error.errors(include_url=False)[0]
     loc = mistake["loc"]
     if mistake["type"] == "unexpected_positional_argument":
         return f"{within}{': ' if within else ''}expected at most {len(kind.__pydantic_fields__)} values"
     if loc and isinstance(loc[0], int) and hasattr(kind, "__pydantic_fields__"):
-        # An argument that was given by its place.
+        # A positional argument.
         loc = (list(kind.__pydantic_fields__)[loc[0]], *loc[1:])
     where = ".".join([within] * bool(within) + [_key(part) for part in loc if isinstance(part, str)])
     if mistake["type"] == "unexpected_keyword_argument":
@@ -162,9 +162,9 @@ def _told(error: ValidationError, kind: Any, within: str = "") -> str:
         expected = f"expected some of {', '.join(known)}{did_you_mean(given, known)}"
         return f"{_key(given)}: no such setting {place}; {expected}"
     if mistake["type"] == "value_error":
-        said = mistake["ctx"]["error"]
-        # That of a record within this one begins with the field's name.
-        return f"{where}{'.' if isinstance(said, InvalidArgument) else ': '}{said}" if where else str(said)
+        cause = mistake["ctx"]["error"]
+        # The error of a nested record begins with the field's name.
+        return f"{where}{'.' if isinstance(cause, InvalidArgument) else ': '}{cause}" if where else str(cause)
     return f"{where}{': ' if where else ''}expected {_expected(mistake)}"
 
 
@@ -177,5 +177,5 @@ def _expected(mistake: ErrorDetails) -> str:
 
 
 def _key(key: str) -> str:
-    """A key as a message names it; in quotes a file lets it be any text."""
+    """A key for a message; in a file a quoted key can be any text."""
     return key if key.isprintable() and len(key) < 60 else shown(key)

@@ -1,4 +1,4 @@
-"""Robots and mappings by name: registered, announced by an installed package, or imported; and as plain data."""
+"""Robots and mappings by name (registered, announced by an installed package, or imported) and as plain data."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _IN_MEMORY = "train in memory: train(training, timeline, None)"
 
 
 _registries: dict[type, Registry[Any]] = {}
-"""By what their classes are made of."""
+"""By base class."""
 
 
 class Registry(Generic[Thing]):
-    """The classes of one noun by their names, ours and those of a user's own.
+    """The classes of one noun by name, ours and the user's.
 
     Args:
-        noun: what a message calls one, and the option of the command line that names one: `robot`.
-        base: what all of its classes are made of; each has a `name`, and is a frozen dataclass of its parameters.
-        ours: those of animat that have a name of their own each, and no class for themselves.
+        noun: its name in messages, and the command-line option that selects one: `robot`.
+        base: the base class of all; each subclass has a `name`, and is a frozen dataclass of its parameters.
+        ours: instances that animat knows by name, several of which share a class.
         reserved: names that none may have.
     """
 
@@ -45,22 +45,22 @@ class Registry(Generic[Thing]):
         self._registered: dict[str, type[Thing]] = {}
         self._families: dict[str, type[Any]] = {}
         self.kinds: Mapping[str, type[Thing]] = MappingProxyType(self._registered)
-        """What is registered so far, by name."""
+        """The classes registered so far, by name."""
         _registries[base] = self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The module of the base, or its package, makes the registry.
+        # Unpickling the base imports its module or package, which creates the registry.
         return _registry_of, (self._base,)
 
     def register(self, kind: type[Thing]) -> None:
-        """Make a class known by its name.
+        """Register a class under its name.
 
         Raises:
-            InvalidArgument: for another class, one that lacks a method, or a name that another one has.
+            InvalidArgument: for a class of another kind, one that lacks a method, or a name already taken.
         """
         noun = self.noun
         if not (isinstance(kind, type) and issubclass(kind, self._base)):
-            raise InvalidArgument(f"{noun}: expected a class made of animat.{self._base.__name__}, got {shown(kind)}")
+            raise InvalidArgument(f"{noun}: expected a subclass of animat.{self._base.__name__}, got {shown(kind)}")
         place = place_of(kind)
         if missing := sorted(getattr(kind, "__abstractmethods__", ())):
             raise InvalidArgument(
@@ -71,38 +71,38 @@ class Registry(Generic[Thing]):
         name = getattr(kind, "name", None)
         if not (isinstance(name, str) and _NAME.fullmatch(name)):
             raise InvalidArgument(f"{place}.name: expected letters, digits, - and _, a letter first, got {shown(name)}")
-        other = place_of(self._registered[name]) if name in self._registered else "animat's own"
+        other = place_of(self._registered[name]) if name in self._registered else "part of animat"
         if name in self._reserved or (name in self._registered and other != place):
             raise InvalidArgument(
-                f"{place}.name: expected one that no other {noun} has, got {name!r}, which is {other}"
+                f"{place}.name: expected a name that no other {noun} has, got {name!r}, which is {other}"
             )
         self._registered[name] = kind
         if kind.__module__ == "__main__":
-            # In a worker, __main__ is the worker: what a script defines is found there by the name of its file.
-            copyreg.pickle(kind, self._reduced)
+            # In a worker, __main__ is the worker; classes of a script are imported there by the script's file name.
+            copyreg.pickle(kind, self._reduce)
 
     def add_family(self, name: str, family: type[Any]) -> None:
-        """Make things known that are each something of others, by its own name there: `gymnasium:Pendulum-v1`.
+        """Register a family of things from elsewhere, each by its name there: `gymnasium:Pendulum-v1`.
 
         Args:
-            name: what their names begin with, before a colon; in files it is the name of all of them.
-            family: their class. `family.import_module(own_name)` imports what things of this name are made of;
-                `family.named(own_name, **parameters)` looks a thing up; with all of its parameters, as
-                files have them, the class itself makes it, and nothing is looked up.
+            name: the prefix of their names, before a colon; in files it is the name of all of them.
+            family: their class. `family.import_module(own_name)` imports the module that defines a thing;
+                `family.named(own_name, **parameters)` looks it up. Called with all parameters, as files have them, the
+                class creates it without any look-up.
         """
         self._families[name] = family
 
     def named(self, name: str, /, **parameters: Any) -> Thing:
-        """The robot or mapping of this name, with these parameters in place of its defaults, `pole_mass_kg=0.55`.
+        """The robot or mapping with this name, with parameters that replace its defaults, such as `pole_mass_kg=0.55`.
 
         Args:
-            name: of one that is registered or that an installed package announces (entry points `animat.robots`,
-                `animat.mappings`); or where to import one from, `my_package.robots:Rover`, which registers it.
+            name: registered, or announced by an installed package (entry points `animat.robots`, `animat.mappings`); or
+                the place to import it from, `my_package.robots:Rover`, which also registers it.
             parameters: fields of its class.
 
         Raises:
-            InvalidArgument: for a name or parameter that is not known, a value that is refused, or one that cannot be
-                imported or registered.
+            InvalidArgument: for an unknown name or parameter, a refused value, or a class that cannot be imported or
+                registered.
         """
         if isinstance(name, str) and name in self._ours and not parameters:
             return self._ours[name]
@@ -121,18 +121,18 @@ class Registry(Generic[Thing]):
         except InvalidArgument as error:
             raise InvalidArgument(f"{name}: {error}") from error
         except Exception as error:
-            of = f"of {parameters}" if parameters else "without parameters"
-            raise InvalidArgument(f"{name}: expected it to be made {of}, got {first_line(error)}") from error
+            with_what = f"with {parameters}" if parameters else "without parameters"
+            raise InvalidArgument(f"{name}: expected it to be created {with_what}, got {first_line(error)}") from error
 
     def names(self) -> tuple[str, ...]:
-        """The names that are known here: ours, of what is registered, then of what packages announce."""
+        """All known names: ours, the registered ones, then those announced by packages."""
         announced = importlib.metadata.entry_points(group=self.entry_points)
         return tuple(dict.fromkeys([*self._ours, *self._registered, *(point.name for point in announced)]))
 
     def name_of(self, name: str) -> str:
-        """The name of what is named so; errors as those of `named`."""
+        """The registered name for any form of `name` that `named` accepts; raises as `named` does."""
         if (family := self._family_of(name)) is not None:
-            # Not looked up: its parameters, without which it may not be made, are not known here.
+            # Not looked up, as it may need parameters that are not known here.
             family.import_module(name.partition(":")[2])
             return name
         return name if name in self._ours else str(self.class_named(name).name)  # type: ignore[attr-defined]
@@ -142,30 +142,30 @@ class Registry(Generic[Thing]):
         return self._families.get(family) if colon else None
 
     def class_named(self, name: str) -> type[Thing]:
-        """The class of this name; arguments and errors as those of `named`."""
+        """The class of this name; arguments and errors as in `named`."""
         kind = self._family_of(name) or self._kind(name)
         if kind is None:
             raise InvalidArgument(
                 f"{self.noun}: expected one of {', '.join(self.names())}, got {shown(name)}"
-                + (did_you_mean(str(name), self.names()) or "; one of your own is named by its module:Class")
+                + (did_you_mean(str(name), self.names()) or "; name your own by its module:Class")
             )
         return kind
 
     def to_dict(self, thing: Thing) -> dict[str, Any]:
-        """As JSON data, all parameters named: `{"name": "cartpole", "parameters": {"force_n": 1.0, ...}}`.
+        """As JSON data with all parameters: `{"name": "cartpole", "parameters": {"force_n": 1.0, ...}}`.
 
-        Of one that is not ours it also says where it is imported from: `"import": "my_package.robots:Rover"`.
+        If it is not ours, the place to import it from is added: `"import": "my_package.robots:Rover"`.
         """
         name = thing.name if self._family_of(thing.name) is None else thing.name.partition(":")[0]  # type: ignore[attr-defined]
         data = {"name": name, "parameters": dataclasses.asdict(thing)}  # type: ignore[call-overload]
         return data if is_ours(thing) else data | {"import": place_of(type(thing))}
 
     def from_dict(self, data: Mapping[str, Any]) -> Thing:
-        """What `to_dict` made this of.
+        """The inverse of `to_dict`.
 
         Raises:
-            InvalidArgument: for data of another form, or a name or parameter that is not known; of what is not
-                registered here it says what to import. Nothing is imported because a file says so.
+            InvalidArgument: for malformed data, or an unknown name or parameter; for a class that is not registered it
+                says what to import. Nothing is imported because a file says so.
         """
         noun = self.noun
         if (
@@ -176,11 +176,11 @@ class Registry(Generic[Thing]):
         ):
             raise InvalidArgument(f'{noun}: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
         if "import" in data and not _PLACE.fullmatch(str(data["import"])):
-            raise InvalidArgument(f"{noun}: expected to be imported from module:Class, got {shown(data['import'])}")
+            raise InvalidArgument(f"{noun}: expected an import from module:Class, got {shown(data['import'])}")
         if "import" in data and self._kind(data["name"]) is None:
             place = str(data["import"])
             raise InvalidArgument(
-                f"{noun}: expected one that is registered, got {shown(data['name'])}: import {place.partition(':')[0]} "
+                f"{noun}: expected a registered one, got {shown(data['name'])}: import {place.partition(':')[0]} "
                 f"first (on the command line: --{noun} {place})"
             )
         parameters = {name: _frozen(value) for name, value in data["parameters"].items()}
@@ -192,14 +192,14 @@ class Registry(Generic[Thing]):
         return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:
-        """Refuse what a file could name and nothing could give back.
+        """Refuse a thing that a file could name but that could not be loaded again.
 
         Args:
             thing: of any class.
-            in_workers: whether processes of their own have to import it.
+            in_workers: whether worker processes have to import it.
 
         Raises:
-            InvalidArgument: for one that is not registered, or that no worker could import.
+            InvalidArgument: if it is not registered, or no worker could import it.
         """
         noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
         if (name in self._ours and self._ours[name] == thing) or self._family_of(name) is not None:
@@ -207,14 +207,15 @@ class Registry(Generic[Thing]):
         is_registered = self._registered.get(name) is kind
         if not is_registered or self.from_dict(json.loads(json.dumps(self.to_dict(thing)))) != thing:
             raise InvalidArgument(
-                f"{noun}: expected one that is registered, as a policy's file names its {noun}, got {kind.__name__}, "
-                f"which is not: write @animat.register_{noun} above its class, or {_IN_MEMORY}"
+                f"{noun}: expected a registered one, as a policy's file stores the name of its {noun}, got "
+                f"{kind.__name__}, which is not registered: write @animat.register_{noun} above its class, or "
+                f"{_IN_MEMORY}"
             )
         place = place_of(kind)
         if in_workers and ("<locals>" in place or place.startswith("__main__:")):
             raise InvalidArgument(
-                f"{noun}: expected a class at the top of a file, which worker processes can import, got {place}: put "
-                f"it into a file, or {_IN_MEMORY}"
+                f"{noun}: expected a class at the top level of a file, which worker processes can import, got {place}: "
+                f"put it into a file, or {_IN_MEMORY}"
             )
 
     def _kind(self, name: Any) -> type[Thing] | None:
@@ -223,9 +224,9 @@ class Registry(Generic[Thing]):
         if name in self._registered:
             return self._registered[name]
         if ":" in name:
-            return self._imported(name)
+            return self._import_class(name)
         for point in importlib.metadata.entry_points(group=self.entry_points, name=name):
-            found: Any = self._imported(point.value)
+            found: Any = self._import_class(point.value)
             if found.name != name:
                 raise InvalidArgument(
                     f"{self.noun}: expected {point.value} to have the name {name!r}, got {found.name!r}"
@@ -233,7 +234,7 @@ class Registry(Generic[Thing]):
             return found  # type: ignore[no-any-return]
         return None
 
-    def _imported(self, place: str) -> type[Thing]:
+    def _import_class(self, place: str) -> type[Thing]:
         for kind in self._registered.values():
             if place_of(kind) == place:
                 return kind
@@ -248,19 +249,19 @@ class Registry(Generic[Thing]):
         except InvalidArgument:
             raise
         except (Exception, SystemExit) as error:
-            # Anything may go wrong in somebody else's module.
+            # Anything may go wrong in a third-party module.
             raise InvalidArgument(f"{noun}: expected {place} to be importable, got {first_line(error)}") from error
         self.register(found)
         return found
 
-    def _reduced(self, thing: Thing) -> tuple[Any, ...]:
-        return self._remade, (place_of(type(thing)), dataclasses.asdict(thing))  # type: ignore[call-overload]
+    def _reduce(self, thing: Thing) -> tuple[Any, ...]:
+        return self._recreate, (place_of(type(thing)), dataclasses.asdict(thing))  # type: ignore[call-overload]
 
-    def _remade(self, place: str, parameters: dict[str, Any]) -> Thing:
+    def _recreate(self, place: str, parameters: dict[str, Any]) -> Thing:
         try:
-            return self._imported(place)(**parameters)
+            return self._import_class(place)(**parameters)
         except InvalidArgument as error:
-            hint = "what a script does belongs under `if __name__ == '__main__':`, as worker processes import it"
+            hint = "put what the script runs under `if __name__ == '__main__':`, as worker processes import it"
             raise InvalidArgument(f"{error}; {hint}") from error
 
 
@@ -269,7 +270,7 @@ def _registry_of(base: type) -> Registry[Any]:
 
 
 def place_of(kind: type) -> str:
-    """Where a class can be imported from, as `module:Class`; that of a script is by the name of its file."""
+    """Where a class can be imported from, as `module:Class`; the module of a script is named after its file."""
     module = kind.__module__
     if module == "__main__":
         main = sys.modules[module]
@@ -279,10 +280,10 @@ def place_of(kind: type) -> str:
 
 
 def is_ours(thing: object) -> bool:
-    """Whether every animat has it, so that its name alone tells which it is."""
+    """Whether it is part of animat, so that its name alone identifies it."""
     return type(thing).__module__.startswith("animat.")
 
 
 def _frozen(value: Any) -> Any:
-    """What was a tuple before it was JSON: parameters can be hashed, and lists cannot."""
+    """Turn JSON's lists back into tuples, as parameters must be hashable."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value

@@ -1,4 +1,4 @@
-"""Tables of what was measured: read-only columns of one length, times that can be times, and objects told in short."""
+"""Tables of measurements: read-only columns of equal length, checks of times, and short representations."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ UNKNOWN = -1
 
 CENTURY_S = 100 * 365.25 * 24 * 3600
 FASTEST_HZ = 1e9
-"""No time of a recording is farther from 0 than the one, and no rate or frequency above the other."""
+"""No time of a recording is farther from 0 than `CENTURY_S`, and no rate or frequency is above `FASTEST_HZ`."""
 
 
 def freeze(table: object, name: str, **dtypes: Any) -> None:
-    """Turn the named attributes into read-only arrays of these types and of one length."""
+    """Turn the named attributes into read-only arrays of these types and of equal length."""
     length = None
     for attribute, dtype in dtypes.items():
         array = read_only(table, attribute, dtype)
@@ -34,7 +34,7 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
 
 
 def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
-    """Turn an attribute of a frozen dataclass into an array that nobody changes; returns it."""
+    """Turn an attribute of a frozen dataclass into a read-only array; returns it."""
     array = np.array(getattr(table, attribute), dtype=dtype)
     array.setflags(write=False)
     object.__setattr__(table, attribute, array)
@@ -45,7 +45,7 @@ MOST_PADDED = 50_000_000
 
 
 def fits_padded(lists: Sequence[Sequence[int]]) -> bool:
-    """Whether lists of whole numbers can be padded: one long row must not fill memory, nor a number lose digits."""
+    """Whether lists of whole numbers can be padded without filling the memory (one long row) or losing digits."""
     most = max([1, *map(len, lists)]) * len(lists)
     return most <= MOST_PADDED and all(abs(number) < 2**53 for row in lists for number in row)
 
@@ -59,12 +59,12 @@ def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]
 
 
 def evenly(n: int, most: int) -> Int64[np.ndarray, " some"]:
-    """Of n things in a row at most so many, evenly spread, by their numbers."""
+    """Indices of at most `most` of n items, evenly spread."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse times that are not finite, or not within a century (UnusableData, by the name of the column)."""
+    """Raise UnusableData, naming the column, for times that are not finite or not within a century."""
     if bad := np.count_nonzero(~np.isfinite(times_s)):
         raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
     far = np.abs(times_s) > CENTURY_S
@@ -75,20 +75,20 @@ def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
 
 
 def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
-    """Refuse also times that fall."""
+    """The same, also for times that fall."""
     expect_times(name, times_s)
     if np.any(np.diff(times_s) < 0):
         raise UnusableData(f"{name}: expected times that do not fall; sort them with their channels first")
 
 
-def made_anew(record: Any) -> tuple[Any, ...]:
-    """A dataclass whose arrays are read-only, to be its `__reduce__`: they are so too where it is unpickled."""
+def reduce_dataclass(record: Any) -> tuple[Any, ...]:
+    """A `__reduce__` for dataclasses with read-only arrays, which keeps them read-only when unpickled."""
     values = (getattr(record, field.name) for field in fields(record))
     return type(record), tuple(dict(value) if isinstance(value, MappingProxyType) else value for value in values)
 
 
 def briefly(record: Any) -> str:
-    """A dataclass in a line or a few, to be its `__repr__`."""
+    """A short `__repr__` for dataclasses."""
     shown = (f"{field.name}={_brief(getattr(record, field.name))}" for field in fields(record) if field.repr)
     return f"{type(record).__name__}({', '.join(shown)})"
 

@@ -1,4 +1,4 @@
-"""What may be put around an environment, each one thing, in any order and together."""
+"""Wrappers of an environment, which combine in any order."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from animat.robots.base import Quantity, Robot, capability
 from animat.robots.host import HostRobot
 
 Delivery = Literal["chosen", "shuffled"]
-"""What the neurons get: the condition that was chosen, or one drawn at random (`ShuffledDelivery`)."""
+"""The condition that the neurons get: the one chosen, or one drawn at random (`ShuffledDelivery`)."""
 
 
 @dataclass(frozen=True)
 class Wrapper(Environment[RobotState]):
-    """An environment around another one, which it leaves as it is; each kind of wrapper changes something.
+    """An environment that passes everything on to another; each subclass changes something.
 
     Attributes:
-        inside: the other one.
+        inside: the other environment.
     """
 
     inside: Environment[RobotState]
 
     @property
-    def robot(self) -> Robot[RobotState]:  # type: ignore[override]  # of a frozen dataclass it is not written either
+    def robot(self) -> Robot[RobotState]:  # type: ignore[override]  # read-only, as in every frozen dataclass
         return self.inside.robot
 
     @property
@@ -61,7 +61,7 @@ class Wrapper(Environment[RobotState]):
 
 
 def unwrapped(environment: Environment[RobotState]) -> Environment[RobotState]:
-    """What is inside of all wrappers: an `Animat`, or one `WithoutNeurons`."""
+    """The environment inside all wrappers: an `Animat` or a `WithoutNeurons`."""
     while isinstance(environment, Wrapper):
         environment = environment.inside
     return environment
@@ -70,7 +70,7 @@ def unwrapped(environment: Environment[RobotState]) -> Environment[RobotState]:
 @final
 @dataclass(frozen=True)
 class EpisodeLimit(Wrapper[RobotState]):
-    """Cuts an episode off after the robot's `episode_limit`, unless the task ends by itself."""
+    """Truncates an episode at the robot's `episode_limit`, unless the task ends by itself."""
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
@@ -81,7 +81,7 @@ class EpisodeLimit(Wrapper[RobotState]):
 @final
 @dataclass(frozen=True)
 class ShuffledDelivery(Wrapper[RobotState]):
-    """Delivers a condition drawn anew at each iteration, whatever was chosen: the paper's control (section 3.2).
+    """Delivers a random condition at each iteration, whatever was chosen: the paper's control (section 3.2).
 
     Raises:
         InvalidArgument: around an environment without neurons.
@@ -104,9 +104,9 @@ class ShuffledDelivery(Wrapper[RobotState]):
 @final
 @dataclass(frozen=True)
 class NeuralObservation(Wrapper[RobotState]):
-    """Lets the policy see, after all else, what the neurons remember (`State.neurons`).
+    """Appends the history state of the neurons (`State.neurons`) to the observation.
 
-    Trace and load are all that a simulator's next answer depends on; one without memory leaves both at 0.5.
+    A simulator's next answer depends on trace and load alone; a simulator without memory leaves both at 0.5.
 
     Raises:
         InvalidArgument: around an environment without neurons.
@@ -127,13 +127,13 @@ class NeuralObservation(Wrapper[RobotState]):
 @final
 @dataclass(frozen=True)
 class TrialCosts(Wrapper[RobotState]):
-    """Counts what the trials of an episode cost, in `State.info["cost"]`; rewards stay what they are (`net_reward`).
+    """Adds up the cost of an episode's trials in `State.info["cost"]`; rewards are unchanged (see `net_reward`).
 
     Attributes:
         costs: of a trial of each condition, in the units of the reward.
 
     Raises:
-        InvalidArgument: around an environment without neurons, or for other conditions than it has.
+        InvalidArgument: around an environment without neurons, or unless there is one cost per condition.
     """
 
     costs: tuple[float, ...]
@@ -151,35 +151,35 @@ class TrialCosts(Wrapper[RobotState]):
         return _remembering(after, {_COST: state.info[_COST] + self.of(after.info["delivered"])})
 
     def of(self, delivered: Array) -> Array:
-        """What trials of these conditions cost."""
+        """The cost of trials of these conditions."""
         return jnp.asarray(self.costs, jnp.float32)[delivered]
 
 
 def net_reward(before: State, after: State) -> Array:
-    """The reward of an iteration less what its trial cost, where that is counted (`TrialCosts`)."""
+    """The reward of an iteration less the cost of its trial, if costs are counted (`TrialCosts`)."""
     return after.reward - (after.info[_COST] - before.info[_COST]) if _COST in after.info else after.reward
 
 
 def net_return(returns: Array, after: State) -> Array:
-    """The return of an episode so far less what its trials cost, where that is counted."""
+    """The return of an episode so far less the cost of its trials, if costs are counted."""
     return returns - after.info[_COST] if _COST in after.info else returns
 
 
-def costing(state: State, more: Array) -> State:
-    """A state after another trial, of bodies that are moved outside of JAX."""
+def add_cost(state: State, more: Array) -> State:
+    """Add the cost of another trial to a state, for bodies stepped outside JAX."""
     return _remembering(state, {_COST: state.info[_COST] + more})
 
 
 @final
 @dataclass(frozen=True)
 class YokedDelivery(Wrapper[RobotState]):
-    """Delivers what was chosen for another episode, which goes on beside this one: as many stimuli, to no end here.
+    """Delivers the stimuli chosen for another episode, which runs in parallel: as many, but unrelated to this one.
 
-    Whoever acts observes the other episode and acts in it, through neurons of its own; one that ends starts again. The
-    same stimuli are delivered here, whatever happens here.
+    The agent observes and acts in the other episode, with its own neurons; when it ends it starts again. The same
+    stimuli are delivered here, whatever happens here.
 
     Raises:
-        InvalidArgument: around an environment without neurons, or with a robot that is stepped outside of JAX.
+        InvalidArgument: around an environment without neurons, or with a robot that is stepped outside JAX.
 
     Source: the non-contingent control of Bakkum et al. 2008, doi:10.1088/1741-2560/5/3/004.
     """
@@ -202,10 +202,10 @@ class YokedDelivery(Wrapper[RobotState]):
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
         n, other, start = self.inside.noise_size, state.info[_OTHER], state.info[_START]
-        there = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
-        next_ = _where(jnp.logical_or(*there.ended), start, there.carried)
-        here = self.inside.advance(uniforms[:n], state, action, simulator)
-        return _remembering(here, {_OTHER: next_, _START: start})
+        other_after = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
+        next_ = _where(jnp.logical_or(*other_after.ended), start, other_after.carried)
+        after = self.inside.advance(uniforms[:n], state, action, simulator)
+        return _remembering(after, {_OTHER: next_, _START: start})
 
 
 @final
@@ -214,7 +214,7 @@ class GoalSwitch(Wrapper[RobotState]):
     """Gives the robot another goal in mid-episode, that of the first other start whose goal looks different.
 
     Attributes:
-        at: after how many iterations.
+        at: the number of iterations before the switch.
 
     Raises:
         InvalidArgument: for a robot whose goal cannot be switched (`Robot.with_goal_of`).
@@ -238,8 +238,8 @@ class GoalSwitch(Wrapper[RobotState]):
 
 @final
 @dataclass(frozen=True)
-class TurnedRound(Animat[RobotState]):
-    """The mapping turned round: every response moves the robot by the opposite command."""
+class ReversedMapping(Animat[RobotState]):
+    """Reverses the mapping: every response moves the robot by the opposite command."""
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
         responded = super().respond(uniforms, state, action, simulator)
@@ -249,10 +249,10 @@ class TurnedRound(Animat[RobotState]):
 @final
 @dataclass(frozen=True)
 class IdealActuator(Animat[RobotState]):
-    """Moves the robot by a command of each condition in place of the response.
+    """Moves the robot by a fixed command per condition in place of the response.
 
     Attributes:
-        commands: of each condition; of several commands, one of each.
+        commands: one per condition; for a robot with several commands, a tuple of them.
     """
 
     commands: tuple[float | tuple[float, ...], ...]
@@ -262,21 +262,21 @@ class IdealActuator(Animat[RobotState]):
         return responded._replace(command=jnp.asarray(self.commands, jnp.float32)[action])
 
 
-def with_inmost(
+def replace_innermost(
     environment: Environment[RobotState], change: Callable[[Environment[RobotState]], Environment[RobotState]]
 ) -> Environment[RobotState]:
-    """The same wrappers around what is made of what is inside of all of them."""
+    """The same wrappers around a changed innermost environment."""
     if isinstance(environment, Wrapper):
-        return replace(environment, inside=with_inmost(environment.inside, change))
+        return replace(environment, inside=replace_innermost(environment.inside, change))
     return change(environment)
 
 
 STARTS = 16
-"""Among which another goal is looked for: of two that are equally likely one in 65,000 is not found."""
+"""Starts among which another goal is sought: of two equally likely goals, the other is missed once in 65,000 times."""
 
 
 def other_goal(robot: Robot[RobotState], own: RobotState, key: PRNGKeyArray) -> RobotState:
-    """A start of a robot with another goal than its own, which an observation tells apart."""
+    """A start of the robot whose goal differs from its own in the observation."""
     starts = jax.vmap(robot.reset)(jax.random.split(key, STARTS))
     switched = jax.vmap(capability(robot, "with_goal_of"), (None, 0))(own, starts)
     is_other = jnp.any(jax.vmap(robot.observe)(switched) != robot.observe(own), axis=-1)
@@ -285,7 +285,7 @@ def other_goal(robot: Robot[RobotState], own: RobotState, key: PRNGKeyArray) -> 
 
 
 _OTHER, _START, _GOAL, _COST = "other_episode", "other_start", "other_goal", "cost"
-"""In `State.info`: the other episode and where it starts; the state whose goal is switched to; and what trials cost."""
+"""In `State.info`: the other episode and its start; the state whose goal is switched to; and the cost of trials."""
 
 
 def _remembering(state: State, remembered: dict[str, Any]) -> State:
@@ -298,4 +298,4 @@ def _where(condition: Array, yes: Any, no: Any) -> Any:
 
 def _expect_neurons(wrapper: Wrapper[Any]) -> None:
     if not isinstance(inmost := unwrapped(wrapper), Animat):
-        raise InvalidArgument(f"inside: expected an Animat, whose neurons answer, got {type(inmost).__name__}")
+        raise InvalidArgument(f"inside: expected an Animat, which has neurons, got {type(inmost).__name__}")

@@ -36,7 +36,7 @@ from animat.cli.train import Train
 from animat.cli.tune import TuneFile
 from animat.cli.validate import Validate
 from animat.cli.watch import Watch
-from animat.ctrl_c import heard_everywhere
+from animat.ctrl_c import interruptible
 from animat.devices import stay_on_cores
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 
@@ -115,7 +115,7 @@ def _run(arguments: list[str]) -> int:
         # As for `python -m animat`: the working folder may hold the user's own robots.
         sys.path.append("")
     try:
-        with heard_everywhere(), _live_page(command):
+        with interruptible(), _live_page(command):
             results = command.run()
     except AnimatError as error:
         print(f"animat: {_name_option(command, ' '.join(str(error).split()))}", file=sys.stderr)

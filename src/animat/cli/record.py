@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.errors import InvalidArgument, Mismatch, in_min
-from animat.marks import expect_no_other
+from animat.folder_kinds import expect_no_other
 
 if TYPE_CHECKING:
     from animat.progress import Progress

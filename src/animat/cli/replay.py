@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from animat.cli.responses import SimulatorOptions, policies_for
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.plain_file import is_nothing
+from animat.plain_file import is_absent
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Replay(SimulatorOptions):
                 f"--span-s: expected a start from 0 s and a later end, got {self.span_s[0]:g} {self.span_s[1]:g}"
             )
         expected = None if self.robot is None else REGISTRY.name_of(self.robot)
-        if is_nothing(self.source):
+        if is_absent(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
             for option, value in (

@@ -39,7 +39,7 @@ def run_and_report(study: Study, base: Path, command: JobOptions) -> dict[str, A
 
 
 def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
-    from animat.lined_up import lined_up
+    from animat.columns import align_columns
     from animat.report.results import Results
     from animat.studies.heuristic import not_outperforming
     from animat.studies.places import results_file
@@ -58,7 +58,7 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
             [f"{row.robot}, {row.comparison}", *means, f"{row.u:g}", f"{row.p_normal:.3g}", row.outcome + paper]
         )
     if cells:
-        print("\n".join(lined_up(["", "first", "second", "U", "p", ""], cells)))
+        print("\n".join(align_columns(["", "first", "second", "U", "p", ""], cells)))
     messages = not_outperforming(results)
     for message in messages:
         print(message)
@@ -77,8 +77,8 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
 
 
 def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
+    from animat.columns import align_columns
     from animat.errors import AnimatError
-    from animat.lined_up import lined_up
     from animat.studies.cultures import run_over_cultures
     from animat.studies.cultures_page import write_cultures_page
     from animat.studies.results import MISSING
@@ -95,7 +95,7 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         cells.append([f"{row.robot}, {row.comparison}", *means, interval, *counts])
     if cells:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
-        print("\n".join(lined_up(head, cells)))
+        print("\n".join(align_columns(head, cells)))
     jobs = sum(len(each.done_now) for each in results.finished.values())
     print(f"{len(results.finished)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
     if results.parquet is None:

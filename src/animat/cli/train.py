@@ -139,7 +139,7 @@ class Train(SimulatorOptions):
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
         from animat.goals.robot import with_goal
-        from animat.responses.readouts import ALL, USUAL_READOUTS, count_readouts, read_readouts
+        from animat.responses.readouts import ALL, DEFAULT_READOUTS, count_readouts, read_readouts
         from animat.robots.registry import robot_named
         from animat.training.specification import Training
 
@@ -147,7 +147,7 @@ class Train(SimulatorOptions):
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]
-        usual_readouts = "all" if mapping == "none" else USUAL_READOUTS.get(robot.n_commands, "all")
+        usual_readouts = "all" if mapping == "none" else DEFAULT_READOUTS.get(robot.n_commands, "all")
         readouts = read_readouts(self.readouts or usual_readouts)
         if mapping != "none":
             expect_fit(robot.name, robot.n_commands, count_readouts(readouts))

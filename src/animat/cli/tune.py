@@ -23,7 +23,7 @@ class TuneFile(JobOptions):
 
     def run(self) -> dict[str, Any]:
         """Search."""
-        from animat.lined_up import lined_up
+        from animat.columns import align_columns
         from animat.tuning.search import expect_optuna
         from animat.tuning.specification import read_tuning
 
@@ -47,7 +47,7 @@ class TuneFile(JobOptions):
         policies, episodes = tuning.study.policies, tuning.study.episodes
         counted = "1 policy" if policies == 1 else f"{policies} policies"
         print(f"retrained, {counted} of each, in {episodes} fresh episodes per policy:")
-        print("\n".join(lined_up(["", "mean return", "s.e.", "settings"], cells)))
+        print("\n".join(align_columns(["", "mean return", "s.e.", "settings"], cells)))
         if tuned.importance:
             shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
             print(f"importance: {shares}")

@@ -9,7 +9,7 @@ from scipy.special import ndtr, ndtri
 from animat.coding.mapping import N_PERCENTILES
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import ranks_among
-from animat.neurons.remembering import Remembered
+from animat.neurons.history_tracker import HistoryState
 
 NEWEST = 100
 """Responses kept of a condition, as many as in the paper's recording; with more, thresholds would adapt late."""
@@ -55,7 +55,7 @@ class AdaptiveThresholds:
         self._recorded, self._added = recorded, np.zeros(len(self._kept), np.int64)
         self._latest, self._weights = self._means(), np.ones(len(self._kept))
 
-    def add(self, condition: int, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
+    def add(self, condition: int, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
         """Add a new non-burst response.
 
         Args:

@@ -26,7 +26,7 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
-from animat.neurons.remembering import Remembered
+from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
 from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
@@ -84,7 +84,7 @@ class Driver:
         self._zero_s = self._observed_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
         self._last_command = self._at_rest
-        self._remembered = Remembered()
+        self._remembered = HistoryState()
         self._last_delivered: dict[str, list[int]] = {}
         """Conditions delivered in the last whole episode of each agent, the newest last."""
         self._unfinished: tuple[Stretch, Sequence[Stimulus], dict[str, Any]] | None = None
@@ -131,7 +131,7 @@ class Driver:
         remembering = loop.remembering if agent.sees_neurons(turn) else None
         source, conditions = self._source_of(agent), list[int]()
         for iteration in range(loop.robot.episode_limit):
-            seen = observation if remembering is None else remembering.beside(observation, self._remembered)
+            seen = observation if remembering is None else remembering.append_to(observation, self._remembered)
             chosen = self._choose(agent, controller, seen)
             repeats = 0
             while True:

@@ -27,7 +27,7 @@ from jaxtyping import Float64, Int, Int64
 
 from animat.errors import InvalidArgument, InvalidFile
 from animat.plain_file import expect_plain_file
-from animat.writing import keep_name
+from animat.writing import sync_folder
 
 MAGIC = b"ANIMATL1"
 RECORD = b"REC1"
@@ -75,7 +75,7 @@ class LogWriter:
             self._write(MAGIC)
             self.append(Record(self._header))
             self.sync()
-            keep_name(path.parent)
+            sync_folder(path.parent)
         except OSError as error:
             self.close()
             raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error

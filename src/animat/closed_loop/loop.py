@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument, UnusableData
 from animat.evaluation.transfer import describe_window, other_presentation
 from animat.goals.robot import body_and_goal
 from animat.neurons.adjusted_rank import AdjustedRanks
-from animat.neurons.remembering import Remembering
+from animat.neurons.history_tracker import HistoryTracker
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.readouts import ALL, Readouts
@@ -100,7 +100,7 @@ class Loop:
     patience_s: float = 10.0
     real_time: bool = False
     readouts: Readouts = ALL
-    remembering: Remembering | None = field(default=None, repr=False)
+    remembering: HistoryTracker | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
@@ -156,7 +156,7 @@ class Loop:
         return [SETTLING_ROUNDS] * (settling or 0) + [0 if is_silent else self.warm_up or 0]
 
     @property
-    def history(self) -> Remembering | None:
+    def history(self) -> HistoryTracker | None:
         """How responses become the history state, for adaptive thresholds or for agents; None: not needed."""
         return self.remembering if self.adaptive_from is None else self.adaptive_from.remembering
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64, UInt8
 from numpy.typing import ArrayLike
 
 from animat.errors import InvalidArgument
-from animat.late import jax, jnp
+from animat.lazy import jax, jnp
 from animat.robots.base import Robot, capability
 from animat.robots.host import Bodies, HostRobot
 from animat.wrappers import other_goal

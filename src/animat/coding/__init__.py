@@ -1,1 +1,1 @@
-"""What an action is as a stimulus (Encoder), and what a response is as a command (Decoder, mappings)."""
+"""From an action to a stimulus (Encoder), and from a response to a command (Decoder, mappings)."""

@@ -1,4 +1,4 @@
-"""Whether a mapping keeps to the contract, seen on a few responses, before anything is trained."""
+"""Check that a mapping keeps to the contract, on a few responses, before anything is trained."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from animat.coding.mapping import N_PERCENTILES, Mapping
 from animat.errors import InvalidArgument, first_line, shown
-from animat.late import jax
+from animat.lazy import jax
 
 _RESPONSES_HZ = np.linspace(0.0, 12.0, 25, dtype=np.float32)
 _PERCENTILES_HZ = {
@@ -18,11 +18,11 @@ _PERCENTILES_HZ = {
     " where all percentiles are equal": np.full(N_PERCENTILES, 6.0, np.float32),
     " where all percentiles are 0": np.zeros(N_PERCENTILES, np.float32),
 }
-"""Of a culture that answers, of one that always answers the same, and of one that is silent."""
+"""For a culture with varied responses, one whose response is always the same, and a silent one."""
 
 
 def check_mapping(mapping: Mapping) -> None:
-    """Ask a mapping for a few commands, in numpy and under `jax.jit`, and refuse it if they are none.
+    """Refuse a mapping whose results on a few responses, in numpy and under `jax.jit`, are not commands.
 
     Args:
         mapping: of any class.
@@ -44,7 +44,7 @@ def check_mapping(mapping: Mapping) -> None:
 
 @lru_cache(maxsize=64)
 def _check_commands(mapping: Mapping) -> None:
-    """Once for each mapping: it is compiled."""
+    """Cached, as each mapping is compiled."""
     kind, compiled = type(mapping).__name__, None
     for where, percentiles in _PERCENTILES_HZ.items():
         u = _commands(mapping, _RESPONSES_HZ, percentiles)
@@ -54,7 +54,7 @@ def _check_commands(mapping: Mapping) -> None:
             one = _commands(mapping, _RESPONSES_HZ[i], percentiles)
             if one.shape != () or not one == u[i]:
                 raise InvalidArgument(
-                    f"{kind}.command: expected the same for one response as among several, {u[i]:g}, got "
+                    f"{kind}.command: expected the same command for a single response as in an array, {u[i]:g}, got "
                     f"{shown(one.tolist())}"
                 )
         _expect_same(kind, compiled, u, percentiles, where)
@@ -66,7 +66,7 @@ def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
         with np.errstate(all="ignore"):
             return np.asarray(mapping.command(x, percentiles))
     except Exception as error:
-        # Anything may go wrong in somebody else's mapping.
+        # Anything may go wrong in a third-party mapping.
         raise InvalidArgument(
             f"{type(mapping).__name__}.command: expected commands, got {first_line(error)}"
         ) from error
@@ -86,7 +86,7 @@ def _expect_commands(kind: str, u: Any, where: str) -> None:
 
 
 def _expect_same(kind: str, compiled: Callable[..., Any], u: Any, percentiles: Any, where: str) -> None:
-    """Training asks for commands under `jax.jit`, and a closed loop in numpy."""
+    """Training computes commands under `jax.jit`, and a closed loop in numpy."""
     try:
         same = np.asarray(compiled(_RESPONSES_HZ, percentiles))
     except Exception as error:

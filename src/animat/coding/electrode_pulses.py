@@ -1,4 +1,4 @@
-"""How many electrodes a trial of a condition pulses: what a cost of stimulation counts."""
+"""The number of electrodes that a trial of a condition pulses, on which the cost of stimulation depends."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from animat.responses.condition import RESTING, Condition
 def electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...] | None:
     """The electrode pulses of a trial of each condition: one for each electrode of each pulse.
 
-    Where a condition is on one of several sets, their mean, as they are dealt equally often.
+    For a condition on one of several sets it is their mean, as they are used equally often.
 
     Args:
         conditions: as recorded.
-        pulses: of a trial.
+        pulses: per trial.
 
     Returns:
-        One number for each condition; None where some condition does not say the electrodes of all its pulses.
+        One number per condition; None if the electrodes of all pulses are not known for some condition.
     """
-    found = []
+    counts = []
     for each in conditions:
         if not each.electrodes or (each.only_last and pulses > 1):
             return None
         sets = [] if each.electrodes == RESTING else each.electrodes
-        found.append(pulses * sum(map(len, sets)) / len(each.electrodes))
-    return tuple(found)
+        counts.append(pulses * sum(map(len, sets)) / len(each.electrodes))
+    return tuple(counts)
 
 
 def expect_electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...]:
-    """The same, for a cost that is asked for.
+    """The same where the cost is required.
 
     Raises:
-        UnusableData: where they are not known.
+        UnusableData: if they are not known.
     """
-    found = electrode_pulses(conditions, pulses)
-    if found is None:
+    counts = electrode_pulses(conditions, pulses)
+    if counts is None:
         raise UnusableData(
-            "pulse_cost: expected conditions that say the electrodes of all their pulses, got "
+            "pulse_cost: expected conditions that state the electrodes of all their pulses, got "
             f"{', '.join(condition.label for condition in conditions)}; record places of several sizes, or leave the "
             "cost out"
         )
-    return found
+    return counts

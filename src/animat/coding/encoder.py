@@ -1,4 +1,4 @@
-"""From an action to a stimulus: each condition is delivered as it was in the recording."""
+"""From an action to a stimulus: each condition is delivered as in the recording."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ from animat.stimulation.stimulus import NOTHING
 from animat.tables import UNKNOWN
 
 SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
-"""Frequencies that a presentation may have: a quarter of an hour is waited for a pulse at most, and for a train."""
+"""Range of a trial's frequency: a pulse, and a whole train, may take at most about a quarter of an hour."""
 
 
 @dataclass(frozen=True)
 class Encoder:
-    """What the actions of an agent are as stimuli: a condition each, presented as so many pulses.
+    """From an agent's actions to stimuli: each action is a condition, presented as trials of several pulses.
 
     Attributes:
-        conditions: by the number of their action.
-        pulses: of one presentation.
+        conditions: in the order of the actions.
+        pulses: per trial.
 
     Raises:
-        InvalidArgument: for no conditions, or trains that are longer than is waited for.
-        UnusableData: for a condition that cannot be delivered, as it is not known at which frequency or on which
-            electrodes it was.
+        InvalidArgument: for no conditions, or trains that take too long.
+        UnusableData: for a condition that cannot be delivered, as its frequency or electrodes are not known.
     """
 
     conditions: tuple[Condition, ...]
@@ -41,45 +40,45 @@ class Encoder:
         for condition in self.conditions:
             if not condition.frequencies_hz:
                 raise UnusableData(
-                    f"condition {condition.label}: expected recordings that state the frequency of its pulses, at "
-                    "which a closed loop presents it, got none; sort the stimuli by their intervals too: --conditions "
+                    f"condition {condition.label}: expected recordings that state the frequency of its pulses, which a "
+                    "closed loop needs, got none; sort the stimuli by their intervals too: --conditions "
                     "'interval:5,10 x electrode'"
                 )
             if not all(SLOWEST_HZ <= each <= FASTEST_HZ for each in condition.frequencies_hz):
                 raise UnusableData(
-                    f"condition {condition.label}: expected a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, as a "
-                    f"closed loop presents by frequency, got {', '.join(f'{f:g}' for f in condition.frequencies_hz)}"
+                    f"condition {condition.label}: expected a frequency from {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz for a "
+                    f"closed loop, got {', '.join(f'{f:g}' for f in condition.frequencies_hz)}"
                 )
             if condition.electrodes == ():
                 raise UnusableData(
-                    f"condition {condition.label}: expected recordings that state the electrodes of its pulses, "
-                    "through which a closed loop presents it, got none; train on conditions by frequency or interval"
+                    f"condition {condition.label}: expected recordings that state the electrodes of its pulses, which "
+                    "a closed loop needs, got none; train on conditions by frequency or interval"
                 )
         slowest_hz = min(min(condition.frequencies_hz) for condition in self.conditions)
         if self.pulses > slowest_hz / SLOWEST_HZ:
             raise InvalidArgument(
                 f"pulses: expected trials of {1 / SLOWEST_HZ:g} s at most, got {shown(self.pulses)} pulses per trial, "
-                f"which at {slowest_hz:g} Hz are {self.pulses / slowest_hz:,.0f} s: ask for fewer"
+                f"which take {self.pulses / slowest_hz:,.0f} s at {slowest_hz:g} Hz: use fewer"
             )
 
     @property
     def electrodes(self) -> tuple[int, ...]:
-        """All that its conditions name, rising."""
+        """All electrodes that its conditions name, rising."""
         sets = (one for condition in self.conditions for one in condition.electrodes or ())
         return tuple(sorted({electrode for one in sets for electrode in one} - {NOTHING}))
 
     @property
     def takes_patterns(self) -> bool:
-        """Whether any pulse is on whatever patterns the culture has."""
+        """Whether any pulse is on one of the culture's patterns, whichever they are."""
         return any(each.electrodes is None or (each.only_last and self.pulses > 1) for each in self.conditions)
 
 
 class Target(NamedTuple):
-    """What one pulse is on.
+    """The electrodes of one pulse.
 
     Attributes:
-        electrodes: pulsed together; none where nothing is delivered.
-        pattern: number of the culture's pattern that they are, -1 where they are none, -2 where nothing is delivered.
+        electrodes: pulsed together; empty if nothing is delivered.
+        pattern: the number of the culture's pattern that they form; -1: they form none; -2: nothing is delivered.
     """
 
     electrodes: tuple[int, ...]
@@ -87,15 +86,15 @@ class Target(NamedTuple):
 
 
 class Dealer:
-    """Deals out the stimuli of one presentation after the other, as the schedule of a recording does.
+    """Deals out the stimuli of successive trials, as the schedule of a recording does.
 
-    What a condition leaves open is dealt: patterns from a deck that is shuffled when it is empty, so that all are
-    used equally often, and its frequencies by lot.
+    What a condition leaves open is drawn: patterns from a deck that is reshuffled when empty, so that all are used
+    equally often, and frequencies at random.
 
     Args:
-        encoder: what the actions are.
+        encoder: from actions to stimuli.
         patterns: electrodes of each of the culture's patterns in use, padded with -1.
-        rng: of all draws.
+        rng: for all draws.
     """
 
     def __init__(
@@ -108,26 +107,24 @@ class Dealer:
         self._decks = [
             self._any
             if each.electrodes is None
-            else _Deck([_target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
+            else _Deck([Target((), NOTHING)], rng)
+            if each.electrodes == RESTING
+            else _Deck([Target(one, number_of.get(frozenset(one), UNKNOWN)) for one in each.electrodes], rng)
             for each in encoder.conditions
         ]
 
     def frequency_hz(self, condition: int) -> float:
-        """The frequency of the next presentation of a condition."""
+        """The frequency of the next trial of a condition."""
         known = self._encoder.conditions[condition].frequencies_hz
         return known[0] if len(known) == 1 else float(known[self._rng.integers(len(known))])
 
     def targets(self, condition: int) -> list[Target]:
-        """What the pulses of the next presentation of a condition are on, different ones where there are enough."""
+        """The targets of the pulses of a condition's next trial, all different if there are enough."""
         pulses, deck = self._encoder.pulses, self._decks[condition]
         if not self._encoder.conditions[condition].only_last:
             return deck.hand(pulses)
         last = deck.hand(1)
         return [*self._any.hand(pulses - 1, but=last), *last]
-
-
-def _target(electrodes: tuple[int, ...], pattern: int) -> Target:
-    return Target((), NOTHING) if (electrodes,) == RESTING else Target(electrodes, pattern)
 
 
 class _Deck:
@@ -136,7 +133,7 @@ class _Deck:
         self._left: list[Target] = []
 
     def hand(self, n: int, but: Iterable[Target] = ()) -> list[Target]:
-        """So many, different from each other and from those in `but` as long as the deck has such."""
+        """Draw n, different from each other and from those in `but` as long as the deck has such."""
         hand: list[Target] = []
         avoided = list(but)
         while len(hand) < n:

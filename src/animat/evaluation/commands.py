@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from animat.coding.decoder import decoded
+from animat.coding.decoder import decode
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import NeuronSimulator, Stored, placed
+from animat.neurons.simulator import NeuronSimulator, Stored, to_jax
 from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
 
 CONTINUOUS_ACTIONS = 21
@@ -140,7 +140,7 @@ def mean_commands(
     """
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
-        commands = decoded(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
+        commands = decode(animat.mapping, simulator.evenly_drawn(_QUANTILES), jnp.asarray(simulator.percentiles))
         return np.arange(animat.n_conditions), np.asarray(commands.mean(axis=1), np.float64)
     of_one = commands_of(environment, simulator)
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
@@ -167,7 +167,7 @@ def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"])
 
     Loads are not distinguished: each class has the loads that were recorded with such traces.
     """
-    ends, traces = placed(np.arange(1, CLASSES) / CLASSES), placed(_recorded(simulator)[:, 0])
+    ends, traces = to_jax(np.arange(1, CLASSES) / CLASSES), to_jax(_recorded(simulator)[:, 0])
     return np.asarray(np.sum(np.asarray(history)[..., :1] >= np.asarray(jnp.quantile(traces, ends)), axis=-1))
 
 

@@ -23,11 +23,11 @@ from animat.robots.host import HostRobot
 from animat.wrappers import (
     GoalSwitch,
     IdealActuator,
+    ReversedMapping,
     ShuffledDelivery,
-    TurnedRound,
     YokedDelivery,
+    replace_innermost,
     unwrapped,
-    with_inmost,
 )
 
 Delivered = Literal["chosen", "shuffled", "silent", "yoked"]
@@ -69,8 +69,8 @@ class Control:
             animat = unwrapped(environment)
             assert isinstance(animat, Animat)
             through = animat.robot, animat.mapping, animat.n_conditions
-            changed = TurnedRound(*through) if self.commands is None else IdealActuator(*through, self.commands)
-            environment = with_inmost(environment, lambda _: changed)
+            changed = ReversedMapping(*through) if self.commands is None else IdealActuator(*through, self.commands)
+            environment = replace_innermost(environment, lambda _: changed)
         if self.delivery == "shuffled":
             environment = ShuffledDelivery(environment)
         elif self.delivery == "yoked":

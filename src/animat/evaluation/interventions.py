@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.columns import align_columns
 from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
@@ -15,7 +16,6 @@ from animat.evaluation.information import DRAWS, GoalInformation, goal_informati
 from animat.evaluation.rollouts import Episodes, Networks, roll_out
 from animat.evaluation.statistics import Interval
 from animat.evaluation.traces import Traces, trace
-from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, Silent
 from animat.records import as_json
@@ -112,7 +112,7 @@ class InterventionTable:
             cells.append([row.name, f"{row.returns.mean():.1f}", *lost, bits, row.meaning])
         lines = [
             "whose work is it: the same policies with each intervention",
-            *lined_up(["", "return", "lost", "95 % interval", "bits", ""], cells),
+            *align_columns(["", "return", "lost", "95 % interval", "bits", ""], cells),
         ]
         information = self.rows[0].information
         if information is None:

@@ -19,7 +19,7 @@ from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shu
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
-from animat.neurons.history import AT_FIRST
+from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Part, Progress, Silent
@@ -302,7 +302,7 @@ class _Programme:
             values, before = before, values
             progress.update(remaining + 1, self._robot.episode_limit)
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
-        first = np.array([AT_FIRST])
+        first = np.array([INITIAL_HISTORY])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
         return self._interpolate(values.reshape(shape)[:, at_first], starts)
 

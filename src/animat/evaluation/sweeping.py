@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from animat.compilation import kept_njit
+from animat.compilation import cached_njit
 
 f4 = np.float32
 ONE, TWO, HALF, SIXTH = f4(1), f4(2), f4(0.5), f4(1 / 6)
 
 # Without the interpreter's lock: `animat run` predicts and runs its loop at the same time.
-compiled = kept_njit(error_model="numpy", fastmath={"contract", "nsz"}, nogil=True)
+compiled = cached_njit(error_model="numpy", fastmath={"contract", "nsz"}, nogil=True)
 
 
 @compiled

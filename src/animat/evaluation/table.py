@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from animat.coding.electrode_pulses import electrode_pulses
+from animat.columns import align_columns
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
 from animat.evaluation import transfer
@@ -23,7 +24,6 @@ from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
-from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, Silent, in_phase
@@ -157,7 +157,7 @@ class Evaluation:
             for line in (head, *cells):
                 del line[-2]
         episodes = f"{first.shape[1]} episode{'' if first.shape[1] == 1 else 's'}"
-        lines = [f"{self.robot}, {on}: {count}, {episodes} each", *lined_up(head, cells)]
+        lines = [f"{self.robot}, {on}: {count}, {episodes} each", *align_columns(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if cost:
@@ -320,7 +320,7 @@ class _World:
             return cls(first, WithoutNeurons(body, first.commands))
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators, as the policies act through neurons")
-        minute = float(timeline.start_min[timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)])
+        minute = float(timeline.start_min[timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)])
         findings = *transfer.timeline_differences(first, timeline), *transfer.loop_differences(first, timeline, minute)
         fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)

@@ -11,7 +11,7 @@ from typing import Any
 from animat.errors import Mismatch, in_min, some_of
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
-from animat.responses.condition import Condition, other_stimulus
+from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.readouts import Readouts
 from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
@@ -126,7 +126,7 @@ def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts:
             f"conditions: expected {some_of([c.label for c in policy.conditions])}, from which the policies choose, "
             f"got recordings with {some_of([c.label for c in conditions])}: use those that the policies were trained on"
         )
-    if others := other_stimulus(policy.conditions, conditions):
+    if others := stimulus_mismatch(policy.conditions, conditions):
         raise Mismatch(f"conditions: {others} in the recordings: use those that the policies were trained on")
     if policy.readouts != readouts:
         raise Mismatch(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument, did_you_mean
-from animat.late import Array, jnp
+from animat.lazy import Array, jnp
 from animat.records import Flag, Number, Positive, record
 from animat.robots.base import Quantity
 

@@ -31,7 +31,7 @@ from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.goals.text import read_goal
-from animat.late import Array, jax, jnp
+from animat.lazy import Array, jax, jnp
 from animat.robots.base import WITHOUT, Quantity, Robot, capability
 from animat.robots.grid import Grid
 from animat.robots.host import HostRobot

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from animat.goals.goal import Objective
-from animat.late import Array, jax, jnp
+from animat.lazy import Array, jax, jnp
 
 Margins = Sequence[tuple["Float[Array, '']", "Bool[Array, '']"]]
 """For each objective, the margin in [-1, 1] and whether the robot is in its region."""

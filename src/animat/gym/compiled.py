@@ -1,7 +1,7 @@
-"""An environment as two compiled functions from arrays to arrays: what Gymnasium's environments step.
+"""An environment as two compiled functions from arrays to arrays, which Gymnasium's environments call.
 
-A call into compiled code costs by the number of arrays that go in and out, more than by what it computes. So an
-iteration takes and gives one row of float32 per environment, with the state and what is observed packed inside.
+The cost of a call into compiled code depends more on the number of arrays passed than on what is computed. So an
+iteration takes and returns one row of float32 per environment, which packs the state and the observation.
 """
 
 from __future__ import annotations
@@ -23,30 +23,32 @@ Rows = Float32[np.ndarray, "environments numbers"]
 
 
 class CompiledAnimat:
-    """Starts and steps any number of Animats on numpy arrays, every random number drawn from a numpy generator."""
+    """Starts and steps any number of Animats on numpy arrays, with all random numbers from a numpy generator.
+
+    It is compiled at the first call, once for all environments of the same Animat.
+    """
 
     def __init__(self, setup: Setup) -> None:
-        """Compilation waits for the first call, and is shared by all environments of the same Animat."""
         self._environment, self._simulator = setup.environment, setup.simulator
 
     def __getstate__(self) -> dict[str, Any]:
-        """Compiled functions stay behind when an environment is pickled; they are made again where it arrives."""
+        """Compiled functions are not pickled; they are compiled again after unpickling."""
         return {name: value for name, value in vars(self).items() if name != "_functions"}
 
     def start(self, n: int, rng: np.random.Generator) -> Rows:
-        """The start of `n` episodes."""
+        """Start `n` episodes."""
         return np.asarray(self._functions.start(rng.integers(0, 2**32, n, dtype=np.uint32)))
 
     def step(self, rows: Rows, actions: Int64[np.ndarray, " environments"], rng: np.random.Generator) -> Rows:
         """One iteration of each."""
         n, noise_size = len(rows), self._environment.noise_size
-        given = np.empty((n, 1 + noise_size), np.float32)
-        given[:, 0] = actions
-        given[:, 1:] = rng.random((n, noise_size), np.float32)
-        return np.asarray(self._functions.step(given, rows, self._simulator))
+        inputs = np.empty((n, 1 + noise_size), np.float32)
+        inputs[:, 0] = actions
+        inputs[:, 1:] = rng.random((n, noise_size), np.float32)
+        return np.asarray(self._functions.step(inputs, rows, self._simulator))
 
     def read(self, rows: Rows) -> tuple[Any, Rows]:
-        """The `State` in them and what is observed, in copies of numpy, shape (environments, ...)."""
+        """The `State` and the observations in the rows, as numpy copies, shape (environments, ...)."""
         return self._functions.read(rows)
 
     @cached_property
@@ -76,8 +78,8 @@ def _compiled(environment: Environment[Any]) -> _Functions:
     def start(seed: Array) -> Array:
         return pack(environment.reset(jax.random.key(seed)))
 
-    def step(given: Array, row: Array, simulator: Any) -> Array:
-        return pack(environment.advance(given[1:], unpack(row)[0], given[0].astype(jnp.int32), simulator))
+    def step(inputs: Array, row: Array, simulator: Any) -> Array:
+        return pack(environment.advance(inputs[1:], unpack(row)[0], inputs[0].astype(jnp.int32), simulator))
 
     def read(rows: Rows) -> tuple[Any, Rows]:
         parts = [

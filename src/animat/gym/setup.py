@@ -1,4 +1,4 @@
-"""From the options of an environment to an Animat and the simulator of its neurons."""
+"""From the options of an environment to an Animat and a neuron simulator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
 from animat.responses.conditions import conditions_named
-from animat.responses.readouts import USUAL_READOUTS, Readouts
+from animat.responses.readouts import DEFAULT_READOUTS, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.host import HostRobot
@@ -39,9 +39,9 @@ class Setup:
     """What an environment runs on.
 
     Attributes:
-        environment: neurons, mapping and robot, and what is around them; static.
-        simulator: how the neurons answer; data.
-        condition_labels: what the actions 0, 1, ... do, `("5 Hz", ...)`.
+        environment: neurons, mapping and robot, with wrappers; static.
+        simulator: of the neurons; data.
+        condition_labels: of the actions 0, 1, ..., such as `("5 Hz", ...)`.
     """
 
     environment: EpisodeLimit[Any]
@@ -50,7 +50,7 @@ class Setup:
 
     @property
     def observation_space(self) -> spaces.Box:
-        """What is observed, in its own units, within the bounds that no episode passes."""
+        """The observations, in their own units, within bounds that no episode exceeds."""
         spec = self.environment.observation_spec
         low, high = (np.array([getattr(q, end) for q in spec], np.float32) for end in ("low", "high"))
         return spaces.Box(low, high, dtype=np.float32)
@@ -79,54 +79,54 @@ def set_up(
     """Read the options of `Animat/...` environments.
 
     Args:
-        robot: its name, or where to import it from (`robot_named`); set by the environment's id, but for `Robot-v0`.
-        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`, or
-            one of your own, also by where to import it from.
-        recordings: files or folders of recordings of one culture to make the neurons' simulator of.
-        simulator: a simulator that is there already, in place of `recordings`. Without either, the five conditions
-            of `animat.neurons.synthetic` answer.
+        robot: its name, or where to import it from (`robot_named`); set by the environment's id except for `Robot-v0`.
+        mapping: from a response to a motor command, or its name: `1-threshold`, `9-thresholds`, `linear`, or your own,
+            which may also be named by where to import it from.
+        recordings: files or folders of recordings of one culture, to which the neuron simulator is fitted.
+        simulator: an existing simulator, in place of `recordings`. Without either, responses come from the five
+            conditions of `animat.neurons.synthetic`.
         at_min: which recording's simulator, in minutes on the culture's clock: the newest at that time; None: the
             first.
         conditions: what the agent picks from, `frequency`, `interval:5,10+-25%`, ...; None: what the recording has.
-        window_ms: when a response is read after its stimulus.
+        window_ms: start and end of the response window after a stimulus.
         kind: `histogram` (the paper), `empirical` or `memory`; None: what suits the recordings (`fit_timeline`).
         readouts: of the recordings, as many as the robot takes commands: `halves`, `quadrants`, or groups; None: all
-            channels as one, or of several commands those that `animat train` takes.
+            channels as one or, for several commands, the default of `animat train`.
         delivery: `chosen`, or `shuffled` for the control in which the neurons get a random condition.
-        neural_observation: whether what the neurons remember is observed too (`animat.wrappers.NeuralObservation`).
+        neural_observation: whether the neurons' history state is observed too (`animat.wrappers.NeuralObservation`).
         parameters: of the robot, `pole_mass_kg=0.55`.
 
     Raises:
-        InvalidArgument: for options that are not known or do not go together.
+        InvalidArgument: for options that are unknown or incompatible.
         InvalidFile: for recordings that cannot be read.
         UnusableData: for recordings that no controller can learn from.
     """
     body = robot_named(robot, **parameters)
     if isinstance(body, HostRobot):
         raise InvalidArgument(
-            f"robot: expected one that is stepped in JAX, got {body.name}, which Gymnasium steps: animat train takes it"
+            f"robot: expected one stepped in JAX, got {body.name}, which Gymnasium steps: use it with animat train"
         )
     for caveat in body.caveats():
         warnings.warn(caveat, stacklevel=2)
-    expect_kind("simulator", simulator, NeuronSimulator | None, "a simulator, and `kind` for the name of one")
+    expect_kind("simulator", simulator, NeuronSimulator | None, "a simulator; `kind` takes the name of one")
     if recordings is not None and not isinstance(recordings, str | os.PathLike):
         recordings = expect_several("recordings", recordings, str | os.PathLike, "a path or several")
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     check_window(window_ms)
     if recordings is None:
-        reading: dict[str, Any] = {"at_min": (at_min, None), "conditions": (conditions, None), "kind": (kind, None)}
-        reading["readouts"] = (readouts, None)
-        for name, (got, usual) in (reading | {"window_ms": (tuple(window_ms), DEFAULT_WINDOW_MS)}).items():
-            if got != usual:
-                raise InvalidArgument(f"{name}: expected only with recordings, of which it says how they are read")
+        window = None if tuple(window_ms) == DEFAULT_WINDOW_MS else window_ms
+        reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window}
+        for name, value in reading.items():
+            if value is not None:
+                raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
     if recordings is not None:
         by = None if conditions is None else conditions_named(conditions)
-        read = readouts or USUAL_READOUTS.get(body.n_commands, "all")
+        read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")
         timeline = fit_timeline(extract_series(read_sources(recordings), by, window_ms, readouts=read), kind=kind)
         for message in warnings_once(timeline.findings):
             warnings.warn(message, stacklevel=2)
-        row = 0 if at_min is None else timeline.row_asked_for(at_min)
+        row = 0 if at_min is None else timeline.requested_row(at_min)
         simulator = timeline.at(timeline.start_min[row])
         labels = tuple(condition.label for condition in timeline.conditions)
     elif simulator is not None:
@@ -134,7 +134,7 @@ def set_up(
     elif body.n_commands > 1:
         raise InvalidArgument(
             f"recordings: expected some for {body.name}, which takes {body.n_commands} commands: synthetic responses "
-            "have one readout"
+            "have only one readout"
         )
     else:
         simulator, labels = synthetic_simulator(), LABELS

@@ -16,16 +16,16 @@ from animat.robots.drawing import draw_robot
 
 
 class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
-    """A robot that moves as neurons answer; the action picks the stimulus.
+    """A robot moved by the responses of neurons; the action picks the stimulus.
 
     Observation: `Box`, what the robot sees, in the task's units (the learner scales). Action: `Discrete`, the index
-    of the condition given to the neurons. Reward: the task's own. `terminated` when the task ends by itself,
-    `truncated` at the robot's `episode_limit`, never both.
+    of the condition given to the neurons. Reward: the task's. `terminated` when the task ends by itself, `truncated` at
+    the robot's `episode_limit`, never both.
 
-    `info` of a step: `delivered`, the condition that reached the neurons; `rate_hz`, how they answered (Hz per
-    channel); `command`, the motor command in [-1, 1] made of it. Of several readouts both are arrays.
+    `info` of a step: `delivered`, the condition that reached the neurons; `rate_hz`, their response (Hz per channel);
+    `command`, the motor command in [-1, 1] decoded from it. With several readouts the latter two are arrays.
 
-    Everything random comes from the generator that `reset(seed=...)` seeds.
+    All random numbers come from the generator that `reset(seed=...)` seeds.
 
     Args:
         robot: its name; set by the environment's id.
@@ -58,7 +58,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
         return observations[0], {}
 
     def step(self, action: np.int64) -> tuple[Float32[np.ndarray, " observations"], float, bool, bool, dict[str, Any]]:
-        """Stimulate with the condition `action`, and let the robot move by the response."""
+        """Stimulate with the condition `action`, and move the robot by the response."""
         if self._states is None:
             raise gymnasium.error.ResetNeeded("step: expected an episode that reset() started, got none")
         if not self.action_space.contains(action):
@@ -66,7 +66,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
             raise InvalidArgument(f"action: expected a condition, a whole number from 0 to {last}, got {shown(action)}")
         self._states = self._compiled.step(self._states, np.array([action]), self.np_random)
         after, observations = self._compiled.read(self._states)
-        # Numbers are plain ones; of several readouts they are arrays.
+        # Python numbers; arrays with several readouts.
         info = {name: value[0] if value.ndim > 1 else value[0].item() for name, value in after.info.items()}
         self._command = info["command"]
         self._show(observations[0])
@@ -76,7 +76,7 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """A picture of the robot as it is now, with `render_mode="rgb_array"`."""
         if self.render_mode is None:
-            gymnasium.logger.warn('render: made without a render_mode; make it with render_mode="rgb_array"')
+            gymnasium.logger.warn('render: expected render_mode="rgb_array" when the environment was created, got None')
             return None
         if not self._shown:
             raise gymnasium.error.ResetNeeded("render: expected an episode that reset() started, got none")
@@ -84,19 +84,19 @@ class AnimatEnv(gymnasium.Env[Float32[np.ndarray, " observations"], np.int64]):
         return draw_robot(self.setup.environment.robot, now, command=self._command, earlier=earlier)
 
     def _show(self, observation: Float32[np.ndarray, " observations"]) -> None:
-        """Keep what pictures need, the robot's numbers; the observation itself is the user's, so it is copied."""
+        """Keep the robot's numbers for pictures; a copy, as the observation belongs to the user."""
         if self.render_mode is not None:
             self._shown.append(observation[: len(self.setup.environment.robot.observation_spec)].copy())
 
 
 def check_render_mode(render_mode: str | None, robot: Robot[Any]) -> None:
-    """Refuse a render mode other than None and `rgb_array`, and that one for a robot that cannot be drawn.
+    """Refuse a render mode other than None and `rgb_array`, and `rgb_array` for a robot that cannot be drawn.
 
     Raises:
         InvalidArgument: naming the mode, or the robot.
     """
     if render_mode not in (None, "rgb_array"):
-        show = "; gymnasium.make shows these pictures in a window, with pygame" if render_mode == "human" else ""
-        raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}{show}")
+        hint = "; gymnasium.make shows these pictures in a window, with pygame" if render_mode == "human" else ""
+        raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}{hint}")
     if render_mode is not None:
         capability(robot, "draw")

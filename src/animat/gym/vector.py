@@ -1,4 +1,4 @@
-"""Many Animats, stepped at once, as a Gymnasium vector environment."""
+"""Many Animats, stepped together, as a Gymnasium vector environment."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from animat.robots.drawing import draw_robot
 
 
 class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float32[np.ndarray, " environments"]]):
-    """`num_envs` independent Animats in one compiled call; each is an `AnimatEnv` (see there).
+    """`num_envs` independent Animats in one compiled call; each behaves as an `AnimatEnv`.
 
-    An environment whose episode ended starts anew in the step after (Gymnasium's `NEXT_STEP`): its action is not used
-    in that step, its observation is the first of the new episode, its reward 0. `info` holds arrays `delivered`,
-    `rate_hz` and `command`, each with a mask `_delivered` and so on that is False where a step only started an episode.
+    An environment whose episode ended starts a new one in the next step (Gymnasium's `NEXT_STEP`): that step ignores
+    its action, returns the first observation of the new episode, and gives reward 0. `info` holds the arrays
+    `delivered`, `rate_hz` and `command`, each with a mask (`_delivered`, ...) that is False where a step only started
+    an episode.
 
     Args:
         robot: its name; set by the environment's id.
-        num_envs: how many.
+        num_envs: the number of environments.
         render_mode: `rgb_array`, or None.
-        options: as of `AnimatEnv`, the same for all.
+        options: as in `AnimatEnv`, the same for all.
     """
 
     metadata = {  # noqa: RUF012 - Gymnasium's name and form
@@ -58,13 +59,13 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         self._commands = self._at_rest
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Rows, dict[str, Any]]:
-        """Start all episodes; one seed decides all of them, and `options` are not used.
+        """Start all episodes from one seed; `options` are not used.
 
         Raises:
-            InvalidArgument: for Gymnasium's `reset_mask`, which would start some of them only.
+            InvalidArgument: for Gymnasium's `reset_mask`, which would start only some of them.
         """
         if options and "reset_mask" in options:
-            raise InvalidArgument("options: expected no 'reset_mask': all episodes are started at once")
+            raise InvalidArgument("options: expected no 'reset_mask': all episodes are started together")
         super().reset(seed=seed)
         self._states = self._compiled.start(self.num_envs, self.np_random)
         _, observations = self._compiled.read(self._states)
@@ -106,7 +107,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
     def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
         """A picture of each robot as it is now, with `render_mode="rgb_array"`."""
         if self.render_mode is None:
-            gymnasium.logger.warn('render: made without a render_mode; make it with render_mode="rgb_array"')
+            gymnasium.logger.warn('render: expected render_mode="rgb_array" when the environment was created, got None')
             return None
         if self._states is None:
             raise gymnasium.error.ResetNeeded("render: expected episodes that reset() started, got none")
@@ -122,7 +123,7 @@ class AnimatVectorEnv(VectorEnv[Rows, Int64[np.ndarray, " environments"], Float3
         commands: Float32[np.ndarray, "environments *commands"],
         begun: Bool[np.ndarray, " environments"],
     ) -> None:
-        """Keep what pictures need, the robots' numbers; the observations are the user's, so they are copied."""
+        """Keep the robots' numbers for pictures; copies, as the observations belong to the user."""
         if self.render_mode is None:
             return
         self._commands = commands

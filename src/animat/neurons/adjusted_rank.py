@@ -1,4 +1,4 @@
-"""The rank of a response without what its history explains."""
+"""The rank of a response, adjusted for its history."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.neurons.history import NO_MEMORY, Ranked, ranks_among
-from animat.neurons.remembering import Remembered, Remembering
+from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.responses import Responses
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedRanks:
-    """Responses of a recording by condition, with their ranks as they would be after no history.
+    """Responses of a recording by condition, with their ranks less the effect of the history.
 
         y = r - a p - b l
 
-    r is the rank of the response, the share of the recording's responses below it, ties half; p and l are trace and
-    load when its trial came (`animat.neurons.history.Memory`). The slopes a and b, the same for all conditions, are
-    found by least squares beside a mean of each condition. Of several readouts each has its own.
+    r is the rank of the response, the share of the recording's responses below it, ties counted half; p and l are trace
+    and load at its trial (`animat.neurons.history.Memory`). The slopes a and b, the same for all conditions, are fitted
+    by least squares together with a mean for each condition; each readout has its own.
 
     Attributes:
-        remembering: what trace and load are.
+        remembering: the tracker of trace and load.
         sorted_hz: the recording's non-burst responses, rising, shape (responses,), or (readouts, responses).
-        slopes: a and b, shape (2, readouts); 0 of what the recording's simulator does not remember.
+        slopes: a and b, shape (2, readouts); 0 for parts of the history that the recording's simulator does not have.
         responses_hz: non-burst responses of each condition, in the order of time, Hz, shape (responses,), or
             (responses, readouts).
         ranks: y of each, shape (responses, readouts).
     """
 
-    remembering: Remembering
+    remembering: HistoryTracker
     sorted_hz: Float64[np.ndarray, "*readouts responses"]
     slopes: Float64[np.ndarray, "2 readouts"]
     responses_hz: tuple[Float64[np.ndarray, "responses *readouts"], ...]
@@ -41,8 +41,8 @@ class AdjustedRanks:
 
     @classmethod
     def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
-        """Of a recording, with the memory of its simulator."""
-        remembering, usable = Remembering.of(responses, simulator), ~responses.is_burst
+        """From a recording's responses, with the memory of its simulator."""
+        remembering, usable = HistoryTracker.of(responses, simulator), ~responses.is_burst
         n_conditions, condition, read_hz = (
             len(responses.conditions),
             responses.condition[usable],
@@ -51,8 +51,8 @@ class AdjustedRanks:
         sorted_hz, memory = np.sort(read_hz.T, axis=-1), remembering.memory
         history = Ranked(responses).states(memory)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
         ranks = _ranks(sorted_hz, read_hz)
-        given = np.concatenate([np.eye(n_conditions)[condition], history], axis=1)
-        slopes = np.linalg.lstsq(given, ranks, rcond=None)[0][n_conditions:]
+        design = np.concatenate([np.eye(n_conditions)[condition], history], axis=1)
+        slopes = np.linalg.lstsq(design, ranks, rcond=None)[0][n_conditions:]
         adjusted = ranks - history @ slopes
         rows = [condition == each for each in range(n_conditions)]
         return cls(
@@ -60,12 +60,12 @@ class AdjustedRanks:
         )
 
     def of_response(
-        self, came: Remembered, read_hz: Float64[np.ndarray, "*readouts"]
+        self, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]
     ) -> Float64[np.ndarray, " readouts"]:
         """y of another response.
 
         Args:
-            came: the history state when its trial came (`Remembering.when`).
+            came: the history state at its trial (`HistoryTracker.when`).
             read_hz: x of each readout, Hz.
         """
         return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)

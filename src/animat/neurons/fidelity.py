@@ -1,4 +1,4 @@
-"""What a simulator keeps of the responses it was made from, and what it loses."""
+"""How faithfully a simulator reproduces the responses it was fitted to."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Fidelity:
     """How often each condition passes the pooled median, in the data and in the simulator.
 
     Attributes:
-        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,); of several readouts
-            (conditions, readouts).
-        in_simulator: the same from the simulator, the same shape.
-        n_above_range: non-burst responses, of any readout, above a histogram's range, counted into its last bin.
+        in_data: P(x >= P50) of each condition's non-burst responses, shape (conditions,), or (conditions, readouts) for
+            several readouts.
+        in_simulator: the same for the simulator, in the same shape.
+        n_above_range: non-burst responses, of any readout, above a histogram's range, counted in its last bin.
         readouts: their names.
     """
 
@@ -43,15 +43,15 @@ class Fidelity:
 
     @property
     def largest_loss(self) -> float:
-        """How far the simulator moves P(x >= P50) of any condition."""
+        """The largest change of P(x >= P50) of any condition."""
         return float(np.abs(self.in_data - self.in_simulator).max())
 
     def findings(self, *, of_memory: bool = False) -> tuple[Finding, ...]:
-        """A warning where binning, or the nearest of too few, moves P(x >= P50) by more than `LARGEST_LOSS`, or where
+        """Warnings if binning, or drawing from too few neighbours, moves P(x >= P50) by more than `LARGEST_LOSS`, or if
         responses lie above the range.
 
         Args:
-            of_memory: whether the simulator remembers.
+            of_memory: whether the simulator has a memory.
         """
         found = []
         loss = np.abs(self.in_data - self.in_simulator)
@@ -62,14 +62,15 @@ class Fidelity:
             value = float(loss[worst])
             if of_memory:
                 message = (
-                    f"drawing from similar histories {changed}: some of so few responses come too often; record more"
+                    f"drawing from similar histories {changed}: with so few responses some are drawn too often; record "
+                    "more"
                 )
                 found.append(Finding("few-neighbours", "warning", message, value))
             else:
-                remedy = "take more bins, no range (edges are then percentiles) or the empirical simulator"
+                remedy = "use more bins, no range (edges are then percentiles) or the empirical simulator"
                 found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
         if self.n_above_range:
-            message = f"responses above the histogram's range, which count into its last bin: {self.n_above_range}"
+            message = f"responses above the histogram's range, which are counted in its last bin: {self.n_above_range}"
             found.append(Finding("above-range", "warning", message, float(self.n_above_range)))
         return tuple(found)
 
@@ -77,8 +78,8 @@ class Fidelity:
 def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
     """Compare a simulator with the responses it was fitted to, at the pooled median P50.
 
-    The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; of a
-    simulator with memory, the mean share of the responses nearest to each history that it knows.
+    The simulator's share is computed, not drawn: it is the share of 20,000 evenly spaced quantiles that pass P50; for a
+    simulator with memory, the mean share over the neighbours of each history that it holds.
     """
     median_hz = np.asarray(simulator.percentiles, np.float32)[..., 5]
     kept, read_hz = ~responses.is_burst, responses.read_hz.astype(np.float32)
@@ -99,7 +100,7 @@ def fidelity(responses: Responses, simulator: NeuronSimulator) -> Fidelity:
 def _shares_after_each(
     simulator: MemorySimulator, median_hz: Float[Array, "*readouts"]
 ) -> Float[Array, "conditions *readouts"]:
-    """How many answers to every condition reach the median, over all histories that its own responses had."""
+    """The share of answers to every condition that reach the median, over the histories of its own responses."""
     rows = jnp.arange(simulator.before.shape[1])
 
     def of_condition(condition: Int[Array, ""]) -> Float[Array, "*readouts"]:

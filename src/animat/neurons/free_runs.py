@@ -1,4 +1,4 @@
-"""A simulator left to itself under a recorded sequence of conditions, and what series of responses are told by."""
+"""Free runs of a simulator under a recorded sequence of conditions, and statistics of series of responses."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from animat.neurons.prediction import Halves, Prediction
 from animat.neurons.simulator import NeuronSimulator
 
 LAGS = 10
-"""Up to which responses are correlated with the ones before, and run lengths are told apart."""
+"""The largest lag of correlations, and the largest run length counted separately."""
 
 
 def recorded_series(halves: Halves) -> Float64[np.ndarray, " presentations"]:
-    """The held-out responses in their places among all trials, NaN at the others."""
+    """The held-out responses at their places among all trials, NaN elsewhere."""
     presented, place = halves.whole.presentations
     series = np.full(len(presented.rate_hz), np.nan)
     series[place[halves.rows]] = halves.x_hz
@@ -27,13 +27,13 @@ def recorded_series(halves: Halves) -> Float64[np.ndarray, " presentations"]:
 def free_runs(
     simulator: NeuronSimulator | None, prediction: Prediction, halves: Halves, n: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "n presentations"]:
-    """What a simulator answers in the held-out half's place, n times.
+    """Draw n series of responses from a simulator in place of the held-out half.
 
-    Conditions and times are the recorded ones. A simulator with memory remembers its own answers; what it does not
-    answer, bursts and trials of no condition or of the first half, it is given.
+    Conditions and times are the recorded ones. A simulator with memory remembers its own answers; for trials that it
+    does not answer (bursts, trials without a condition or in the first half) the recorded history is used.
 
     Returns:
-        Responses in Hz in the places of the recorded ones, NaN elsewhere.
+        Responses in Hz at the places of the recorded ones, NaN elsewhere.
     """
     presented, place = halves.whole.presentations
     places = place[halves.rows]
@@ -75,12 +75,12 @@ def _remembering(
 ) -> Float[Array, "trials n *readouts"]:
     answer = jax.vmap(simulator.answer_at, (None, 0, 0, None))
 
-    def trial(trace: Float[Array, " n"], given: tuple[Array, ...]) -> tuple[Array, Array]:
-        condition, load, left, is_answered, is_burst, is_rested, uniform = given
+    def trial(trace: Float[Array, " n"], inputs: tuple[Array, ...]) -> tuple[Array, Array]:
+        condition, load, left, is_answered, is_burst, is_rested, uniform = inputs
         trace = jnp.where(is_rested, 0.0, trace)
         rate_hz, after = answer(condition, uniform, trace, load)
         after = jnp.where(is_answered, after, jnp.asarray(simulator.decay) * trace + left)
-        # As `history.Ranked` has it: what a burst leaves is not known.
+        # As in `history.Ranked`: the trace after a burst is not known.
         return jnp.where(is_burst, 0.5, after), rate_hz
 
     begun = jnp.full(uniforms.shape[1], trace)
@@ -88,15 +88,15 @@ def _remembering(
 
 
 def autocorrelation(series: Float64[np.ndarray, "*n trials"]) -> Float64[np.ndarray, "*n lags"]:
-    """The correlation of responses with those 1 to `LAGS` trials before, over the pairs that there are; NaN of none."""
-    is_there = ~np.isnan(series)
-    count = is_there.sum(axis=-1, keepdims=True)
-    filled = np.where(is_there, series, 0.0)
-    centred = np.where(is_there, filled - filled.sum(axis=-1, keepdims=True) / count, 0.0)
+    """The correlation of responses with those 1 to `LAGS` trials before, over the existing pairs; NaN without any."""
+    is_known = ~np.isnan(series)
+    count = is_known.sum(axis=-1, keepdims=True)
+    filled = np.where(is_known, series, 0.0)
+    centred = np.where(is_known, filled - filled.sum(axis=-1, keepdims=True) / count, 0.0)
     variance = np.sum(centred**2, axis=-1) / count[..., 0]
     of_lags = []
     for lag in range(1, LAGS + 1):
-        pairs = np.sum(is_there[..., :-lag] & is_there[..., lag:], axis=-1)
+        pairs = np.sum(is_known[..., :-lag] & is_known[..., lag:], axis=-1)
         products = np.sum(centred[..., :-lag] * centred[..., lag:], axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_lags.append(products / pairs / variance)
@@ -104,14 +104,14 @@ def autocorrelation(series: Float64[np.ndarray, "*n trials"]) -> Float64[np.ndar
 
 
 def run_lengths(series: Float64[np.ndarray, " trials"], threshold_hz: float) -> Int64[np.ndarray, " runs"]:
-    """How many trials in a row the response is at or above a threshold; what is missing ends a run."""
+    """The lengths of runs of trials with responses at or above a threshold; a missing response ends a run."""
     passes = np.concatenate([[False], series >= threshold_hz, [False]])
     edges = np.flatnonzero(np.diff(passes.astype(np.int8))).reshape(-1, 2)
     return np.asarray(edges[:, 1] - edges[:, 0])
 
 
 def shares_lasting(lengths: Int64[np.ndarray, " runs"]) -> Float64[np.ndarray, " lengths"]:
-    """The share of runs that last 1, 2, ..., `LAGS` trials or more; NaN without runs."""
+    """The shares of runs that last 1, 2, ..., `LAGS` trials or more; NaN without runs."""
     if not len(lengths):
         return np.full(LAGS, np.nan)
     return np.asarray(np.mean(lengths[:, None] >= np.arange(1, LAGS + 1), axis=0))

@@ -1,4 +1,4 @@
-"""The history state: what neurons remember, as two numbers, and how it is read from a recording."""
+"""The history state: what neurons remember, as two numbers, and how to compute it from a recording."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.responses.conditions import NO_CONDITION
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 
-AT_FIRST = (0.5, 0.5)
-"""Trace and load that an episode begins with: its warm-up was presented in random order, as in a recording.
+INITIAL_HISTORY = (0.5, 0.5)
+"""Trace and load at the start of an episode: its warm-up was presented in random order, as in a recording.
 
-The trace is of what was answered just before, from 0 to 1; the load of what was presented in the seconds before, 0 or
-more. Both are 0 after silence (`animat.neurons.memory`).
+The trace summarises the latest responses, from 0 to 1; the load the stimulation of the last seconds, 0 or more. Both
+are 0 after silence (`animat.neurons.memory`).
 """
 
 
 class Memory(NamedTuple):
-    """How the history state is made of what was presented and answered, and how much of it an answer hangs on.
+    """How the history state follows from stimuli and responses, and how strongly a response depends on it.
 
         p' = decay p + (1 - decay) (r + weight m) / (1 + weight)
         l  = exp(-t / load_s) l',    l' = l + c
 
-    The trace p is what was answered just before: p before a response and p' after it, r the response's rank (the share
+    The trace p summarises the latest responses: p before a response and p' after it, r the response's rank (the share
     of all responses below it), m the mean rank of its condition; all are in [0, 1], 0 after silence. Ranks are of the
-    response of all channels, also where several readouts are read. The load l is how much was stimulated in the seconds
-    before: it falls during the time t from one trial to the next, and each trial adds c, by which its mean over
-    the recording is 0.5.
+    response of all channels, even with several readouts. The load l is how much was stimulated in the last seconds: it
+    decays during the time t from one trial to the next, and each trial adds c, chosen so that the mean load over the
+    recording is 0.5.
 
     Attributes:
-        decay: of the trace before; 0: only the last presentation is remembered.
-        weight: of what was presented beside what was answered; 0: only the answer is remembered.
-        neighbour_exponent: of n responses the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
+        decay: of the previous trace; 0: only the last trial is remembered.
+        weight: of the stimulus relative to the response; 0: only the response is remembered.
+        neighbour_exponent: of n responses, the n^neighbour_exponent with the nearest histories may be drawn; 1: all of
             them, whatever the history.
-        load_s: the load's time constant, s; 0: there is none.
+        load_s: the load's time constant, s; 0: no load.
     """
 
     decay: float
@@ -52,10 +52,10 @@ class Loads(NamedTuple):
 
     Attributes:
         every: at each trial, shape (presentations,).
-        at: each response, shape (responses,).
-        after: the trial before it, shape (responses,).
-        kept: the share that is left at a trial of each condition, shape (conditions,).
-        added: what a trial adds; 0: there is no load.
+        at: at each response, shape (responses,).
+        after: after the trial before it, shape (responses,).
+        kept: the share that is left when a trial of each condition comes, shape (conditions,).
+        added: by each trial; 0: there is no load.
     """
 
     every: Float64[np.ndarray, " presentations"]
@@ -70,7 +70,7 @@ class Ranked:
 
     Attributes:
         sorted_hz: the non-burst responses, rising.
-        rank: of each, the share of non-burst responses below it, ties half, shape (responses,).
+        rank: of each, the share of non-burst responses below it, ties counted half, shape (responses,).
         means: the mean rank of each condition's non-burst responses, shape (conditions,).
         rows: of each condition, the responses that can be drawn.
     """
@@ -96,18 +96,18 @@ class Ranked:
     def recorded(
         self, memory: Memory
     ) -> tuple[Float64[np.ndarray, " presentations"], Float64[np.ndarray, " presentations"]]:
-        """The trace before each trial, and what its response adds."""
-        presented: Presented = self._presented
-        # Of what has no condition of its own the middle one's is as good as any.
+        """The trace before each trial, and the increment by its response."""
+        presented: Trials = self._presented
+        # For trials without a condition, the middle rank is as good as any.
         means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
-        left = left_by(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
+        left = trace_increment(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
         trace, traces = 0.0, []
         for is_rested, is_burst, more in zip(
             presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
         ):
             trace = 0.0 if is_rested else trace
             traces.append(trace)
-            # What a burst leaves is not known: what comes right after one is not drawn, and begins anew.
+            # The trace after a burst is not known: the next response is not drawn, and the trace starts again.
             trace = 0.5 if is_burst else memory.decay * trace + more
         return np.array(traces, np.float64), left
 
@@ -124,10 +124,10 @@ class Ranked:
             lefts.append(left)
             loads.append(kept * left)
             left = loads[-1] + 1
-        # Before the first trial of all, time has no length.
-        has_length = np.isfinite(since_s)
+        # The time before the very first trial is infinite.
+        is_finite = np.isfinite(since_s)
         usual_s = [
-            np.median(since_s[of] if (of := (presented.condition == c) & has_length).any() else np.inf)
+            np.median(since_s[of] if (of := (presented.condition == c) & is_finite).any() else np.inf)
             for c in range(len(self.rows))
         ]
         added = 0.5 / max(float(np.mean(loads)), 1e-9)
@@ -138,23 +138,23 @@ class Ranked:
 def ranks_among(
     sorted_hz: Float64[np.ndarray, " others"], rate_hz: Float64[np.ndarray, " values"]
 ) -> Float64[np.ndarray, " values"]:
-    """The share of some responses, which are sorted, that lies below each of others; ties half."""
+    """The share of sorted responses that lies below each of other responses; ties counted half."""
     below, no_larger = sorted_hz.searchsorted(rate_hz, "left"), sorted_hz.searchsorted(rate_hz, "right")
     return np.asarray((below + no_larger) / (2 * len(sorted_hz)))
 
 
-def left_by(
+def trace_increment(
     rank: Float64[np.ndarray, " responses"], mean: Float64[np.ndarray, "#responses"] | float, memory: Memory
 ) -> Float64[np.ndarray, " responses"]:
-    """What responses add to the history."""
+    """What responses add to the trace."""
     return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
 
 
-class Recorded(NamedTuple):
-    """What there is to remember before each trial of a recording, as a simulator of a part of it reads it.
+class RecordedStates(NamedTuple):
+    """The history state before each trial of a recording, for a simulator fitted to a part of it.
 
     Attributes:
-        trace, load: when the trial comes, shape (presentations,).
+        trace, load: at the trial, shape (presentations,).
         left: what its recorded response adds to the trace, shape (presentations,).
     """
 
@@ -163,13 +163,13 @@ class Recorded(NamedTuple):
     left: Float64[np.ndarray, " presentations"]
 
 
-def recorded_states(responses: Responses, memory: Memory) -> Recorded:
+def recorded_states(responses: Responses, memory: Memory) -> RecordedStates:
     """The history states of all trials of a recording.
 
     Args:
-        responses: that a simulator was fitted to. Ranks are among them; the trials (`Responses.presentations`) may be
-            more.
+        responses: to which a simulator was fitted. Ranks are among these; there may be more trials
+            (`Responses.presentations`).
     """
     ranked = Ranked(responses)
     traces, left = ranked.recorded(memory)
-    return Recorded(traces, ranked.loads(memory.load_s).every, left)
+    return RecordedStates(traces, ranked.loads(memory.load_s).every, left)

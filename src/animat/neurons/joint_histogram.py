@@ -1,4 +1,4 @@
-"""Histograms of several readouts that are drawn together: each keeps its own law, and trials keep what they share."""
+"""Histograms of several readouts that are drawn together: each keeps its distribution, and trials their correlation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, placed, quantile_of, stacked
+from animat.neurons.simulator import NeuronSimulator, Stored, fit_histogram, quantile_of, stacked, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
@@ -21,13 +21,13 @@ _BELOW_ONE = float(np.nextafter(np.float32(1.0), np.float32(0.0)))
 class JointHistogramSimulator(NeuronSimulator):
     """A histogram per condition and readout, drawn together by the ranks of one recorded trial (an empirical copula).
 
-    Of the n trials of a condition one is drawn, all equally likely. With r_d the rank of readout d in it, from 0, and w
+    One of the n trials of a condition is drawn, all equally likely. With r_d the rank of readout d in it, from 0, and w
     uniform in [0, 1), the same for all readouts of the trial:
 
         x_d = Q_d((r_d + w) / n),    Q_d: the quantiles of the histogram of readout d
 
-    So each readout alone has the law of its histogram (the paper's), and the readouts have the rank correlation of the
-    recording. Tied responses are ranked at random, apart for each readout.
+    So each readout alone has the distribution of its histogram (the paper's), and the readouts have the rank
+    correlation of the recording. Tied responses are ranked at random, separately for each readout.
 
     Attributes:
         cumulative: share of a condition's responses below each edge, shape (readouts, conditions, bins + 1).
@@ -52,7 +52,7 @@ class JointHistogramSimulator(NeuronSimulator):
         return self.counts.shape[-1]
 
     def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, " readouts"]:
-        """The responses of all readouts, of the trial that a uniform in [0, 1) draws."""
+        """The responses of all readouts for the trial that a uniform in [0, 1) draws."""
         count = jnp.asarray(self.counts)[condition]
         # float32 rounds a uniform just under 1 times a count up to the count.
         trial = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -81,7 +81,7 @@ def fit_joint_histogram(
     ]
     counts = np.array([len(rows) for rows in of_condition])
     ranks = np.zeros((len(counts), max(int(counts.max()), room or 0), len(alone)))
-    # Of one seed: the same responses make the same simulator.
+    # A fixed seed: the same responses give the same simulator.
     rng = np.random.default_rng(0)
     for condition, rows in enumerate(of_condition):
         for d in range(len(alone)):
@@ -90,7 +90,7 @@ def fit_joint_histogram(
     return JointHistogramSimulator(
         stacked([each.cumulative for each in alone]),
         stacked([each.edges_hz for each in alone]),
-        placed(ranks),
-        placed(counts, np.int32),
+        to_jax(ranks),
+        to_jax(counts, np.int32),
         stacked([each.percentiles for each in alone]),
     )

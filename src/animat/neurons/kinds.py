@@ -12,7 +12,7 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, fit_histogr
 from animat.responses.responses import Responses
 
 Kind = Literal["histogram", "empirical", "memory"]
-"""A distribution in bins (the paper); a measured value; one that was measured after a similar history."""
+"""Draw from a distribution in bins (the paper); a measured response; or one measured after a similar history."""
 
 
 def fit_simulator(
@@ -24,11 +24,11 @@ def fit_simulator(
     room: int | None = None,
     memory: Memory | None = None,
 ) -> NeuronSimulator:
-    """Fit a simulator of a `Kind`: `bins` and `range_hz` are of a histogram, `room` of the others and of
-    histograms of several readouts, `memory` of one.
+    """Fit a simulator of a `Kind`: `bins` and `range_hz` are for histograms, `room` for the other kinds and for
+    histograms of several readouts, `memory` for the memory kind.
 
     Raises:
-        InvalidArgument: for another kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
+        InvalidArgument: for an unknown kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
         UnusableData: if a condition has no non-burst response.
     """
     if kind == "histogram" and len(responses.readouts) > 1:

@@ -1,4 +1,4 @@
-"""A neuron simulator that remembers: what a culture answers depends on what it was given and answered before."""
+"""A neuron simulator with memory: its responses depend on earlier stimuli and responses."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
-from animat.neurons.history import NO_MEMORY, Memory, Ranked, left_by
-from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, placed
+from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
+from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
 _DECAYS = (0.0, 0.15, 0.3, 0.45)
 _WEIGHTS = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""The larger ones suit few channels, whose response tells less of the network than the stimulus does."""
+"""The larger ones suit few channels, whose response says less about the network than the stimulus does."""
 _EXPONENTS = (0.5, 0.6, 0.7, 0.8, 0.9)
 _LOAD_S = 1.0
-"""Settled on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s this one told the responses in their closed loops best."""
+"""Chosen on virtual cultures 1 to 5: of 0.5, 1, 2 and 4 s it predicted the responses in their closed loops best."""
 _FEWEST = 30
-"""Responses of which a condition has slopes of its own; of fewer it has those of all conditions."""
+"""Responses needed for a condition to have its own slopes; with fewer it has those of all conditions."""
 _UNLIKELY = 0.01
-"""How often a load would explain as much by chance, at most."""
+"""The largest probability that a load explains as much by chance."""
 _CERTAIN = 2.0
-"""Standard errors by which a memory must tell responses better than none: the best of many does by chance, a little."""
+"""Standard errors by which a memory must predict better than none, as the best of many is a little better by chance."""
 
 
 @jax.tree_util.register_dataclass
@@ -37,28 +37,28 @@ class MemorySimulator(EmpiricalSimulator):
     """Draws one of the measured responses to the condition that had a similar history.
 
     Of a condition's responses, ordered by their histories (see `Memory`), one of the k nearest in that order is drawn,
-    all equally likely; where more than k had the very same history, one of these. The order is that of the trace; where
-    the load tells too, it is that of the rank that trace and load lead to expect, a p + b l, with a and b of each
-    condition by regression. No distribution is assumed. With all of them nearest it is the empirical simulator,
-    which its `quantile` always is: what is answered when nothing is known of the history.
+    all equally likely; if more than k had exactly the same history, one of these. The order is that of the trace; with
+    a load, it is that of the rank expected from trace and load, a p + b l, with a and b of each condition by
+    regression. No distribution is assumed. If all responses are neighbours it is the empirical simulator, as its
+    `quantile` always is: the response if nothing is known about the history.
 
     Attributes:
-        before: the place in that order of each of a condition's responses, rising, padded with infinity, shape
+        before: the position in that order of each of a condition's responses, rising, padded with infinity, shape
             (conditions, most responses).
         histories: the history state before them, trace and load (`Answer`), shape (conditions, most responses, 2).
-        after_hz: the response itself, in that order, shape (conditions, most responses); of several readouts of one
-            trial each, shape (conditions, most responses, readouts).
-        left: what it adds to the trace, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most
+        after_hz: the responses in that order, shape (conditions, most responses), or (conditions, most responses,
+            readouts) with several readouts.
+        left: what each adds to the trace, (1 - decay) (r + weight m) / (1 + weight), shape (conditions, most
             responses).
-        followers: how many of them there are, shape (conditions,): those before which no burst came.
+        followers: the number of these responses, which are those not preceded by a burst, shape (conditions,).
         nearest: k of each condition, shape (conditions,).
         toward: a and b of each condition, shape (conditions, 2).
-        kept: the share of the load that is left when a trial of each condition has come, shape (conditions,).
+        kept: the share of the load that is left when a trial of each condition comes, shape (conditions,).
         added: c, what a trial adds to the load.
         decay, weight, neighbour_exponent, load_s: as in `Memory`.
 
-    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with one number to tell
-    neighbours by and without its weights.
+    Source: the nearest-neighbour bootstrap of Lall and Sharma 1996 (doi:10.1029/95WR02966), with neighbours in a single
+    number and without its weights.
     """
 
     __repr__ = briefly
@@ -81,7 +81,7 @@ class MemorySimulator(EmpiricalSimulator):
 
     @property
     def memory(self) -> Memory:
-        """Of a single recording's simulator, as `fit_memory` takes it."""
+        """The memory of a single recording's simulator, as `fit_memory` takes it."""
         return Memory(float(self.decay), float(self.weight), float(self.neighbour_exponent), float(self.load_s))
 
     def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
@@ -92,7 +92,7 @@ class MemorySimulator(EmpiricalSimulator):
     def answer_at(
         self, condition: Int[Array, ""], uniform: Float[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
     ) -> tuple[Float[Array, "*readouts"], Float[Array, ""]]:
-        """What is answered at a trace and a load as they are when the trial comes, and the trace after it."""
+        """The response for the trace and load at the trial, and the trace after it."""
         first, end = self.rows_near(condition, trace, load)
         # float32 rounds a uniform just under 1 times a count up to the count.
         row = jnp.minimum(first + (uniform * (end - first)).astype(jnp.int32), end - 1)
@@ -102,31 +102,31 @@ class MemorySimulator(EmpiricalSimulator):
     def rows_near(
         self, condition: Int[Array, ""], trace: Float[Array, ""], load: Float[Array, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """The first row of `after_hz` that is drawn from at a trace and a load, and the one after the last."""
+        """The first row of `after_hz` to draw from for a trace and a load, and the row after the last."""
         before, count, nearest = self.before[condition], self.followers[condition], self.nearest[condition]
         toward = jnp.asarray(self.toward)[condition]
-        here = toward[0] * trace + toward[1] * load
-        smaller, no_larger = jnp.sum(before < here), jnp.sum(before <= here)
+        position = toward[0] * trace + toward[1] * load
+        smaller, no_larger = jnp.sum(before < position), jnp.sum(before <= position)
         first = jnp.clip((smaller + no_larger - nearest) // 2, 0, count - nearest)
-        # Small arrays count few spikes, and many responses may have the same history.
+        # Small arrays count few spikes, so many responses may have the same history.
         return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
 
 
 def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory | None = None) -> MemorySimulator:
-    """Keep every condition's non-burst responses, and what was before them, to draw from.
+    """Keep every condition's non-burst responses, with their histories, to draw from.
 
-    What is remembered, and the neighbour exponent, are found by leaving out each response in turn and telling it, in
-    rank, by the mean of its neighbours. Of twenty ways to make a trace the one with the smallest error is taken, and
-    of its exponents the largest that is as good as the best, up to one standard error of the difference. Where nothing
-    tells responses better than no history at all does, by two standard errors, there is no memory in the simulator
-    either. Where there is, and the times of the trials are known, a load of one second is taken too if it explains
-    ranks beyond the trace (p < 0.01, F test of linear regressions).
+    The form of the trace and the neighbour exponent are found by leaving out each response in turn and predicting its
+    rank by the mean of its neighbours. Of twenty forms of the trace the one with the smallest error is taken, and of
+    its exponents the largest that is as good as the best, within one standard error of the difference. If none predicts
+    better than no history at all by two standard errors, the simulator has no memory. If one does, and the times of the
+    trials are known, a load with a time constant of one second is added if it explains ranks beyond the trace
+    (p < 0.01, F test of linear regressions).
 
     Args:
-        responses: of one recording, every condition with at least one non-burst response. Those that came after a
-            burst, which the simulator never answers itself, are only drawn where a condition has no others.
+        responses: of one recording, every condition with at least one non-burst response. Those after a burst, which
+            the simulator itself never gives, are only drawn if a condition has no others.
         room: as in `fit_empirical`.
-        memory: to be used in place of the one that is found: for responses that are drawn from others.
+        memory: to use instead of fitting one: for bootstrap samples of responses.
 
     Raises:
         UnusableData: if a condition has no non-burst response.
@@ -136,7 +136,7 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
     """
     values = fit_empirical(responses, room=room)
     ranked = Ranked(responses)
-    memory = memory or _found(ranked)
+    memory = memory or _find_memory(ranked)
     trace, load = ranked.traces(memory), ranked.loads(memory.load_s)
     memory = memory if load.added else memory._replace(load_s=0.0)
     history, state = (np.stack([trace, each], axis=-1) for each in (load.at, load.after))
@@ -151,31 +151,31 @@ def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory 
         before[condition, : len(rows)] = np.sort(at)
         histories[condition, : len(rows)] = state[in_order]
         after[condition, : len(rows)] = responses.read_hz[in_order]
-        left[condition, : len(rows)] = left_by(ranked.rank[in_order], ranked.means[condition], memory)
+        left[condition, : len(rows)] = trace_increment(ranked.rank[in_order], ranked.means[condition], memory)
     followers = np.array([len(rows) for rows in ranked.rows])
     return MemorySimulator(
         values.values_hz,
         values.counts,
         values.percentiles,
-        placed(before),
-        placed(histories),
-        placed(after),
-        placed(left),
-        placed(followers, np.int32),
-        placed(np.rint(followers**memory.neighbour_exponent), np.int32),
-        placed(toward),
-        placed(load.kept),
-        placed(load.added),
-        *(placed(each) for each in memory),
+        to_jax(before),
+        to_jax(histories),
+        to_jax(after),
+        to_jax(left),
+        to_jax(followers, np.int32),
+        to_jax(np.rint(followers**memory.neighbour_exponent), np.int32),
+        to_jax(toward),
+        to_jax(load.kept),
+        to_jax(load.added),
+        *(to_jax(each) for each in memory),
     )
 
 
-def _found(ranked: Ranked) -> Memory:
-    """The memory that tells responses best, as `fit_memory` says."""
+def _find_memory(ranked: Ranked) -> Memory:
+    """The memory that predicts responses best, as described in `fit_memory`."""
     rows = [rows for rows in ranked.rows if len(rows) > 1]
     if not rows:
         return NO_MEMORY
-    # With all of them nearest, every history is as good as any.
+    # With all responses as neighbours the history does not matter.
     errors = {NO_MEMORY: _errors(ranked.rank, rows, 1.0)}
     for decay, weight in itertools.product(_DECAYS, _WEIGHTS):
         history = ranked.traces(Memory(decay, weight, 1.0))
@@ -202,14 +202,13 @@ def _has_load(ranked: Ranked, memory: Memory) -> bool:
     trace, load = ranked.traces(memory), ranked.loads(_LOAD_S)
     if not load.added:
         return False
-    # Of each condition on its own, so that its mean explains nothing.
+    # Each condition has its own coefficients, so that differences of means explain nothing.
     one = np.concatenate([np.eye(len(ranked.rows))[[c] * len(rows)] for c, rows in enumerate(ranked.rows)])
     every = np.concatenate(ranked.rows)
     rank = ranked.rank[every]
 
-    def squares_left(*given: Float64[np.ndarray, " responses"]) -> float:
-        """By a linear regression."""
-        design = np.concatenate([one * x[every, None] for x in (np.ones_like(trace), *given)], axis=1)
+    def squares_left(*regressors: Float64[np.ndarray, " responses"]) -> float:
+        design = np.concatenate([one * x[every, None] for x in (np.ones_like(trace), *regressors)], axis=1)
         return float(np.sum((rank - design @ np.linalg.lstsq(design, rank, rcond=None)[0]) ** 2))
 
     without, with_load = squares_left(trace), squares_left(trace, load.at)
@@ -224,8 +223,9 @@ def _slopes(
 ) -> Float64[np.ndarray, "conditions 2"]:
     """Slopes of each condition's ranks over trace and load, shrunk towards those of all conditions together.
 
-    Least squares of some hundred responses tell a slope to about its own size. What slopes of conditions differ by
-    beyond that is estimated from them (empirical Bayes), and each is moved towards the common one accordingly.
+    With some hundred responses, the error of a slope is about as large as the slope. How much the true slopes differ
+    between conditions is estimated from all of them (empirical Bayes), and each is moved towards the common one
+    accordingly.
 
     Source: Morris 1983 (doi:10.1080/01621459.1983.10477920).
     """
@@ -238,7 +238,7 @@ def _slopes(
     n = sum(map(len, ranks)) - len(ranks) - 2
     variance = sum(float(np.sum((y - x @ common) ** 2)) for y, x in centred) / max(n, 1)
     slopes = np.tile(common, (len(ranks), 1))
-    # The slopes of a few responses would tell more of chance than of how conditions differ.
+    # Slopes from a few responses would reflect chance more than differences between conditions.
     known = [i for i, of in enumerate(squares) if len(ranks[i]) >= _FEWEST and np.linalg.matrix_rank(of) == 2]
     if len(known) < 2 or variance <= 0:
         return slopes
@@ -255,9 +255,9 @@ def _slopes(
 def _errors(
     rank: Float64[np.ndarray, " responses"], in_order: Sequence[Int64[np.ndarray, " rows"]], neighbour_exponent: float
 ) -> Float64[np.ndarray, " rows"]:
-    """Squared differences between each response's rank and the mean of the nearest n^neighbour_exponent others'.
+    """Squared differences between each response's rank and the mean rank of its n^neighbour_exponent neighbours.
 
-    Responses to each condition are in the order of their histories.
+    The responses to each condition are in the order of their histories.
     """
     errors = np.full(len(rank), np.nan)
     for rows in in_order:

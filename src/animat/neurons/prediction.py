@@ -1,4 +1,4 @@
-"""What a simulator made from the first half of a recording says of each response in the second, and how well."""
+"""Predictions of each response in the second half of a recording by simulators of the first half, and their scores."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, Neu
 from animat.responses.responses import Responses
 
 FEWEST = 20
-"""Non-burst responses of each condition in each half, at least: of fewer there is no distribution to speak of."""
+"""Non-burst responses of each condition needed in each half: fewer do not make a distribution."""
 CLASSES = 10
-"""That the percentiles P10 to P90 make: the commands of nine thresholds."""
+"""Between the percentiles P10 to P90: the commands of nine thresholds."""
 
 
 class Halves(NamedTuple):
@@ -29,9 +29,9 @@ class Halves(NamedTuple):
         first: those to fit to.
         rows: the non-burst responses of the second part, by their row in `whole`, shape (held,).
         condition: of these, shape (held,).
-        x_hz: of these, in the precision that thresholds are compared in, shape (held,).
-        values_hz: all responses that the recording has, of any condition and half, each once, rising.
-        readout: whose responses these are, of several; None: of the only one.
+        x_hz: of these, in the precision in which thresholds are compared, shape (held,).
+        values_hz: all distinct values of responses in the recording, of any condition and half, rising.
+        readout: the readout of these responses; None: the only one.
     """
 
     whole: Responses
@@ -43,7 +43,7 @@ class Halves(NamedTuple):
     readout: int | None = None
 
     def read(self, every: Float[np.ndarray, "*some"]) -> Float[np.ndarray, "*others"]:
-        """What is the readout's, of an array that has readouts last where there are several."""
+        """The readout's part of an array whose last axis, with several readouts, is that of readouts."""
         return every if self.readout is None else every[..., self.readout]
 
     def first_of(self, condition: int) -> Float64[np.ndarray, " fitted"]:
@@ -52,14 +52,14 @@ class Halves(NamedTuple):
 
 
 def halved(responses: Responses, readout: int | None = None) -> Halves:
-    """Part a recording's responses in the middle: by time, or each condition's where they were presented in blocks.
+    """Split a recording's responses in the middle: by time, or within each condition if presented in blocks.
 
     Args:
         responses: of one recording.
         readout: which of several is to be predicted.
 
     Raises:
-        UnusableData: for one condition, or a half with fewer than `FEWEST` non-burst responses to one.
+        UnusableData: for a single condition, or a half with fewer than `FEWEST` non-burst responses to a condition.
     """
     labels = [condition.label for condition in responses.conditions]
     if len(labels) < 2:
@@ -92,7 +92,7 @@ class Prediction(NamedTuple):
 
     Attributes:
         probability: of each value, shape (held, values).
-        n: how many responses each is made of, shape (held,).
+        n: the number of responses that each is made from, shape (held,).
     """
 
     probability: Float64[np.ndarray, "held values"]
@@ -105,17 +105,17 @@ class Prediction(NamedTuple):
 
 
 def predict_marginal(halves: Halves) -> Prediction:
-    """The first half's non-burst responses of all conditions together: what is known without any condition."""
+    """Predict by the first half's non-burst responses of all conditions together, ignoring the condition."""
     x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
     share = _shares(x_hz, halves.values_hz)
     return Prediction(np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
 
 
 def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
-    """What a simulator of the first half says of each held-out response.
+    """Predict each held-out response by a simulator of the first half.
 
-    Given are its condition and, where the simulator remembers, all that was recorded before it. A histogram's draw
-    counts as the largest value of the recording that is not above it, so that thresholds read it as they would.
+    The condition is known and, if the simulator has a memory, everything recorded before. A histogram's draw counts as
+    the largest value of the recording that is not above it, so that thresholds give the same commands.
     """
     values_hz = halves.values_hz
     if isinstance(simulator, MemorySimulator):
@@ -130,7 +130,7 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
         cumulatives, edges_hz = np.asarray(simulator.cumulative)[own], np.asarray(simulator.edges_hz)[own]
         of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
     else:
-        raise TypeError(f"simulator: expected a histogram, an empirical or a memory one, got {type(simulator)}")
+        raise TypeError(f"simulator: expected a histogram, empirical or memory simulator, got {type(simulator)}")
     return Prediction(np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
 
 
@@ -181,7 +181,7 @@ def crps(prediction: Prediction, halves: Halves) -> Float64[np.ndarray, " held"]
 
 
 def transformed(prediction: Prediction, halves: Halves) -> Float64[np.ndarray, "held 2"]:
-    """The probability integral transform of each held-out response, F(x-) and F(x): from below x, and with it."""
+    """The probability integral transform of each held-out response, F(x-) and F(x): below x, and up to it."""
     at = np.searchsorted(halves.values_hz, halves.x_hz)[:, None]
     mass = np.take_along_axis(prediction.probability, at, 1)
     up_to = np.take_along_axis(prediction.at_most, at, 1)
@@ -193,7 +193,7 @@ def share_below(
 ) -> Float64[np.ndarray, " places"]:
     """The mean distribution function of the transforms, each spread evenly from F(x-) to F(x).
 
-    It is the diagonal where the predictions are calibrated, whether or not responses are tied.
+    It is the diagonal if the predictions are calibrated, whether or not responses are tied.
 
     Source: the non-randomised transform of Czado, Gneiting and Held 2009, doi:10.1111/j.1541-0420.2009.01191.x.
     """
@@ -208,13 +208,13 @@ def command_probabilities(
     halves: Halves,
     thresholds_hz: Float[np.ndarray, " thresholds"],
 ) -> Float64[np.ndarray, "held classes"]:
-    """The probability of each command through nine thresholds, for each held-out response.
+    """The probability of each command with nine thresholds, for each held-out response.
 
-    What was never drawn is not impossible. To the n responses that a prediction is made of, ten, one a class, are added
-    as a coarser prediction has them: p = (n p_n + 10 prior) / (n + 10).
+    A command that was never drawn is not impossible. Ten responses, distributed as in a coarser prediction, are added
+    to the n that a prediction is made from: p = (n p_n + 10 prior) / (n + 10).
 
     Args:
-        prior: the coarser one's probabilities; a number for all.
+        prior: the probabilities of the coarser prediction; a number for all.
         thresholds_hz: P10, P20, ..., P90 of the first half.
     """
     of_value = np.searchsorted(thresholds_hz, halves.values_hz, side="right")
@@ -225,6 +225,6 @@ def command_probabilities(
 def log_likelihood_bits(
     probability: Float64[np.ndarray, "held classes"], halves: Halves, thresholds_hz: Float[np.ndarray, " thresholds"]
 ) -> Float64[np.ndarray, " held"]:
-    """The logarithm to base 2 of the probability that each held-out response's command had."""
+    """The logarithm to base 2 of the predicted probability of each held-out response's command."""
     observed = np.searchsorted(thresholds_hz, halves.x_hz, side="right")[:, None]
     return np.asarray(np.log2(np.take_along_axis(probability, observed, 1)[:, 0]))

@@ -1,4 +1,4 @@
-"""The neuron simulator: per condition a distribution of responses, drawn from instead of asking the culture."""
+"""The neuron simulator: a distribution of responses per condition, to draw from in place of the culture."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
 from animat.errors import InvalidArgument, UnusableData
-from animat.neurons.history import AT_FIRST
+from animat.neurons.history import INITIAL_HISTORY
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
 Stored: TypeAlias = Array | np.ndarray[Any, Any]
-"""Arrays of a simulator: JAX's, or numpy's while it is on its way to another process."""
+"""Arrays of a simulator: JAX's, or numpy's while it travels to another process."""
 
 LARGEST_BINS = 10_000
-"""Of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
+"""Most bins of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
 
 PERCENTILES = tuple(range(0, 101, 10))
-"""Which percentiles of the pooled non-burst responses a simulator carries: P0 (smallest), P10, ..., P100 (largest)."""
+"""The percentiles of the pooled non-burst responses that a simulator carries: P0 (smallest), P10, ..., P100 (largest).
+"""
 
 
 class Answer(NamedTuple):
-    """A response, and what is remembered after it.
+    """A response, and the history state after it.
 
     Attributes:
-        rate_hz: x, Hz per channel; of several readouts one each, shape (readouts,).
-        history: the history state, trace and load (`animat.neurons.history`), as `animat.neurons.memory` makes it.
+        rate_hz: x, Hz per channel; with several readouts one each, shape (readouts,).
+        history: the history state, trace and load (`animat.neurons.history`), as `animat.neurons.memory` updates it.
     """
 
     rate_hz: Float[Array, "*readouts"]
@@ -41,14 +42,14 @@ class Answer(NamedTuple):
 
 
 class NeuronSimulator(abc.ABC):
-    """What a culture answers to each condition, as a pytree of arrays; so a refresh changes data, never code.
+    """A culture's responses to each condition, as a pytree of arrays, so that a refresh changes data, never code.
 
-    Where several readouts are read, one draw answers for all of them.
+    With several readouts, one draw answers for all of them.
 
     Attributes:
-        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,); of
-            several readouts shape (readouts, 11).
-        has_memory: whether what it answers depends on what was before.
+        percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, shape (11,), or
+            (readouts, 11) with several readouts.
+        has_memory: whether its answers depend on the history.
     """
 
     percentiles: Float[Stored, "*any percentiles"]
@@ -57,36 +58,36 @@ class NeuronSimulator(abc.ABC):
     @property
     @abc.abstractmethod
     def n_conditions(self) -> int:
-        """How many conditions it answers to."""
+        """The number of conditions."""
 
     @property
     def n_readouts(self) -> int:
-        """For how many readouts it answers at once."""
+        """The number of readouts that it answers for together."""
         return 1 if self.percentiles.ndim == 1 else int(self.percentiles.shape[0])
 
     @abc.abstractmethod
     def quantile(self, condition: Int[Array, ""], uniform: Float[Array, ""]) -> Float[Array, "*readouts"]:
         """The response x, in Hz per channel, below which the share `uniform` (in [0, 1)) of a condition's lies.
 
-        Of several readouts, which have no order, any function of a uniform that has their joint law.
+        With several readouts, which have no order, any function of a uniform that has their joint distribution.
         """
 
     def answer(self, condition: Int[Array, ""], uniform: Float[Array, ""], history: Float[Array, "2"]) -> Answer:
-        """What is answered to a condition, by a uniform in [0, 1), after a history state (see `Answer`).
+        """The answer to a condition, from a uniform in [0, 1), after a history state (see `Answer`).
 
-        A simulator without memory answers the same whatever was before, and leaves the history as it is.
+        A simulator without memory answers the same after any history, and leaves the history unchanged.
         """
         return Answer(self.quantile(condition, uniform), history)
 
     def evenly_drawn(self, n: int) -> Float[Array, "conditions n *readouts"]:
-        """The responses to each condition at n evenly spaced quantiles, whatever was before."""
+        """The responses to each condition at n evenly spaced quantiles, ignoring the history."""
         uniforms = (jnp.arange(n, dtype=jnp.float32) + 0.5) / n
         quantile = jax.vmap(jax.vmap(self.quantile, (None, 0)), (0, None))
         return quantile(jnp.arange(self.n_conditions), uniforms)
 
     @final
     def sample(
-        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = AT_FIRST
+        self, key: PRNGKeyArray, condition: Int[Array, ""], history: ArrayLike | tuple[float, float] = INITIAL_HISTORY
     ) -> Float[Array, "*readouts"]:
         """Draw one response x to a condition, in Hz per channel, after a history state (see `Answer`)."""
         return self.answer(condition, jax.random.uniform(key), jnp.asarray(history, jnp.float32)).rate_hz
@@ -123,7 +124,7 @@ def quantile_of(
     cumulative: Float[Stored, " edges"], edges_hz: Float[Stored, " edges"], uniform: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The quantile of one histogram (see `HistogramSimulator`)."""
-    # Twenty comparisons beat a binary search, and an empty bin is never chosen: its two edges share a value.
+    # Twenty comparisons beat a binary search, and an empty bin is never chosen, as its two edges share a value.
     bin_ = jnp.sum(uniform >= cumulative[1:-1])
     low, high = cumulative[bin_], cumulative[bin_ + 1]
     within = (uniform - low) / (high - low)
@@ -135,13 +136,13 @@ def quantile_of(
 class EmpiricalSimulator(NeuronSimulator):
     """The measured responses themselves: one of a condition's values is drawn, so nothing is lost to binning.
 
-    x(q) = v_(floor(q n)), v the n sorted values of the condition. Of several readouts a value is a whole trial, and
+    x(q) = v_(floor(q n)), v the n sorted values of the condition. With several readouts a value is a whole trial, and
     trials are sorted by the response of all channels together.
 
     Attributes:
-        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses); of several
-            readouts (conditions, most responses, readouts).
-        counts: how many of them there are, shape (conditions,).
+        values_hz: each condition's responses, sorted, padded at the end, shape (conditions, most responses), or
+            (conditions, most responses, readouts) with several readouts.
+        counts: the number of responses, shape (conditions,).
     """
 
     __repr__ = briefly
@@ -162,10 +163,10 @@ class EmpiricalSimulator(NeuronSimulator):
 
 
 def check_binning(bins: int, range_hz: float | None) -> None:
-    """Raise unless a histogram can have such bins, before there is anything to fit it to.
+    """Check the bins of a histogram before there is anything to fit it to.
 
     Raises:
-        InvalidArgument: for fewer bins than one or more than `LARGEST_BINS`, or a range that is not positive.
+        InvalidArgument: for fewer than one or more than `LARGEST_BINS` bins, or a range that is not positive.
     """
     if not 1 <= bins <= LARGEST_BINS:
         raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS:,}, got {bins}; only histogram simulators have bins")
@@ -176,16 +177,16 @@ def check_binning(bins: int, range_hz: float | None) -> None:
 def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
     """Fit a histogram per condition to the non-burst responses.
 
-    The paper's bins are equally wide, over a range that was chosen for its culture. On another one a bin can hold
-    several percentiles, and the differences between conditions that the mapping listens to are lost; responses that
-    fall over the hours lose them later on. So by default the edges are percentiles of the responses themselves: with
-    20 bins P0, P5, ..., P100 of all conditions together, and what lies on either side of P10, P20, ..., P90 is kept.
+    The paper's bins are equally wide, over a range chosen for its culture. For another culture a bin can hold several
+    percentiles, and the differences between conditions that the mapping uses are lost; if responses fall over hours,
+    they are lost later. So by default the edges are percentiles of the responses: with 20 bins P0, P5, ..., P100 of all
+    conditions together, which keeps the shares on either side of P10, P20, ..., P90.
 
     Args:
         responses: of one recording, every condition with at least one non-burst response.
-        bins: how many (the paper: 20); a multiple of ten keeps all shares that thresholds ask for.
-        range_hz: equally wide bins from 0 to here instead (the paper: 120). Responses above it count into the last
-            bin, and `fidelity` says how many they are.
+        bins: how many (the paper: 20); a multiple of ten keeps all shares that thresholds use.
+        range_hz: equally wide bins from 0 to here instead (the paper: 120). Responses above it are counted in the last
+            bin, and `fidelity` reports their number.
 
     Raises:
         InvalidArgument: as `check_binning` does.
@@ -196,14 +197,14 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
         edges = np.percentile(_non_burst(responses), np.linspace(0.0, 100.0, bins + 1))
     else:
         edges = np.linspace(0.0, range_hz, bins + 1)
-    # Counted in the precision that thresholds are compared in: a response that is a percentile lies above its edge.
+    # Counted in the precision in which thresholds are compared: a response that equals a percentile is above its edge.
     edges = edges.astype(np.float32)
     values = [np.minimum(x.astype(np.float32), edges[-1]) for x in _by_condition(responses)]
     counts = np.array([np.histogram(x, edges)[0] for x in values])
-    # Whole counts are added up before dividing, so that the last share is exactly 1 and no empty bin is ever drawn.
+    # Counts are added up before dividing, so that the last share is exactly 1 and no empty bin is ever drawn.
     below = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
     cumulative = below / below[:, -1:]
-    return HistogramSimulator(placed(cumulative), placed(edges), pooled_percentiles(responses))
+    return HistogramSimulator(to_jax(cumulative), to_jax(edges), pooled_percentiles(responses))
 
 
 def fit_empirical(responses: Responses, *, room: int | None = None) -> EmpiricalSimulator:
@@ -211,8 +212,8 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
 
     Args:
         responses: of one recording, every condition with at least one non-burst response.
-        room: how many values a condition has room for, so that simulators of several recordings stack; None: as many
-            as the largest condition needs.
+        room: the number of values that each condition has room for, so that simulators of several recordings stack;
+            None: as many as the largest condition needs.
 
     Raises:
         UnusableData: if a condition has no non-burst response.
@@ -223,39 +224,39 @@ def fit_empirical(responses: Responses, *, room: int | None = None) -> Empirical
     room = int(counts.max()) if room is None else room
     if counts.max() > room:
         raise InvalidArgument(f"room: expected at least {counts.max()}, the largest condition's responses, got {room}")
-    # Padded with the last one over and over.
+    # Padded by repeating the last value.
     table = np.stack([np.concatenate([x, np.repeat(x[-1:], room - len(x), axis=0)]) for x in values])
-    return EmpiricalSimulator(placed(table), placed(counts, np.int32), pooled_percentiles(responses))
+    return EmpiricalSimulator(to_jax(table), to_jax(counts, np.int32), pooled_percentiles(responses))
 
 
 def silenced(simulator: NeuronSimulator) -> EmpiricalSimulator:
-    """A culture that always answers 0, beside the percentiles of the one that did not: the silent control."""
+    """A culture that always answers 0, with the percentiles of the original: the silent control."""
     conditions, readouts = simulator.n_conditions, simulator.percentiles.shape[:-1]
     zeros, counts = np.zeros((conditions, 1, *readouts)), np.ones(conditions)
-    return EmpiricalSimulator(placed(zeros), placed(counts, np.int32), simulator.percentiles)
+    return EmpiricalSimulator(to_jax(zeros), to_jax(counts, np.int32), simulator.percentiles)
 
 
 def indifferent(simulator: NeuronSimulator) -> EmpiricalSimulator:
-    """A culture that answers every condition as this one answers all of them together: random spikes, of its rates.
+    """A culture that answers every condition with the pooled responses to all: random spikes at the same rates.
 
-    Responses at 512 evenly spaced quantiles stand for each condition, whatever was before.
+    Responses at 512 evenly spaced quantiles represent each condition, ignoring the history.
     """
     each, n = simulator.evenly_drawn(512), simulator.n_conditions
     pooled = each.reshape(-1, *each.shape[2:])
     pooled = pooled[jnp.argsort(pooled if pooled.ndim == 1 else pooled.mean(axis=1))]
     values = jnp.broadcast_to(pooled, (n, *pooled.shape))
-    return EmpiricalSimulator(values, placed(np.full(n, len(pooled)), np.int32), simulator.percentiles)
+    return EmpiricalSimulator(values, to_jax(np.full(n, len(pooled)), np.int32), simulator.percentiles)
 
 
 def pooled_percentiles(responses: Responses) -> Float[Array, "*readouts percentiles"]:
     """P0, P10, ..., P100 of the non-burst responses of all conditions together, interpolated linearly, in Hz."""
-    return placed(np.percentile(_non_burst(responses), PERCENTILES, axis=0).T)
+    return to_jax(np.percentile(_non_burst(responses), PERCENTILES, axis=0).T)
 
 
-def placed(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
-    """Numbers of the host as JAX has them, made of this kind (None: as they are) before they get there.
+def to_jax(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
+    """A JAX array of the host's numbers, converted to a type (None: unchanged) by numpy.
 
-    JAX would compile a program for each shape, also where it is not told the kind and nothing changes.
+    JAX would compile a program for each shape, even if no type is given and nothing changes.
     """
     with np.errstate(over="ignore"):
         array = np.asarray(values, kind)
@@ -263,8 +264,8 @@ def placed(values: Any, kind: type[np.generic] | None = np.float32) -> Array:
 
 
 def stacked(leaves: Sequence[Any]) -> Array:
-    """`jnp.stack` of arrays that are ready, which are put together on the host: nothing is compiled."""
-    return placed(np.stack(leaves), None)
+    """`jnp.stack` of computed arrays, but stacked on the host, so that nothing is compiled."""
+    return to_jax(np.stack(leaves), None)
 
 
 def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts"]:
@@ -277,7 +278,7 @@ def _non_burst(responses: Responses) -> Float64[np.ndarray, "responses *readouts
 def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *readouts"]]:
     """The non-burst responses of each condition, sorted by those of all channels together."""
     if not responses.conditions:
-        raise UnusableData("conditions: expected one or more to fit, got none; choose what the stimuli belong to")
+        raise UnusableData("conditions: expected one or more to fit, got none; choose the conditions of the stimuli")
     order = np.argsort(responses.read_hz if responses.read_hz.ndim == 1 else responses.rate_hz, kind="stable")
     kept = order[~responses.is_burst[order]]
     values = [responses.read_hz[kept[responses.condition[kept] == c]] for c in range(len(responses.conditions))]

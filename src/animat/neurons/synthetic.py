@@ -1,4 +1,4 @@
-"""A simulator of synthetic responses with known truth, for a first try and for tests without any recording."""
+"""A simulator of synthetic responses with a known distribution, for first trials and for tests without recordings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from animat.errors import InvalidArgument
-from animat.neurons.simulator import PERCENTILES, HistogramSimulator, placed
+from animat.neurons.simulator import PERCENTILES, HistogramSimulator, to_jax
 
 MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 """Mean responses to the five conditions, in the order of 5, 10, 20, 40 and 80 Hz."""
@@ -22,7 +22,7 @@ def synthetic_simulator(
     range_hz: float = 120.0,
     n_responses: int = 500,
 ) -> HistogramSimulator:
-    """The histogram simulator of gamma-distributed responses, in closed form: nothing is drawn, nothing is fitted.
+    """The histogram simulator of gamma-distributed responses, in closed form: nothing is drawn or fitted.
 
         x | condition c  ~  Gamma(shape, means_hz[c] / shape)
 
@@ -30,10 +30,10 @@ def synthetic_simulator(
 
     Args:
         means_hz: mean response to each condition, Hz per channel.
-        shape: of all the gamma distributions; the larger, the narrower.
-        bins, range_hz: of the histogram, from 0; what lies above the range counts into the last bin.
+        shape: of all gamma distributions; the larger, the narrower.
+        bins, range_hz: of the histogram, from 0; responses above the range are counted in the last bin.
         n_responses: of a recording, all conditions together (the paper: 500). The percentiles P0 and P100, which for
-            a distribution would be 0 and infinity, are where the ends of so many responses lie: the quantiles
+            the distribution would be 0 and infinity, are those of the extremes of this many responses: the quantiles
             1/(n + 1) and n/(n + 1).
 
     Raises:
@@ -44,7 +44,7 @@ def synthetic_simulator(
 
     means = np.asarray(means_hz, np.float64)
     if means.ndim != 1 or not len(means) or not np.all(np.isfinite(means) & (means > 0)):
-        raise InvalidArgument(f"means_hz: expected one positive mean in Hz a condition, got {means_hz!r}")
+        raise InvalidArgument(f"means_hz: expected a positive mean in Hz per condition, got {means_hz!r}")
     for name, value in {"shape": shape, "bins": bins, "range_hz": range_hz, "n_responses": n_responses}.items():
         if not (np.isfinite(value) and value > 0):
             raise InvalidArgument(f"{name}: expected a positive number, got {value!r}")
@@ -58,4 +58,4 @@ def synthetic_simulator(
 
     shares = np.clip(np.array(PERCENTILES) / 100, 1 / (n_responses + 1), n_responses / (n_responses + 1))
     percentiles_hz = [brentq(pooled, 0.0, 100 * float(means.max()), (share,)) for share in shares]
-    return HistogramSimulator(*(placed(each) for each in (cumulative, edges_hz, percentiles_hz)))
+    return HistogramSimulator(*(to_jax(each) for each in (cumulative, edges_hz, percentiles_hz)))

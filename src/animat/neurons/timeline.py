@@ -1,4 +1,4 @@
-"""A culture's simulators over its recordings: what parameter shadowing refreshes from."""
+"""A culture's simulators over its recordings, from which parameter shadowing refreshes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from animat.errors import InvalidArgument, Mismatch, expect_several, in_min
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.simulator import NeuronSimulator, placed, stacked
+from animat.neurons.simulator import NeuronSimulator, stacked, to_jax
 from animat.recordings.findings import Finding
-from animat.responses.condition import Condition, other_stimulus
+from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
@@ -24,30 +24,30 @@ from animat.tables import briefly
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",
     "warning",
-    "in recordings presented in blocks a condition follows on itself only: the simulator does not know what a culture "
-    "answers after another one; record with --order mixed",
+    "in recordings presented in blocks each condition follows only itself: the simulator does not know how a culture "
+    "responds after a different one; record with --order mixed",
 )
 
 
 ALONE_MIN = 10.0
-"""For which the simulator of a single recording holds: the paper's interval."""
+"""How long the simulator of a single recording holds: the paper's interval."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatorTimeline:
-    """Simulators of one culture, one a recording, stacked, with the minutes they were recorded at.
+    """Simulators of one culture, one per recording, stacked, with the times of the recordings.
 
     Attributes:
         simulators: one pytree whose arrays have a leading axis of recordings.
         start_min: minutes on the culture's clock, rising, shape (recordings,).
-        conditions: what the agent picks from, the same in every recording.
-        presentation: how stimuli were presented, None where it is not known.
-        fidelities: what each simulator keeps of its responses.
-        fitted: how the simulators were made of responses, for whoever comes later: `kind`, `bins`, `range_hz`; `by`,
-            the rule of the conditions; `burst_threshold`, where one was given; and `burst_thresholds`, the share of
-            active channels above which a response was left out of each.
-        findings: what was noticed in the recordings and in the fits, with the minute in front.
-        responses: that the simulators were made of; none where they come from elsewhere.
+        conditions: from which the agent picks, the same in every recording.
+        presentation: how stimuli were presented; None if it is not known.
+        fidelities: how faithful each simulator is to its responses.
+        fitted: how the simulators were fitted, for later use: `kind`, `bins`, `range_hz`; `by`, the rule of the
+            conditions; `burst_threshold`, if one was given; and `burst_thresholds`, the share of active channels above
+            which a response of each recording was left out.
+        findings: on the recordings and the fits, each beginning with the minute.
+        responses: to which the simulators were fitted; empty if they come from elsewhere.
         readouts: that they answer for, the same in every recording.
     """
 
@@ -74,18 +74,18 @@ class SimulatorTimeline:
         return float(self.start_min[-1] - self.start_min[0] + (np.median(gaps_min) if len(gaps_min) else ALONE_MIN))
 
     def findings_at(self, start_min: float) -> tuple[Finding, ...]:
-        """What was noticed in the recording that started at a minute, and in its simulator."""
+        """The findings on the recording that started at a minute, and on its simulator."""
         return tuple(finding for finding in self.findings if finding.at_min == start_min)
 
     def row_at(self, minute: float) -> int:
         """The newest recording at a minute: the last one that started at or before it (before all: the first)."""
         return max(0, int(np.searchsorted(self.start_min, minute, side="right")) - 1)
 
-    def row_asked_for(self, minute: float) -> int:
-        """The same for a minute that a user named, who is told where no recording is as old as that.
+    def requested_row(self, minute: float) -> int:
+        """The same for a minute that a user gave.
 
         Raises:
-            InvalidArgument: for a minute before the first recording, or none.
+            InvalidArgument: for a minute before the first recording, or NaN.
         """
         if not minute >= self.start_min[0]:
             raise InvalidArgument(
@@ -97,26 +97,26 @@ class SimulatorTimeline:
     def at(self, minute: float) -> NeuronSimulator:
         """The simulator in use at a minute of the culture's clock."""
         row = self.row_at(minute)
-        # Taken out on the host: JAX would compile programs for each shape.
-        return jax.tree.map(lambda each: placed(np.asarray(each)[row], None), self.simulators)  # type: ignore[no-any-return]
+        # Extracted on the host: JAX would compile a program for each shape.
+        return jax.tree.map(lambda each: to_jax(np.asarray(each)[row], None), self.simulators)  # type: ignore[no-any-return]
 
     def with_first_percentiles(self) -> SimulatorTimeline:
-        """The same simulators with the first recording's percentiles fixed, for mappings that do not move along."""
+        """The same simulators with the first recording's percentiles, for mappings with fixed thresholds."""
         percentiles = np.asarray(self.simulators.percentiles)
-        held = placed(np.broadcast_to(percentiles[:1], percentiles.shape), None)
+        held = to_jax(np.broadcast_to(percentiles[:1], percentiles.shape), None)
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
 
 
 def room_for(series: Sequence[Responses]) -> int:
-    """How many non-burst responses the condition with the most of them has in any of the recordings.
+    """The largest number of non-burst responses to a condition in any recording.
 
-    With room for so many, simulators of all of them have one shape.
+    With this much room, the simulators of all recordings have the same shape.
     """
     return max(int(np.bincount(each.condition[~each.is_burst], minlength=1).max()) for each in series)
 
 
-def usual_kind(responses: Responses) -> Kind:
-    """The kind that suits a recording: one with memory, where it was presented so that it shows any."""
+def default_kind(responses: Responses) -> Kind:
+    """The kind that suits a recording: one with memory, unless stimuli in blocks hide the memory."""
     return "histogram" if responses.is_blocked else "memory"
 
 
@@ -127,9 +127,9 @@ def fit_timeline(
 
     Args:
         series: responses of the recordings, all with the same conditions, window and presentation, in any order.
-        kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one that was measured
-            after a similar history); None: `"memory"`, but `"histogram"` where stimuli were presented in
-            blocks, which hold nothing of what a culture answers after another condition.
+        kind: `"histogram"` (the paper), `"empirical"` (draw a measured value) or `"memory"` (draw one measured after a
+            similar history); None: `"memory"`, but `"histogram"` if stimuli were presented in blocks, which do not show
+            how a culture responds after a different condition.
         bins: of a histogram.
         range_hz: upper end of a histogram's equally wide bins, Hz, the same for all; None: each recording's own
             percentiles are the edges (`fit_histogram`).
@@ -139,12 +139,12 @@ def fit_timeline(
         Mismatch: if the recordings differ in conditions, window, presentation or readouts, or two share a minute.
         UnusableData: if a condition of a recording has no non-burst response.
     """
-    series = expect_several("series", series, Responses, "a list of responses, as animat.extract_series makes")
+    series = expect_several("series", series, Responses, "a list of responses, as animat.extract_series returns")
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
-    kind = kind or usual_kind(first)
+    kind = kind or default_kind(first)
     for other in ordered[1:]:
         for name in ("conditions", "window_ms", "presentation", "readouts"):
             if getattr(other, name) != getattr(first, name):
@@ -152,12 +152,12 @@ def fit_timeline(
                     f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
                     f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
                 )
-        if others := other_stimulus(first.conditions, other.conditions):
+        if others := stimulus_mismatch(first.conditions, other.conditions):
             raise Mismatch(f"conditions: {others} at {in_min(other.start_min)}")
     start_min = np.array([responses.start_min for responses in ordered], dtype=np.float64)
     if np.any(np.diff(start_min) == 0):
         twice = start_min[:-1][np.diff(start_min) == 0][0]
-        raise Mismatch(f"start_min: expected one recording a minute mark, got two at {in_min(twice)}")
+        raise Mismatch(f"start_min: expected recordings at different minutes, got two at {in_min(twice)}")
 
     room = room_for(ordered)
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]

@@ -25,17 +25,17 @@ from animat.neurons.prediction import (
     transformed,
 )
 from animat.neurons.simulator import pooled_percentiles
-from animat.neurons.timeline import usual_kind
+from animat.neurons.timeline import default_kind
 from animat.responses.responses import Responses
 from animat.tables import briefly
 
 MARGINAL = "marginal"
-"""The name of the baseline: all conditions' responses in one distribution."""
+"""The name of the baseline: the responses to all conditions in one distribution."""
 SMALL_DISTANCE, LARGE_DISTANCE = 0.1, 0.2
-"""Of the transforms from uniform: through a threshold, a mean command is off by twice as much at most. Of virtual
-cultures 1 to 5, whose measured returns lie in the intervals of their predictions, the largest is 0.08."""
+"""Of the transforms from uniform: with a threshold, a mean command is off by at most twice as much. On virtual cultures
+1 to 5, whose measured returns lie in the intervals of their predictions, the largest is 0.08."""
 LARGE_DIFFERENCE = 0.15
-"""Between the recorded correlation of successive responses and the simulator's: of these cultures 0.07 at most with
+"""Between the recorded correlation of successive responses and the simulator's: on these cultures at most 0.07 with
 memory, and 0.30 to 0.41 without."""
 CERTAIN = 2.0
 """Standard errors by which one prediction must be better than another."""
@@ -46,7 +46,7 @@ _CHANCES = 500
 
 
 class Band(NamedTuple):
-    """What free runs of a simulator have: the middle 95 % of the runs, and their mean."""
+    """The middle 95 % of a simulator's free runs, and their mean."""
 
     low: Any
     mean: Any
@@ -54,7 +54,7 @@ class Band(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """By how much one kind predicts better than another, per trial, with the standard error."""
+    """How much better one kind predicts than another, per trial, with the standard error."""
 
     value: float
     error: float
@@ -67,18 +67,18 @@ class Gain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How one kind of simulator does on the held-out half.
+    """The scores of one kind of simulator on the held-out half.
 
     Attributes:
-        kind: which; `MARGINAL` for none.
-        bits: log-likelihood of each held-out command through nine thresholds, shape (held,).
+        kind: its name; `MARGINAL` for the baseline.
+        bits: log-likelihood of each held-out command with nine thresholds, shape (held,).
         crps_hz: continuous ranked probability score of each, shape (held,).
         transforms: the probability integral transform of each, from F(x-) to F(x), shape (held, 2).
-        distance: Kolmogorov's, of the transforms from uniform.
-        p_value: how often chance alone makes it so large; None of a kind that does not predict from all responses to a
-            condition alike, to which it is not comparable.
+        distance: Kolmogorov's distance of the transforms from uniform.
+        p_value: the probability of such a distance by chance; None for kinds that do not predict equally from all
+            responses to a condition, for which it does not hold.
         autocorrelation: of the free runs, at lags 1 to `LAGS`.
-        run_length: the mean length of the free runs' runs at or above P50 of the first half.
+        run_length: the mean length, in the free runs, of runs at or above P50 of the first half.
         lasting: the share of these that last 1 to `LAGS` trials or more.
         above: P(x >= P50) predicted for the held-out trials of each condition, shape (conditions,).
     """
@@ -102,15 +102,15 @@ class Validation:
     """All kinds of simulators on one recording: fitted to its first half, scored on its second.
 
     Attributes:
-        n_fitted, n_held: non-burst responses to each in the first and in the second half, shape (conditions,).
+        n_fitted, n_held: non-burst responses to each condition in the first and the second half, shape (conditions,).
         medians_hz: of these, shape (2, conditions).
         above: P(x >= P50) of the held-out responses to each, P50 that of the first half, shape (conditions,).
         autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50,
             as the thresholds of a loop adapt.
         scores: of the marginal distribution and of each kind.
-        kind: the one that the verdict is on.
+        kind: the kind that the verdict is about.
         is_blocked: whether conditions were presented in blocks.
-        pit_band: the middle 95 % of the share of transforms in one of `PIT_BINS` bins, of chance alone.
+        pit_band: the middle 95 % of the share of transforms in one of `PIT_BINS` bins, by chance alone.
     """
 
     __repr__ = briefly
@@ -135,7 +135,7 @@ class Validation:
     def gain(self, kind: str, over: str, score: Literal["bits", "crps_hz"] = "bits") -> Gain:
         """How much better a kind is than another, in bits or Hz.
 
-        The standard error is that of the means of `_STRETCHES` stretches in time, as neighbours may hang together.
+        The standard error is from the means of `_STRETCHES` stretches in time, as neighbours may be correlated.
         """
         sign = 1 if score == "bits" else -1
         each = sign * (getattr(self.of(kind), score) - getattr(self.of(over), score))
@@ -143,7 +143,7 @@ class Validation:
         return Gain(float(each.mean()), float(means.std(ddof=1) / np.sqrt(len(means))))
 
     def to_dict(self) -> dict[str, Any]:
-        """All numbers as JSON data, without those of single trials."""
+        """All numbers as JSON data, except those of single trials."""
         kinds = {
             scores.kind: {
                 "bits": float(scores.bits.mean()),
@@ -179,7 +179,7 @@ class Validation:
     def drift(self) -> float:
         """The relative change of the median from the first half to the second, conditions weighted by their trials.
 
-        NaN where a median is 0.
+        NaN if a median is 0.
         """
         if not np.all(self.medians_hz > 0):
             return float("nan")
@@ -188,7 +188,7 @@ class Validation:
 
     @property
     def verdict(self) -> str:
-        """Whether a policy that is trained on the simulator can be trusted, in a sentence, with what decides."""
+        """Whether a policy trained on the simulator can be trusted, in a sentence with the reason."""
         scores = self.of(self.kind)
         conditions = self.gain("empirical", MARGINAL)
         distance, lag = scores.distance, self.autocorrelation[0] - scores.autocorrelation.mean[0]
@@ -198,22 +198,22 @@ class Validation:
         off += drifted if abs(self.drift) > SMALL_DISTANCE / 2 else ""
         if self.is_blocked:
             return (
-                "Cannot be trusted: conditions were presented in blocks, and a loop mixes them, which this recording "
-                "says nothing of; record with --order mixed"
+                "Cannot be trusted: conditions were presented in blocks, but a loop mixes them, and this recording "
+                "does not show what happens then; record with --order mixed"
             )
-        # Where nearly all responses are in one class, what is added for classes without any looks like bits.
+        # If nearly all responses are in one class, what is added for empty classes looks like information.
         for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
             if not gain.is_certain:
                 return (
                     f"Cannot be trusted: knowing the condition is worth {gain.value:.3f} ± {gain.error:.3f} {unit} "
-                    "a trial, which is not clearly above 0, so there is next to nothing to steer with"
+                    "per trial, which is not clearly above 0, so there is next to nothing to steer with"
                 )
         if distance > LARGE_DISTANCE:
             return f"Cannot be trusted: {off} (at most {LARGE_DISTANCE:g} with care)"
         if distance > SMALL_DISTANCE:
             return f"With care: {off} (at most {SMALL_DISTANCE:g} to be trusted)"
         if lag != lag:
-            return "With care: successive responses cannot be compared, as no two neighbours are both no bursts"
+            return "With care: successive responses cannot be compared, as no two neighbours are both non-burst"
         if abs(lag) > LARGE_DIFFERENCE:
             return (
                 f"With care: successive responses correlate by {self.autocorrelation[0]:.2f}, the simulator's by "
@@ -232,17 +232,17 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
 
     Args:
         responses: of one recording.
-        kind: that the verdict is on; None: the one that a training would take.
-        seed: decides the free runs, and what chance alone makes.
+        kind: that the verdict is about; None: the one that training would use.
+        seed: of the free runs and the chance levels.
         readout: which of several readouts is scored; simulators answer for all of them.
 
     Raises:
         UnusableData: as `halved` does.
-        InvalidArgument: for a kind or a readout that there is not.
+        InvalidArgument: for a kind or a readout that does not exist.
     """
     n = len(responses.readouts)
     if (readout is None) != (n == 1) or not 0 <= (readout or 0) < n:
-        raise InvalidArgument(f"readout: expected which of {n} readouts, None of one, got {readout}")
+        raise InvalidArgument(f"readout: expected one of {n} readouts, or None if there is only one, got {readout}")
     rng, halves = np.random.default_rng(seed), halved(responses, readout)
     kinds: tuple[str, ...] = get_args(Kind)
     if kind is not None and kind not in kinds:
@@ -250,7 +250,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     percentiles = np.asarray(pooled_percentiles(halves.first))
     percentiles = percentiles if readout is None else percentiles[readout]
     simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}
-    distances, band = _of_chance(halves, rng)
+    distances, band = _chance_levels(halves, rng)
     probabilities: dict[str, Float64[np.ndarray, "held classes"]] = {}
     scores = []
     for each in (MARGINAL, *kinds):
@@ -259,7 +259,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         prior = probabilities.get("empirical" if each == "memory" else MARGINAL, 1 / CLASSES)
         probabilities[each] = command_probabilities(prediction, prior, halves, percentiles[1:10])
         transforms = transformed(prediction, halves)
-        distance = from_uniform(transforms)
+        distance = distance_from_uniform(transforms)
         series = free_runs(simulator, prediction, halves, FREE_RUNS, rng)
         lengths = [run_lengths(one, percentiles[5]) for one in series]
         passing = prediction.probability @ (halves.values_hz >= percentiles[5])
@@ -278,7 +278,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
             )
         )
     recorded = recorded_series(halves)
-    # At its own median, as a loop's thresholds adapt: what has drifted is told apart.
+    # At its own median, as a loop's thresholds adapt: drift is reported separately.
     lasted = run_lengths(recorded, float(np.median(halves.x_hz)))
     conditions = range(len(responses.conditions))
     first = [halves.first_of(c) for c in conditions]
@@ -293,7 +293,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         _mean(lasted),
         shares_lasting(lasted),
         tuple(scores),
-        kind or usual_kind(responses),
+        kind or default_kind(responses),
         responses.is_blocked,
         band,
     )
@@ -302,7 +302,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
 def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
     """Spearman's correlation of every two readouts in the first half, which simulators keep, and in the second.
 
-    Of each condition on its own; the mean by their trials. Pairs are (0, 1), (0, 2), ..., (1, 2), ...
+    It is computed within conditions and averaged, weighted by trials. Pairs are (0, 1), (0, 2), ..., (1, 2), ...
     """
     from scipy.stats import rankdata
 
@@ -315,7 +315,7 @@ def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
     ):
         of_condition = [rankdata(read_hz[condition == c], axis=0) for c in range(len(responses.conditions))]
         upper = np.triu_indices(read_hz.shape[1], 1)
-        with np.errstate(invalid="ignore", divide="ignore"):  # NaN of a readout that is always the same.
+        with np.errstate(invalid="ignore", divide="ignore"):  # NaN for a constant readout.
             each = [np.corrcoef(ranks, rowvar=False)[upper] for ranks in of_condition]
         of_halves.append(np.average(each, axis=0, weights=list(map(len, of_condition))))
     return np.array(of_halves)
@@ -326,17 +326,19 @@ def pit_shares(transforms: Float64[np.ndarray, "held 2"]) -> Float64[np.ndarray,
     return np.diff(share_below(transforms, np.linspace(0, 1, PIT_BINS + 1)[1:-1]), prepend=0, append=1)
 
 
-def from_uniform(transforms: Float64[np.ndarray, "held 2"]) -> float:
+def distance_from_uniform(transforms: Float64[np.ndarray, "held 2"]) -> float:
     """Kolmogorov's distance of the transforms from the uniform distribution, to 0.001."""
     at = np.linspace(0, 1, 1001)
     return float(np.abs(share_below(transforms, at) - at).max())
 
 
-def _of_chance(halves: Halves, rng: np.random.Generator) -> tuple[Float64[np.ndarray, " chances"], tuple[float, float]]:
-    """Distances from uniform, and the middle 95 % of the bins' shares, where both halves have the same distributions.
+def _chance_levels(
+    halves: Halves, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, " chances"], tuple[float, float]]:
+    """Distances from uniform, and the middle 95 % of the bins' shares, if both halves have the same distributions.
 
-    Independent responses of any continuous distribution do, as only ranks count: those of the second half among the
-    first's, of each condition as many as there are.
+    They are simulated with independent uniform responses, as many per condition and half as recorded: only the ranks of
+    the second half's among the first's count, so any continuous distribution gives the same.
     """
     n = [(len(halves.first_of(c)), np.count_nonzero(halves.condition == c)) for c in np.unique(halves.condition)]
     distances, shares = [], []
@@ -358,8 +360,8 @@ def _mean(runs: Int64[np.ndarray, " runs"]) -> float:
 
 
 def _band(x: Float64[np.ndarray, "n *some"]) -> Band:
-    """Over the free runs, without those that have none of it."""
+    """Over the free runs, ignoring NaN."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # Where no run has any: NaN.
+        warnings.simplefilter("ignore", RuntimeWarning)  # NaN in all runs gives NaN.
         low, high = np.nanquantile(x, [0.025, 0.975], axis=0)
         return Band(low, np.nanmean(x, axis=0), high)

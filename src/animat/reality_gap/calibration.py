@@ -11,9 +11,9 @@ from jaxtyping import Float64
 
 from animat.coding.mapping import Thresholds
 from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history_tracker import HistoryTracker
 from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.remembering import Remembering
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
 from animat.reality_gap.rereading import reread
@@ -68,7 +68,7 @@ class Calibration:
         return self.adjusted.responses_hz
 
     @property
-    def remembering(self) -> Remembering:
+    def remembering(self) -> HistoryTracker:
         """How a loop's responses update the history state, with the memory of the recording's own simulator."""
         return self.adjusted.remembering
 
@@ -105,7 +105,7 @@ class Calibration:
             first_min, last_min = (float(timeline.start_min[i]) for i in (0, -1))
             trained_until = None if policy is None else policy.trained_until_min(first_min)
             at_min = last_min if policy is None else first_min if trained_until is None else trained_until
-        start_min = float(timeline.start_min[timeline.row_asked_for(at_min)])
+        start_min = float(timeline.start_min[timeline.requested_row(at_min)])
         responses = next(each for each in series if each.start_min == start_min)
         rng = np.random.default_rng(0)
         recorded = simulator = timeline.at(start_min)

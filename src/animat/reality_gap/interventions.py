@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.columns import align_columns
 from animat.environment import Environment
 from animat.evaluation.controls import Control
 from animat.evaluation.rollouts import roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.lined_up import lined_up
 from animat.neurons.simulator import NeuronSimulator
 from animat.reality_gap.row import Row, resampled_means
 from animat.records import as_json
@@ -96,7 +96,7 @@ def intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str
     return [
         "whose work is it: return with the culture replaced, and the loss from the measured "
         f"{policies.measured.mean():.1f}",
-        *lined_up(["", "return", "lost", "95 % interval", "", ""], cells),
+        *align_columns(["", "return", "lost", "95 % interval", "", ""], cells),
     ]
 
 

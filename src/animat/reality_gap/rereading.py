@@ -9,7 +9,7 @@ import numpy as np
 from animat.closed_loop.adaptive import AdaptiveThresholds, kept_counts
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history import Ranked
-from animat.neurons.remembering import Remembered
+from animat.neurons.history_tracker import HistoryState
 from animat.responses.responses import Responses
 
 
@@ -40,7 +40,7 @@ def reread(responses: Responses, adjusted: AdjustedRanks) -> Responses:
     for condition, x_hz, history, is_burst in trials:
         ranks.append(thresholds.ranks(x_hz))
         if not is_burst:
-            thresholds.add(int(condition), Remembered(*history), x_hz)
+            thresholds.add(int(condition), HistoryState(*history), x_hz)
     of_readouts = zip(np.atleast_2d(adjusted.sorted_hz), np.array(ranks).T, strict=True)
     reread_hz = np.stack([np.quantile(sorted_hz, rank) for sorted_hz, rank in of_readouts], axis=-1)
     reread_hz = reread_hz.reshape(read_hz.shape)

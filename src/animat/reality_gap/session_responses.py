@@ -14,7 +14,7 @@ from animat.closed_loop.session import Session
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
 from animat.responses.extraction import SILENCE_S
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.robots.base import Robot
 
 
@@ -107,9 +107,9 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     condition, rate_hz, is_burst, first_s, read_s = _columns(presented, 5)
     episode, at, late_s, active_ratio, moved = _columns(acted, 5)
     at = at.astype(np.int64)
-    x_hz = loop.readouts.alone(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
+    x_hz = loop.readouts.squeeze(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
     is_rested = first_s - np.concatenate([[-np.inf], read_s[:-1]]) > SILENCE_S
-    presentations = Presented(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
+    presentations = Trials(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
     responses = Responses(
         condition=presentations.condition[at],
         rate_hz=presentations.rate_hz[at],

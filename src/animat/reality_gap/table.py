@@ -8,12 +8,12 @@ from typing import Any
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.session import Session, unanswered_message
 from animat.closed_loop.session_data import describe_left_out
+from animat.columns import align_columns
 from animat.cultures.budget import Account
 from animat.errors import in_min
 from animat.evaluation.verdict import Verdict
 from animat.goals.robot import objectives_of
 from animat.goals.tally import MEANS, cells_of, satisfaction_line
-from animat.lined_up import lined_up
 from animat.reality_gap.interventions import Intervention, intervention_lines
 from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
@@ -140,7 +140,7 @@ class RealityGap:
         lines = [
             f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
             f"{in_min(self.calibrated_at_min)}",
-            *lined_up(head, cells),
+            *align_columns(head, cells),
         ]
         if self.rows[0].met:
             lines.append(f"  {satisfaction_line(objectives, self.rows[0].met)}")

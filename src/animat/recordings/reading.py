@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.plain_file import expect_plain_file, is_folder, is_nothing
+from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
@@ -215,7 +215,7 @@ def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
 
 def _files(path: Path) -> list[Path]:
     if not is_folder(path):
-        if is_nothing(path):
+        if is_absent(path):
             raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
         return [expect_plain_file(path)]
     try:

@@ -15,7 +15,7 @@ from animat.recordings.findings import Finding
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.stimulus import Stimuli
-from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze, made_anew
+from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze, reduce_dataclass
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Channels:
         x_um, y_um: the electrode's position in micrometres, NaN if not known, shape (channels,).
     """
 
-    __repr__, __reduce__ = briefly, made_anew
+    __repr__, __reduce__ = briefly, reduce_dataclass
 
     label: np.ndarray[Any, np.dtype[np.str_]]
     electrode: Int64[np.ndarray, " channels"]
@@ -112,7 +112,7 @@ class Recording:
         UnusableData: for times that are not finite or not in ascending order, or rows outside the tables.
     """
 
-    __repr__, __reduce__ = briefly, made_anew
+    __repr__, __reduce__ = briefly, reduce_dataclass
 
     spike_times_s: Float64[np.ndarray, " spikes"]
     spike_channels: Int64[np.ndarray, " spikes"]

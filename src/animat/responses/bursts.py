@@ -1,4 +1,4 @@
-"""Burst separation: responses in which the whole culture fires come regardless of the stimulus, and are set apart."""
+"""Burst separation: setting apart responses in which the whole culture fires, regardless of the stimulus."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from jaxtyping import Bool, Float64
 from animat.errors import InvalidArgument
 
 LEAST_RESPONSES = 5
-"""Of a group."""
+"""In each group."""
 CLEAR_VALLEY, FAR_VALLEY, FAR = 0.8, 0.5, 8.0
-"""Between two groups; between two whose means are this many standard deviations of the lower group apart.
+"""The valley between two groups must be `CLEAR_VALLEY` deep, or `FAR_VALLEY` if their means are `FAR` standard
+deviations of the lower group apart.
 
-Of samples of 60 to 1,500 responses from 24 distributions of one peak, 2 to 3 % pass for two groups, nearly all of them
-by the long tail of a lognormal one (docs/evidence/responses.md)."""
+Of samples of 60 to 1,500 responses from 24 distributions with one peak, 2 to 3 % pass as two groups, nearly all of them
+because of the long tail of a lognormal distribution (docs/evidence/responses.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class BurstSeparation:
-    """Responses in two classes by their ratio of active channels, and how far the classes stand apart.
+    """Responses in two classes by their ratio of active channels, and how well the classes are separated.
 
     Attributes:
-        threshold: a response whose ratio is at or under it is non-burst; 1 where there are no two groups, so that
-            nothing is cut; NaN without responses.
-        separability: between-class over total variance of the ratios, from 0 to 1; NaN where a given threshold leaves
-            one class only. A normal distribution, in which there is nothing to separate, reaches 0.64 all the same, a
-            flat one 0.75.
+        threshold: a response whose ratio is at or below it is not a burst; 1 if there are no two groups, so that
+            nothing is set apart; NaN without responses.
+        separability: between-class over total variance of the ratios, from 0 to 1; NaN if a given threshold leaves only
+            one class. A normal distribution, which has nothing to separate, still reaches 0.64, a flat one 0.75.
         valley: how deep the density of ratios falls between the classes, from 0 (no valley: one hump, cut in two) to
             1 (an empty gap): 1 - (lowest density between the class means) / (the lower of the two classes' peaks).
         distance: between the classes' means, in standard deviations of the lower class.
         is_burst: shape (responses,).
-        rejected: Otsu's threshold where it separates nothing, which the numbers above are of; NaN elsewhere.
+        rejected: Otsu's threshold if it was rejected, to which the numbers above then belong; NaN otherwise.
     """
 
     threshold: float
@@ -48,11 +48,11 @@ class BurstSeparation:
 def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
     """Otsu's threshold: the cut that makes the variance between the two classes largest.
 
-        w0 w1 (m0 - m1)^2 -> max,  w: the classes' shares, m: their means; values at or under the cut are class 0.
+        w0 w1 (m0 - m1)^2 -> max,  w: the classes' shares, m: their means; values at or below the cut are class 0.
 
     It is exact: every distinct value is tried as the cut (ratios of active channels are k/N, so there are few), not
-    the edges of a histogram. The first of several equally good cuts is taken. Where all values are equal there is
-    nothing to cut, and the threshold is that value; without values it is NaN.
+    the edges of a histogram. The first of several equally good cuts is taken. If all values are equal there is nothing
+    to cut, and the threshold is that value; without values it is NaN.
 
     Source: Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979), 62-66,
     doi:10.1109/TSMC.1979.4310076.
@@ -60,7 +60,7 @@ def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < 2:
         return float(distinct[0]) if len(distinct) else float("nan")
-    # Centred: the sums below then lose no digits when the values lie far from 0.
+    # Centred, so that the sums below lose no digits when the values are far from 0.
     sums = np.cumsum(counts * (distinct - np.mean(values)))
     n0 = np.cumsum(counts)[:-1]
     n1 = len(values) - n0
@@ -71,19 +71,19 @@ def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
 def separate_bursts(
     active_ratio: Float64[np.ndarray, " responses"], threshold: float | None = None, *, n_channels: int
 ) -> BurstSeparation:
-    """Set bursts apart from the other responses of a recording, all conditions at once.
+    """Set bursts apart from the other responses of a recording, all conditions together.
 
-    Otsu's method cuts any numbers in two. Its cut is kept where there are two groups of five responses or more: with a
-    valley of at least 0.8 between them, or of 0.5 where they are 8 standard deviations apart. Elsewhere no response is
-    a burst.
+    Otsu's method splits any numbers in two. Its split is kept if there are two groups of five responses or more: with a
+    valley of at least 0.8 between them, or of 0.5 if they are 8 standard deviations apart. Otherwise no response is a
+    burst.
 
     Args:
         active_ratio: the share of channels with at least one spike in the window, shape (responses,).
-        threshold: a ratio to use whatever it separates; 1 keeps every response.
-        n_channels: that the ratios are shares of.
+        threshold: a ratio to use in any case; 1 keeps every response.
+        n_channels: the number of channels of which the ratios are shares.
 
     Raises:
-        InvalidArgument: for a threshold that is no ratio from 0 to 1.
+        InvalidArgument: for a threshold that is not a ratio from 0 to 1.
 
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording), which always cuts.
     """
@@ -107,17 +107,13 @@ def separate_bursts(
 
 
 def check_threshold(threshold: float | None) -> None:
-    """Refuse a threshold that is no share of channels; None is Otsu's.
-
-    Raises:
-        InvalidArgument: unless it is from 0 to 1.
-    """
+    """Raise InvalidArgument for a threshold that is not a share of channels; None is Otsu's."""
     if threshold is not None and not 0 <= threshold <= 1:
         raise InvalidArgument(f"burst_threshold: expected a share of channels from 0 to 1, got {threshold:g}")
 
 
 def separability(values: Float64[np.ndarray, " values"], is_upper: Bool[np.ndarray, " values"]) -> float:
-    """Between-class over total variance, w0 w1 (m0 - m1)^2 / var(values); 0 where one class is empty."""
+    """Between-class over total variance, w0 w1 (m0 - m1)^2 / var(values); 0 if one class is empty."""
     upper, lower = values[is_upper], values[~is_upper]
     if not len(upper) or not len(lower) or np.ptp(values) == 0:
         return 0.0
@@ -132,7 +128,7 @@ def _valley(values: Float64[np.ndarray, " values"], is_upper: Bool[np.ndarray, "
         return 0.0
     distinct, counts = np.unique(values, return_counts=True)
     within_sd = np.sqrt(np.var(values) * max(1 - separability(values, is_upper), 0.0))
-    # Silverman's width for the classes, but never under the step between possible ratios: its comb is no valley.
+    # Silverman's width for the classes, but not below the step between possible ratios: its gaps are no valleys.
     width = max(1.06 * within_sd * len(values) ** -0.2, 1 / n_channels)
     grid = np.linspace(distinct[0], distinct[-1], 400)
     density: np.ndarray[Any, np.dtype[np.float64]] = np.exp(-0.5 * ((grid[:, None] - distinct) / width) ** 2) @ counts

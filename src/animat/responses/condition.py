@@ -1,4 +1,4 @@
-"""One thing an agent can choose: its name, and the stimuli that it stands for."""
+"""A condition: one thing that an agent can choose, with its name and its stimuli."""
 
 from __future__ import annotations
 
@@ -15,34 +15,33 @@ from animat.records import Flag, Number, Whole, record
 from animat.stimulation.stimulus import NOTHING
 
 _LONGEST_LABEL = 10_000
-"""A condition may be a set of very many electrodes, and its label names all of them."""
+"""A condition may be a very large set of electrodes, all named in its label."""
 _LARGEST_VALUE = 2.0**63
 RESTING = ((NOTHING,),)
 """The electrodes of a condition that delivers nothing."""
 _MOST_LISTED = 5
-"""Electrodes of a set that its label lists: the paper's patterns have as many."""
+"""The most electrodes of a set that a label lists: as many as the paper's patterns have."""
 
 
 @record
 class Condition:
     """One thing an agent can choose to do to the culture, such as stimulating at 5 Hz.
 
-    Conditions are equal by label, value and unit. The other attributes say what its stimuli were in the recording, so
-    that a closed loop can deliver it again (`animat.coding.encoder`).
+    Conditions are equal by label, value and unit. The other attributes describe its stimuli in the recording, so that a
+    closed loop can deliver it again (`animat.coding.encoder`).
 
     Attributes:
-        label: what figures and tables call it, with its unit: `"5 Hz"`, `"electrodes 909+23923"`.
+        label: its name in figures and tables, with its unit: `"5 Hz"`, `"electrodes 909+23923"`.
         value: the frequency in Hz; the number of the pattern; else the position in the list; 0 for "all".
-        unit: of `value`: `"Hz"`, or empty for a number that only counts.
-        frequencies_hz: of its presentations, each at one of them; empty: not known. That of a condition in Hz is its
-            value.
+        unit: of `value`: `"Hz"`, or empty if the value is only a number.
+        frequencies_hz: each trial is at one of them; empty: not known. For a condition in Hz this is its value.
         electrodes: sets of electrodes, each pulse on one of them; empty: not known; None: any of the culture's
             patterns; `RESTING`: nothing is delivered.
-        only_last: of a presentation only the last pulse is on these electrodes, and those before are on any pattern.
+        only_last: only the last pulse of a trial is on these electrodes, and those before are on any pattern.
 
     Raises:
-        InvalidArgument: for a label that is no line of text, a value that is no finite number, frequencies that are
-            not positive, or electrodes that are no sets of numbers from 0 on.
+        InvalidArgument: for a label that is not a line of text, a value that is not a finite number, frequencies that
+            are not positive, or electrodes that are not sets of numbers from 0 on.
     """
 
     label: Annotated[str, Field(strict=True, min_length=1, max_length=_LONGEST_LABEL)]
@@ -59,32 +58,32 @@ class Condition:
         if self.unit == "Hz":
             object.__setattr__(self, "frequencies_hz", (self.value,))
         elif not all(frequency_hz > 0 for frequency_hz in self.frequencies_hz):
-            raise InvalidArgument(f"frequencies_hz: expected more than 0, got {shown(self.frequencies_hz)}")
+            raise InvalidArgument(f"frequencies_hz: expected numbers above 0, got {shown(self.frequencies_hz)}")
         if self.electrodes != RESTING and not all(
             one and all(0 <= e < _LARGEST_VALUE for e in one) for one in self.electrodes or ()
         ):
             raise InvalidArgument(
-                f"electrodes: expected the numbers of one or more in each set, got {shown(self.electrodes)}"
+                f"electrodes: expected sets of one or more electrode numbers, got {shown(self.electrodes)}"
             )
 
     @property
     def interval_s(self) -> float:
-        """Mean time between its pulses; NaN where it is not known."""
+        """Mean time between its pulses; NaN if it is not known."""
         periods_s = [1 / frequency_hz for frequency_hz in self.frequencies_hz]
         return sum(periods_s) / len(periods_s) if periods_s else math.nan
 
 
 def listed(electrodes: Sequence[int]) -> str:
-    """A set of electrodes in words: `"electrodes 909+23923"`; `"no electrode"` where nothing is delivered."""
+    """The label of a set of electrodes: `"electrodes 909+23923"`; `"no electrode"` if nothing is delivered."""
     if (tuple(electrodes),) == RESTING:
         return "no electrode"
     return f"electrode{'s' if len(electrodes) > 1 else ''} {'+'.join(map(str, electrodes))}"
 
 
 def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
-    """Conditions whose labels count the electrodes of large sets (`"16 electrodes from 909"`) in place of listing them.
+    """Conditions whose labels count the electrodes of large sets (`"16 electrodes from 909"`) instead of listing them.
 
-    Where that would call two sets the same, all are listed. Files of before list them.
+    If that would give two sets the same label, all are listed. Older files list them.
     """
     sets = {one.electrodes[0] for one in conditions if one.electrodes is not None and len(one.electrodes) == 1}
     large = [electrodes for electrodes in sets if len(electrodes) > _MOST_LISTED]
@@ -99,24 +98,24 @@ def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
     )
 
 
-def other_stimulus(conditions: Sequence[Condition], others: Sequence[Condition]) -> str | None:
-    """In words, the first of equal conditions whose stimuli are others, where both are known; None if none is.
+def stimulus_mismatch(conditions: Sequence[Condition], others: Sequence[Condition]) -> str | None:
+    """A message on the first of equal conditions whose stimuli differ, if both are known; None if none does.
 
     Args:
-        conditions: that are expected.
-        others: equal ones, in the same order, of other recordings.
+        conditions: the expected ones.
+        others: equal conditions of other recordings, in the same order.
     """
     for expected, got in zip(conditions, others, strict=True):
         if not (expected.electrodes and got.electrodes and expected.frequencies_hz and got.frequencies_hz):
             continue
-        # Of a pattern at several frequencies a recording may have met some only, and a file rounds.
+        # A recording may hold a pattern at only some of several frequencies, and a file rounds them.
         in_common = np.isclose(np.array(expected.frequencies_hz)[:, None], np.array(got.frequencies_hz), rtol=1e-6)
         if (expected.electrodes, expected.only_last) != (got.electrodes, got.only_last) or not in_common.any():
-            return f"expected {_told(expected)}, got {_told(got)}"
+            return f"expected {_describe(expected)}, got {_describe(got)}"
     return None
 
 
-def _told(condition: Condition) -> str:
+def _describe(condition: Condition) -> str:
     sets = " or ".join("+".join(map(str, one)) for one in condition.electrodes or ())
     last = ", its last pulse alone," if condition.only_last else ""
     frequencies = ", ".join(f"{each:g}" for each in condition.frequencies_hz)

@@ -1,4 +1,4 @@
-"""What a stimulus is an instance of: the index that an agent picks, and how stimuli are sorted into it."""
+"""Rules that sort stimuli into conditions, whose index is what an agent picks."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
-"""The index of a stimulus that belongs to no condition."""
+"""The index of a stimulus without a condition."""
 
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """Which condition each stimulus belongs to.
+    """The condition of each stimulus.
 
     Attributes:
-        condition: index into `conditions` of each stimulus, `NO_CONDITION` where it has none, shape (stimuli,).
-        conditions: the conditions, in the order of their index.
+        condition: index into `conditions` of each stimulus, `NO_CONDITION` if it has none, shape (stimuli,).
+        conditions: in the order of their index.
     """
 
     condition: Int64[np.ndarray, " stimuli"]
@@ -43,25 +43,25 @@ class Conditions(abc.ABC):
 
 @dataclass(frozen=True)
 class All(Conditions):
-    """Every stimulus in one condition: to look at a recording as a whole."""
+    """All stimuli in one condition, to inspect a recording as a whole."""
 
     def __str__(self) -> str:
         return "all"
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Put every pulse into condition 0."""
-        return _recorded(stimuli, np.zeros(len(stimuli), dtype=np.int64), [Condition("all", 0.0)])
+        return _with_stimuli(stimuli, np.zeros(len(stimuli), dtype=np.int64), [Condition("all", 0.0)])
 
 
 @dataclass(frozen=True)
 class ByFrequency(Conditions):
-    """By the frequency that the protocol presented (the paper).
+    """By the stimulation frequency of the protocol (the paper).
 
     Attributes:
         values_hz: the frequencies to take, in the order of their index; empty for all that occur, rising.
 
     Raises:
-        InvalidArgument: for a frequency that is not positive, or is given twice.
+        InvalidArgument: for a frequency that is not positive, or is repeated.
     """
 
     values_hz: tuple[float, ...] = ()
@@ -73,34 +73,34 @@ class ByFrequency(Conditions):
         return "frequency" + _listed(self.values_hz)
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Put each pulse to its frequency; unknown frequencies (NaN), and ones not asked for, have no condition."""
+        """Sort pulses by frequency; unknown frequencies (NaN), and those not listed, have no condition."""
         known = stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]
         values_hz = np.array(self.values_hz) if self.values_hz else np.unique(known)
         index = np.full(len(stimuli), NO_CONDITION)
         for i, value_hz in enumerate(values_hz):
-            # 1e-6: a frequency that went through single precision in a file is still the same frequency.
+            # 1e-6: a frequency stored in single precision is still the same frequency.
             index[np.isclose(stimuli.frequency_hz, value_hz, rtol=1e-6, atol=0.0)] = i
         return Assignment(index, tuple(_frequency(value_hz) for value_hz in values_hz))
 
 
 @dataclass(frozen=True)
 class ByInterval(Conditions):
-    """By the inverse of the time since the *previous* pulse: for stimulation that follows no fixed frequency.
+    """By the inverse of the time since the *previous* pulse, for stimulation without fixed frequencies.
 
     A stimulus with the interval d before it belongs to the frequency f if |ln(d f)| <= ln(1 + tolerance), that is, if
-    1/d lies between f/(1 + tolerance) and f (1 + tolerance). The ratio makes it the same rule for intervals as for
-    frequencies. Where two reach, the nearer one in ratio has it.
+    1/d lies between f/(1 + tolerance) and f (1 + tolerance). As a ratio, the rule is the same for intervals and
+    frequencies. If two frequencies match, the nearer one in ratio wins.
 
-    The previous interval, not the next: a response can depend only on what came before it. The first pulse of a
-    recording has no previous one, hence no condition. All pulses count as previous ones, also those of the same
-    presentation.
+    The previous interval counts, not the next, as a response can depend only on what came before it. The first pulse of
+    a recording has no previous pulse, hence no condition. All pulses count as previous ones, including those of the
+    same trial.
 
     Attributes:
         values_hz: the frequencies, in the order of their index.
         tolerance: relative, 0.25 for 25 %.
 
     Raises:
-        InvalidArgument: for no frequency, one that is not positive or given twice, or a tolerance that is not positive.
+        InvalidArgument: for no frequency, one that is not positive or is repeated, or a tolerance that is not positive.
     """
 
     values_hz: tuple[float, ...]
@@ -117,14 +117,14 @@ class ByInterval(Conditions):
         return f"interval{_listed(self.values_hz)}+-{100 * self.tolerance:.10g}%"
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Put each pulse to the nearest frequency within the tolerance; others have no condition."""
+        """Sort pulses by the nearest frequency within the tolerance; others have no condition."""
         index = np.full(len(stimuli), NO_CONDITION)
         interval_s = np.diff(stimuli.time_s)
         if len(interval_s):
             with np.errstate(divide="ignore"):
                 distance = np.abs(np.log(interval_s[:, None] * np.array(self.values_hz)))
             nearest = np.argmin(distance, axis=1)
-            # 1e-9: times are rounded, so an interval on the edge would be in or out by chance.
+            # 1e-9: times are rounded, so chance would decide about an interval on the edge.
             within = distance.min(axis=1) <= math.log1p(self.tolerance) + 1e-9
             index[1:][within] = nearest[within]
         return Assignment(index, tuple(_frequency(value_hz) for value_hz in self.values_hz))
@@ -138,7 +138,7 @@ class ByElectrode(Conditions):
         sets: the sets to take, in the order of their index; empty for all that occur, in the order of their numbers.
 
     Raises:
-        InvalidArgument: for a set that is empty or given twice.
+        InvalidArgument: for a set that is empty or repeated.
     """
 
     sets: tuple[tuple[int, ...], ...] = ()
@@ -154,8 +154,8 @@ class ByElectrode(Conditions):
         return "electrode" + (":" + ",".join("+".join(map(str, s)) for s in self.sets) if self.sets else "")
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Put each pulse to its set of electrodes, a rest to `RESTING`; a pulse on no known one has no condition."""
-        # Sorted rows make a set out of a list; a repeated electrode is one electrode.
+        """Sort pulses by electrodes, and rests as `RESTING`; a pulse on unknown or other ones has no condition."""
+        # Sorted rows represent sets; a repeated electrode is one electrode.
         rows, row_of = np.unique(np.sort(stimuli.electrodes, axis=1), axis=0, return_inverse=True)
         set_of_row = [tuple(sorted(set(row.tolist()) - {UNKNOWN})) for row in rows]
         resting = RESTING if np.any(stimuli.is_rest) else ()
@@ -164,8 +164,8 @@ class ByElectrode(Conditions):
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
         index = index_of_row[row_of.reshape(-1)]
         index[stimuli.is_rest] = index_of.get(RESTING[0], NO_CONDITION)
-        found = [Condition(listed(electrodes), float(i), electrodes=(electrodes,)) for i, electrodes in enumerate(sets)]
-        return _recorded(stimuli, index, abbreviated(found))
+        conditions = [Condition(listed(one), float(i), electrodes=(one,)) for i, one in enumerate(sets)]
+        return _with_stimuli(stimuli, index, abbreviated(conditions))
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class ByPattern(Conditions):
         patterns: the patterns to take, in the order of their index; empty for all that occur, rising.
 
     Raises:
-        InvalidArgument: for a pattern that is negative or given twice.
+        InvalidArgument: for a pattern that is negative or repeated.
     """
 
     patterns: tuple[int, ...] = ()
@@ -189,19 +189,19 @@ class ByPattern(Conditions):
         return "pattern" + (":" + ",".join(map(str, self.patterns)) if self.patterns else "")
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Put each pulse to its pattern; unknown patterns, and ones not asked for, have no condition."""
+        """Sort pulses by pattern; unknown patterns, and those not listed, have no condition."""
         is_known = (stimuli.pattern != UNKNOWN) & ~stimuli.is_rest
         patterns = np.array(self.patterns or np.unique(stimuli.pattern[is_known]), dtype=np.int64)
         index = np.full(len(stimuli), NO_CONDITION)
         for i, pattern in enumerate(patterns):
             index[stimuli.pattern == pattern] = i
-        found = [Condition(f"pattern {pattern}", float(pattern), electrodes=()) for pattern in patterns]
-        return _recorded(stimuli, index, found)
+        conditions = [Condition(f"pattern {pattern}", float(pattern), electrodes=()) for pattern in patterns]
+        return _with_stimuli(stimuli, index, conditions)
 
 
 @dataclass(frozen=True)
 class ByBoth(Conditions):
-    """By when and where pulses come: the combinations that occur, those of the first `when` before the others.
+    """By when and where pulses come: the combinations that occur, in the order of `when`, then of `where`.
 
     Attributes:
         when: frequencies or intervals.
@@ -215,25 +215,25 @@ class ByBoth(Conditions):
         return f"{self.when} x {self.where}"
 
     def assign(self, stimuli: Stimuli) -> Assignment:
-        """Put each pulse to its combination; a pulse without either has no condition."""
+        """Sort pulses by combination; a pulse that lacks either has no condition."""
         when, where = self.when.assign(stimuli), self.where.assign(stimuli)
         both = (when.condition != NO_CONDITION) & (where.condition != NO_CONDITION)
         number = np.where(both, when.condition * len(where.conditions) + where.condition, NO_CONDITION)
         occurring = np.unique(number[both & stimuli.is_last_of_presentation])
         index = np.full(len(stimuli), NO_CONDITION)
-        found = []
+        conditions = []
         for i, each in enumerate(occurring.tolist()):
             index[number == each] = i
             at, on = when.conditions[each // len(where.conditions)], where.conditions[each % len(where.conditions)]
-            label = f"{at.label}, {on.label}"
-            found.append(Condition(label, float(i), "", at.frequencies_hz, on.electrodes))
-        return _recorded(stimuli, index, found)
+            conditions.append(Condition(f"{at.label}, {on.label}", float(i), "", at.frequencies_hz, on.electrodes))
+        return _with_stimuli(stimuli, index, conditions)
 
 
 def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Conditions:
-    """The conditions of a recording for which none were asked.
+    """The default conditions of a recording.
 
-    By frequency where it is known, else all in one; places are conditions, too, where a protocol has some.
+    By place if the protocol has places, with the frequency if it has several; else by frequency if any is known; else
+    all in one.
     """
     if protocol is not None and protocol.places:
         return ByElectrode() if len(protocol.frequencies_hz) == 1 else ByBoth(ByFrequency(), ByElectrode())
@@ -244,11 +244,11 @@ def conditions_named(text: str) -> Conditions:
     """Read conditions from their text form.
 
     `all`, `frequency`, `frequency:5,10`, `interval:5,10`, `interval:5,10+-25%`, `electrode`,
-    `electrode:23275,909+23923`, `pattern`, `pattern:0,3`, and of frequency or interval with electrode or pattern the
-    product, `frequency:5,80 x pattern:0,3`.
+    `electrode:23275,909+23923`, `pattern`, `pattern:0,3`, and products of frequency or interval with electrode or
+    pattern, `frequency:5,80 x pattern:0,3`.
 
     Raises:
-        InvalidArgument: for anything else, saying what was expected.
+        InvalidArgument: for anything else.
     """
     first, is_product, second = text.partition(" x ")
     if is_product and " x " not in second:
@@ -256,7 +256,7 @@ def conditions_named(text: str) -> Conditions:
         if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
             return ByBoth(when, where)
     if is_product:
-        raise _unread(text, "frequency or interval before x, and electrode or pattern after it")
+        raise _invalid(text, "frequency or interval before x, and electrode or pattern after it")
     name, _, rest = text.strip().partition(":")
     name, rest = name.strip(), rest.strip()
     if name == "all" and not rest:
@@ -269,24 +269,26 @@ def conditions_named(text: str) -> Conditions:
             return ByInterval(_floats(text, values))
         percent = _floats(text, tolerance.strip().removesuffix("%"))
         if len(percent) != 1 or not tolerance.strip().endswith("%"):
-            raise _unread(text, "one tolerance in per cent after +-, as in interval:5,10+-25%")
+            raise _invalid(text, "one tolerance in per cent after +-, as in interval:5,10+-25%")
         return ByInterval(_floats(text, values), percent[0] / 100)
     if name == "electrode":
         return ByElectrode(tuple(_integers(text, part, "+") for part in rest.split(",") if rest))
     if name == "pattern":
         return ByPattern(_integers(text, rest, ","))
-    raise _unread(
+    raise _invalid(
         text, "one of all, frequency, frequency:5,10, interval:5,10+-25%, electrode, pattern, frequency x pattern"
     )
 
 
-def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]) -> Assignment:
-    """An assignment whose conditions say what their stimuli were, where they do not say it yet."""
+def _with_stimuli(
+    stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]
+) -> Assignment:
+    """An assignment whose conditions also describe their stimuli, as far as they did not yet."""
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]
     presented = np.repeat(of, np.diff(last, prepend=-1))
-    presented[last] = NO_CONDITION  # what is left are the pulses before the last one
-    found = []
+    presented[last] = NO_CONDITION  # Leaves the pulses before the last one.
+    described = []
     for i, condition in enumerate(conditions):
         rows = last[of == i]
         known_hz, electrodes = condition.frequencies_hz, condition.electrodes
@@ -298,8 +300,8 @@ def _recorded(stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions
         before = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
         ours = {frozenset(one) - {NOTHING} for one in electrodes or ()}
         only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in before)
-        found.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
-    return Assignment(index, tuple(found))
+        described.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
+    return Assignment(index, tuple(described))
 
 
 def _frequency(value_hz: float) -> Condition:
@@ -315,7 +317,7 @@ def _check_frequencies(name: str, values_hz: tuple[float, ...]) -> None:
 
 
 def _listed(values: tuple[float, ...]) -> str:
-    # The shortest text that reads back as the same number, without a needless .0.
+    # The shortest text that reads back as the same number, without .0.
     return ":" + ",".join(repr(float(value)).removesuffix(".0") for value in values) if values else ""
 
 
@@ -323,18 +325,18 @@ def _floats(text: str, listed: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in listed.split(",")) if listed else ()
     except ValueError:
-        raise _unread(text, "numbers with commas between them, as in interval:5,10") from None
+        raise _invalid(text, "numbers separated by commas, as in interval:5,10") from None
 
 
 def _integers(text: str, listed: str, separator: str) -> tuple[int, ...]:
     try:
         numbers = tuple(int(part) for part in listed.split(separator)) if listed else ()
     except ValueError:
-        raise _unread(text, f"whole numbers with {separator!r} between them") from None
+        raise _invalid(text, f"whole numbers separated by {separator!r}") from None
     if any(abs(number) >= 2**63 for number in numbers):
-        raise _unread(text, "whole numbers of an electrode or a pattern")
+        raise _invalid(text, "whole numbers of electrodes or patterns")
     return numbers
 
 
-def _unread(text: str, expected: str) -> InvalidArgument:
+def _invalid(text: str, expected: str) -> InvalidArgument:
     return InvalidArgument(f"conditions: expected {expected}; got {text!r}")

@@ -1,4 +1,4 @@
-"""From a recording, or a table of responses without times of spikes, to its responses."""
+"""From a recording, or a table of responses without spike times, to its responses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from animat.responses.bursts import BurstSeparation, separate_bursts
 from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts
-from animat.responses.responses import Presented, Responses
+from animat.responses.responses import Responses, Trials
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 
 SILENCE_S = 1.0
-"""So long without a pulse is silence: the slowest of the paper's stimuli come 0.2 s after each other."""
+"""A longer time without a pulse is silence: the slowest of the paper's stimuli are 0.2 s apart."""
 
 
 def extract_responses(
@@ -29,29 +29,30 @@ def extract_responses(
     burst_threshold: float | None = None,
     readouts: Readouts = ALL,
 ) -> Responses:
-    """The response to the last pulse of every presentation that has a condition.
+    """The response to the last pulse of every trial that has a condition.
 
         x = S / (T N)
 
     with S the spikes from window_ms[0] up to, not including, window_ms[1] after the pulse (see
-    `animat.responses.windows.count_spikes` for the edges), T the length of the window and N the number of channels. Of
-    a table, x is the mean over channels of count / T, or of the rate; active are channels with a count or rate above 0.
+    `animat.responses.windows.count_spikes` for the edges), T the length of the window and N the number of channels. For
+    a table, x is the mean over channels of count / T, or of the rate; channels with a count or rate above 0 are active.
 
-    Presentations without a condition, and ones whose window runs past the end of the recording, are left out and
-    counted in `findings`, where also everything else is said that makes the responses doubtful.
+    Trials without a condition, and those whose window runs past the end of the recording, are left out and counted in
+    `findings`, which also reports everything else that makes the responses doubtful.
 
     Args:
-        source: spikes, or what each channel did after each stimulus.
-        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
-        window_ms: start and end of the window after the pulse; of a table that does not say it, the window that was
-            counted in. One that a table says goes before the default one.
+        source: spikes, or the response of each channel to each stimulus.
+        by: the rule of the conditions; None: `animat.responses.conditions.default_conditions`.
+        window_ms: start and end of the window after the pulse. A table that states its window replaces the default; for
+            one that does not, this is the window in which its spikes were counted.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
-        readouts: groups of channels whose x is read too, in the same windows; bursts are told by all channels.
+        readouts: groups of channels whose x is read too, in the same windows; bursts are identified from all channels.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
-        UnusableData: without channels, or for conditions by interval of a table without times.
-        Mismatch: for channels that do not read all electrodes of the readouts, or another window than the table's.
+        UnusableData: without channels, or for conditions by interval with a table without times.
+        Mismatch: for channels that do not read all electrodes of the readouts, or a window that differs from the
+            table's.
 
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
         only where it finds two groups).
@@ -63,12 +64,12 @@ def extract_responses(
     if isinstance(source, ResponseTable):
         return _of_table(source, by, window_ms, burst_threshold, readouts)
     stimuli = source.stimuli
-    # An end that is the last stimulus' or spike's own time is rounded like them.
+    # An end that equals the time of the last stimulus or spike is rounded as that is.
     inside = stimuli.time_s + window_ms[1] * 1e-3 <= source.stop_s + 1e-9
     presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
-    # Those without a condition are read too: they are what came before others.
+    # Trials without a condition are read too, as the history of others.
     rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
-    responses, assignment, bursts = _sorted(source, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    responses, assignment, bursts = _sort(source, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
     if not readouts.are_all and responses.time_s is not None:
         members = readouts.members(source.channels)
         readout_hz = readouts.read(source, members, responses.time_s, window_ms)
@@ -83,20 +84,20 @@ def _of_table(
     burst_threshold: float | None,
     readouts: Readouts,
 ) -> Responses:
-    """Those of a table, which says what its channels did, and not when."""
+    """The responses of a table, which has no spike times."""
     if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
         raise Mismatch(
             f"window_ms: expected {table.window_ms[0]:g} to {table.window_ms[1]:g}, in which the table's spikes were "
             f"counted, got {window_ms[0]:g} to {window_ms[1]:g}; leave the window out"
         )
     if isinstance(by, ByInterval) and not table.has_times:
-        raise UnusableData("conditions: expected others than intervals, as the table has no times of stimuli")
+        raise UnusableData("conditions: expected no intervals, as the table has no stimulus times")
     assumed = []
     if table.window_ms is None:
         message = (
-            f"the table does not say in which window its spikes were counted: {window_ms[0]:g} to {window_ms[1]:g} ms "
-            "after the stimulus are assumed, in which a closed loop would count them; say it with --window-ms, or in "
-            "the file"
+            f"the table does not state the window in which its spikes were counted: {window_ms[0]:g} to "
+            f"{window_ms[1]:g} ms after the stimulus is assumed, in which a closed loop would count them; give it with "
+            "--window-ms, or in the file"
         )
         assumed = [Finding("window-assumed", "warning", message)]
     window_ms = table.window_ms or window_ms
@@ -104,15 +105,15 @@ def _of_table(
     presented = np.flatnonzero(table.stimuli.is_last_of_presentation)
     rate_hz = table.values[presented].mean(axis=1) * scale
     active_ratio = np.mean(table.values[presented] > 0, axis=1)
-    responses, assignment, bursts = _sorted(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
+    responses, assignment, bursts = _sort(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
     if not readouts.are_all:
         members, values = readouts.members(table.channels), table.values[presented[responses.presentations[1]]]
         readout_hz = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1) * scale
-        responses = replace(responses, readouts=readouts, readout_hz=readouts.alone(readout_hz))
+        responses = replace(responses, readouts=readouts, readout_hz=readouts.squeeze(readout_hz))
     return replace(responses, findings=(*assumed, *findings_on(responses, table, assignment, bursts)))
 
 
-def _sorted(
+def _sort(
     source: Recording | ResponseTable,
     by: Conditions | None,
     window_ms: tuple[float, float],
@@ -121,7 +122,7 @@ def _sorted(
     rate_hz: Float64[np.ndarray, " presentations"],
     active_ratio: Float64[np.ndarray, " presentations"],
 ) -> tuple[Responses, Assignment, BurstSeparation]:
-    """What was read after the last pulses, by condition and apart from bursts; with how it was sorted."""
+    """The responses read after the last pulses, sorted by condition, with bursts set apart; and how this was done."""
     stimuli, n_channels = source.stimuli, len(source.channels)
     by = by or default_conditions(stimuli, source.protocol)
     assignment = by.assign(stimuli)
@@ -129,8 +130,8 @@ def _sorted(
     chosen = condition != NO_CONDITION
     bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
     has_times = isinstance(source, Recording) or source.has_times
-    # Between the pulses of a presentation there is no silence, however long it lasts. Rows without times follow each
-    # other, and nothing is known of what was before the first.
+    # There is no silence within a trial, however long it lasts. Rows without times are taken as successive, and nothing
+    # is known about what came before the first.
     silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
     is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
     time_s = stimuli.time_s[presented] if has_times else None
@@ -147,7 +148,7 @@ def _sorted(
         presentation=source.presentation,
         start_min=source.start_min,
         time_s=None if time_s is None else time_s[chosen],
-        presented=Presented(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
+        presented=Trials(condition, rate_hz, active_ratio > bursts.threshold, is_rested, time_s),
         place=np.flatnonzero(chosen),
         by=str(by),
         burst_threshold=burst_threshold,

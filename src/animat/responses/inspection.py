@@ -1,4 +1,4 @@
-"""What is in a recording, whether it can be used, and what is wrong with it."""
+"""The contents of a recording, whether it can be used, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class ConditionSummary:
     """The responses to one condition in a few numbers.
 
     Attributes:
-        n_responses: all responses, bursts included.
-        n_non_burst: responses that are no bursts; the other numbers are theirs.
-        median_rate_hz: median of x, NaN without responses.
+        n_responses: all responses, including bursts.
+        n_non_burst: responses that are not bursts, to which the other numbers belong.
+        median_rate_hz: median of x; NaN without responses.
         share_above_median: P(x >= P50), P50 the median of all conditions together; NaN without responses.
     """
 
@@ -44,25 +44,25 @@ class ConditionSummary:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What was found in one recording.
+    """The contents and findings of one recording.
 
     Attributes:
         name: of the recording, such as its file.
-        n_spikes, n_channels, n_stimuli: what the recording holds; stimuli are pulses. Of a table of rates the number of
-            spikes is not known, and None.
-        n_trials: how many trials; a response is read after the last pulse of each.
-        presentation: how stimuli were presented, in words; None where it is not known.
+        n_spikes, n_channels, n_stimuli: in the recording; stimuli are pulses. The number of spikes is None for a table
+            of rates.
+        n_trials: a response is read after the last pulse of each trial.
+        presentation: how stimuli were presented, as text; None if it is not known.
         start_min: start on the culture's clock.
-        duration_s: length of the recording; NaN where it is not known.
+        duration_s: length of the recording; NaN if it is not known.
         by: the conditions in their text form.
-        by_default: whether the conditions were chosen here, as none were asked for.
-        mean_spikes_per_stimulus: spikes in the window, over all presentations whose window lies in the recording,
-            with or without a condition, bursts included; NaN without any.
-        spontaneous_rate_hz: per channel, before stimuli; NaN where stimuli leave no quiet time. Without any stimulus,
-            over the whole recording.
-        response: when the culture answers; None where no answer was found.
-        responses: what would be learned from.
-        findings: everything noticed, the gravest first.
+        by_default: whether these are the default conditions.
+        mean_spikes_per_stimulus: spikes in the window, over all trials whose window lies in the recording, with or
+            without a condition, including bursts; NaN without any.
+        spontaneous_rate_hz: per channel, before stimuli; NaN if stimuli leave no quiet time. Without any stimulus, over
+            the whole recording.
+        response: when the culture responds; None if no response was found.
+        responses: from which a simulator would be made.
+        findings: all findings, the gravest first.
         network_bursts: of a recording without stimuli; None for others, whose responses are separated instead.
     """
 
@@ -87,7 +87,7 @@ class Inspection:
 
     @property
     def verdict(self) -> Verdict:
-        """Not usable if a finding says to refuse, usable with care if one warns, else usable."""
+        """Not usable if a finding refuses it, usable with care if one warns, else usable."""
         severities = {finding.severity for finding in self.findings}
         if "refuse" in severities:
             return "not usable"
@@ -111,9 +111,9 @@ class Inspection:
         return int(np.count_nonzero(self.responses.is_burst))
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data for JSON; what is not known is None."""
+        """Everything as plain data for JSON; unknown values are None."""
         responses = self.responses
-        told = {
+        data = {
             "name": self.name,
             "verdict": self.verdict,
             "spikes": self.n_spikes,
@@ -153,7 +153,7 @@ class Inspection:
             ],
             "findings": [{**finding.to_dict(), "value": finding.value} for finding in self.findings],
         }
-        return as_json(told)  # type: ignore[no-any-return]
+        return as_json(data)  # type: ignore[no-any-return]
 
 
 def inspect_recording(
@@ -163,7 +163,7 @@ def inspect_recording(
     burst_threshold: float | None = None,
     name: str | None = None,
 ) -> Inspection:
-    """Look at a recording as training would use it, and say what is in it and what is wrong with it.
+    """Inspect a recording as training would use it: its contents, and what is wrong with it.
 
     Args:
         by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
@@ -221,9 +221,9 @@ def inspect_recording(
 
 
 def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> tuple[Finding, ...]:
-    """What was noticed in the recording and in its responses.
+    """The findings on the recording and on its responses.
 
-    Of one name, what the latter say, which is more; but of stimuli that are missing the file knows more.
+    Of those with the same name, the responses' say more; but on missing stimuli the recording's does.
     """
     in_responses = [f for f in responses.findings if f.name != "no-stimuli"]
     names = {finding.name for finding in in_responses}

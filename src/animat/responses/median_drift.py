@@ -1,4 +1,4 @@
-"""How fast a culture's responses change from recording to recording."""
+"""The drift of a culture's responses from recording to recording."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ import numpy as np
 from animat.responses.responses import Responses
 
 NEWEST = 3
-"""Recordings that a drift is taken from: it slows down over hours."""
+"""Recordings from which the drift is estimated: it slows down over hours."""
 _BOOTSTRAPS = 100
 
 
 class MedianDrift(NamedTuple):
-    """The relative change of P50 a minute.
+    """The relative change of P50 per minute.
 
     Attributes:
-        per_min: d ln(P50) / dt, negative where responses fall.
-        error: its standard error, from responses drawn anew.
+        per_min: d ln(P50) / dt, negative if responses fall.
+        error: its standard error, by bootstrap of the responses.
     """
 
     per_min: float
     error: float
 
     def minutes_to(self, change: float) -> tuple[float, float]:
-        """How long P50 takes to change by a part of itself, and how long it does at least: at a rate two errors faster.
+        """Minutes until P50 has changed by a fraction of itself; and the same at a rate two errors faster.
 
-        A fall of 0.25 is one to 0.75, a rise one to 1.25.
+        A fall of 0.25 is to 0.75, a rise to 1.25.
         """
 
         def minutes(per_min: float) -> float:
@@ -41,11 +41,15 @@ class MedianDrift(NamedTuple):
 def median_drift(series: Sequence[Responses]) -> MedianDrift | None:
     """The drift of P50 over the newest recordings of a culture, by least squares of ln(P50) against their starts.
 
-    With t_i the starts less their mean: the slope is sum(t_i ln(P50_i)) / sum(t_i^2), and its error
-    sqrt(sum(t_i^2 e_i^2)) / sum(t_i^2), e_i the spread of ln(P50_i) as that recording's responses are drawn anew.
+    With t_i the starts less their mean, the slope is sum(t_i ln(P50_i)) / sum(t_i^2), and its error is
+    sqrt(sum(t_i^2 e_i^2)) / sum(t_i^2), e_i the standard deviation of ln(P50_i) over bootstrap samples of that
+    recording's responses.
 
     Args:
-        series: in the order of time. None is told of fewer than two, nor where a median is 0.
+        series: in the order of time.
+
+    Returns:
+        The drift; None for fewer than two recordings, or if a median is 0.
     """
     newest = series[-NEWEST:]
     if len(newest) < 2 or not all(each.median_rate_hz > 0 for each in newest):
@@ -54,7 +58,7 @@ def median_drift(series: Sequence[Responses]) -> MedianDrift | None:
     t = np.array([each.start_min for each in newest])
     t -= t.mean()
     logs = np.log([each.median_rate_hz for each in newest])
-    # By condition, as they were presented.
+    # Resampled within conditions, as their numbers are fixed by the protocol.
     drawn = np.array([[each.bootstrapped(rng).median_rate_hz for _ in range(_BOOTSTRAPS)] for each in newest])
     errors = np.std(np.log(np.maximum(drawn, 1e-9)), axis=1)
     spread = float(t @ t)

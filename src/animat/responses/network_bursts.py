@@ -1,4 +1,4 @@
-"""Bursts of a culture that nobody stimulates: stretches in which it fires far above its usual rate."""
+"""Network bursts of an unstimulated culture: stretches in which it fires far above its usual rate."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class NetworkBursts:
         start_s, end_s: of each burst on the recording's clock, shape (bursts,).
         edges_s: of the bins, 50 ms wide, shape (bins + 1,).
         count: spikes of all channels in each bin, shape (bins,).
-        threshold: spikes in a bin, above which it belongs to a burst.
-        share: of all spikes, in bursts; NaN without spikes.
+        threshold: spikes in a bin above which it belongs to a burst.
+        share: the share of all spikes that are in bursts; NaN without spikes.
     """
 
     start_s: Float64[np.ndarray, " bursts"]
@@ -48,14 +48,11 @@ def find_network_bursts(recording: Recording) -> NetworkBursts:
     """Find runs of 50 ms bins with far more spikes than usual, on all channels together.
 
     A bin belongs to a burst if it holds more than 8 times the median bin, and more than independent spikes at the mean
-    rate (Poisson) would put into any bin of one recording in a hundred.
-
-    Args:
-        recording: with any spikes.
+    rate (Poisson) would put into any bin in all but one of a hundred recordings.
     """
     from scipy.stats import poisson
 
-    # Times in another unit than seconds must not ask for memory without end.
+    # Times in a wrong unit must not exhaust the memory.
     bin_s = max(BIN_S, recording.duration_s / MOST_BINS)
     edges_s = recording.start_s + bin_s * np.arange(max(1, math.ceil(recording.duration_s / bin_s)) + 1)
     count = np.histogram(recording.spike_times_s, edges_s)[0].astype(np.float64)

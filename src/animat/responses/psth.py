@@ -1,4 +1,4 @@
-"""The post-stimulus time histogram: when after a stimulus the culture fires, and how it fires without one."""
+"""The post-stimulus time histogram: when the culture fires after a stimulus, and how it fires without one."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from animat.errors import InvalidArgument
 from animat.recordings.recording import Recording
 from animat.responses.windows import HALF_NS_S
 
-# Spikes before a stimulus count as spontaneous from 100 ms after the previous one (the longest direct responses known
-# to us are over by then; a longer window moves it), until 20 ms before the next (filters smear artefacts backwards),
-# 200 ms at most.
+# Spikes count as spontaneous from 100 ms after a stimulus (the longest direct responses known to us are over by then;
+# a longer window delays this) until 20 ms before the next (filters smear artefacts backwards), 200 ms at most.
 _SETTLED_MS = 100.0
 _ARTEFACT_MS = 20.0
 _QUIET_MS = 200.0
 _LEAST_QUIET_S = 1.0
 _ARTEFACT_AFTER_MS = 2.0
+_SEARCH_MS = 500.0
 _SUSTAINED_BINS = 3
 _BINS_MS = (1.0, 2.0, 5.0, 10.0)
 
@@ -50,7 +50,7 @@ class PostStimulusHistogram:
 
 @dataclass(frozen=True)
 class ResponseTime:
-    """When after the stimulus the culture answers.
+    """When the culture responds after a stimulus.
 
     Attributes:
         start_ms, end_ms: the first stretch of time in which it fires clearly above its spontaneous rate.
@@ -72,11 +72,11 @@ def post_stimulus_histogram(
     Args:
         from_ms, to_ms: the span, from the stimulus; negative is before it. It grows to a whole number of bins.
         bin_ms: width of the bins, which are half-open, of lags rounded to a nanosecond. So bins inside a window add
-            up to the spikes of that window (`animat.responses.windows.count_spikes`), but for those on its edges.
-        stimuli: which pulses to take, shape (stimuli,); None for those that end a presentation.
+            up to the spikes of that window (`animat.responses.windows.count_spikes`), except those on its edges.
+        stimuli: which pulses to take, shape (stimuli,); None for the last pulses of trials.
 
     Raises:
-        InvalidArgument: for a span that is empty, or bins that are not positive.
+        InvalidArgument: for an empty span, or bins that are not positive.
     """
     if not (math.isfinite(from_ms) and math.isfinite(to_ms) and from_ms < to_ms):
         raise InvalidArgument(f"from_ms, to_ms: expected from_ms < to_ms, got {from_ms:g} and {to_ms:g}")
@@ -95,12 +95,12 @@ def post_stimulus_histogram(
 def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float, float]:
     """Spikes per second, on all channels together, in the quiet stretches before stimuli; and their total time in s.
 
-    Quiet is what lies 100 ms or more after the previous pulse, and 20 to 220 ms before the next one. At 10 Hz and
-    above nothing is: such stimuli do not count, since what comes before them is the response to the previous one. Less
-    than a second of quiet tells nothing: a single burst might fill it.
+    A stretch is quiet from 100 ms after the previous pulse, and 20 to 220 ms before the next one. At 10 Hz and above
+    there is none: such stimuli do not count, since what precedes them is the response to the previous one. Less than a
+    second of quiet is not enough: a single burst might fill it.
 
     Args:
-        after_ms: quiet begins this long after the previous pulse where that is more than 100 ms.
+        after_ms: quiet begins this long after the previous pulse if that is more than 100 ms.
 
     Returns:
         The rate, NaN without a second of quiet time, and the quiet time.
@@ -118,21 +118,18 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
     return (float(spikes.sum()) / quiet_s if quiet_s >= _LEAST_QUIET_S else float("nan")), quiet_s
 
 
-def find_response(
-    recording: Recording, up_to_ms: float = 500.0, stimuli: Bool[np.ndarray, " stimuli"] | None = None
-) -> ResponseTime | None:
-    """When the culture first fires above its spontaneous rate after a stimulus; None where it does not, or is unknown.
+def find_response(recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | None = None) -> ResponseTime | None:
+    """When the culture first fires above its spontaneous rate after a stimulus; None if it does not, or is unknown.
 
-    The first stretch, from 2 ms on, that begins with three successive bins above b + 3 sqrt(b), b the spikes expected
-    spontaneously in a bin, and ends before three successive bins that are not. Bins are 1 ms wide, or up to 10 ms where
-    spikes are few. Only stimuli are used that no other pulse follows within the search; where there are few such, the
-    search is shortened to the upper quarter of the intervals.
+    It is the first stretch, from 2 ms on, that begins with three successive bins above b + 3 sqrt(b), b the spikes
+    expected spontaneously in a bin, and ends before three successive bins that are not. Bins are 1 ms wide, or up to
+    10 ms if spikes are few. Only stimuli without another pulse within the search, of 500 ms, are used; if these are
+    few, the search is shortened to the upper quartile of the intervals.
 
     Args:
-        up_to_ms: how far after the stimulus is searched.
-        stimuli: which pulses to take, shape (stimuli,); None for those that end a presentation.
+        stimuli: which pulses to take, shape (stimuli,); None for the last pulses of trials.
     """
-    table = recording.stimuli
+    table, up_to_ms = recording.stimuli, _SEARCH_MS
     rate_hz, _ = spontaneous_rate(recording)
     read = table.is_last_of_presentation & ~table.is_rest if stimuli is None else stimuli
     if not read.any() or math.isnan(rate_hz):
@@ -160,6 +157,6 @@ def find_response(
 
 
 def _successive(flags: Bool[np.ndarray, " bins"]) -> Bool[np.ndarray, " starts"]:
-    """Whether a flag and the ones after it, three in all, are set."""
+    """Whether a flag and the two after it are set."""
     n = max(len(flags) - _SUSTAINED_BINS + 1, 0)
     return np.asarray(np.logical_and.reduce([flags[i : i + n] for i in range(_SUSTAINED_BINS)]), dtype=bool)

@@ -1,4 +1,4 @@
-"""Readouts: groups of channels whose responses become a command each, told by the electrodes that the channels read."""
+"""Readouts: groups of channels, each decoded into a command, defined by the electrodes that the channels read."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from animat.stimulation.selection import Electrode
 from animat.tables import UNKNOWN
 
 CUT_NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
-"""Of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
+"""Names of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
 _MOST_BYTES = 2**20
 MOST_READOUTS = 64
-USUAL_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
-"""By how many commands a robot takes."""
+DEFAULT_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
+"""By the number of commands that a robot takes."""
 
 Group = Annotated[tuple[Electrode, ...], Field(min_length=1)]
 Name = Annotated[str, Field(min_length=1, max_length=40)]
@@ -39,7 +39,7 @@ class Readouts:
             several groups.
 
     Raises:
-        InvalidArgument: for names or electrodes that are none, or names without electrodes.
+        InvalidArgument: for invalid names or electrodes, or names without electrodes.
     """
 
     names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_READOUTS)] = ("all",)
@@ -51,12 +51,12 @@ class Readouts:
         groups = [tuple(sorted(set(group))) for group in self.electrodes or ()]
         if not groups:
             raise InvalidArgument(
-                f"electrodes: expected a group of them for each of the names {shown(self.names)}, got none"
+                f"electrodes: expected a group of electrodes for each of the names {shown(self.names)}, got none"
             )
         if not len(set(self.names)) == len(self.names) == len(groups) or not all(map(str.isprintable, self.names)):
             raise InvalidArgument(
-                f"names: expected a printable name for each group of electrodes ({len(groups)} in all), each once, "
-                f"got {shown(self.names)}"
+                f"names: expected a different printable name for each group of electrodes ({len(groups)} in all), got "
+                f"{shown(self.names)}"
             )
         object.__setattr__(self, "electrodes", tuple(groups))
 
@@ -69,7 +69,7 @@ class Readouts:
         return self.electrodes is None
 
     def members(self, channels: Channels) -> Bool[np.ndarray, "readouts channels"]:
-        """Which channels of a table are in each group.
+        """Which channels belong to each group.
 
         Raises:
             Mismatch: for channels that do not read all of the electrodes.
@@ -83,7 +83,7 @@ class Readouts:
                     f"{len(read):,} are read ({some_of(sorted(read), 5)})" if read else "which are read is not known"
                 )
                 raise Mismatch(
-                    f"readouts: expected channels that read all electrodes of the readout {name!r}, got none that read "
+                    f"readouts: expected channels that read all electrodes of the readout {name!r}, got none for "
                     f"{len(missing)} of its {len(group)} ({some_of(missing, 5)}); {known}"
                 )
         return np.array([np.isin(channels.electrode, group) for group in self.electrodes])
@@ -95,43 +95,39 @@ class Readouts:
         after_s: Float64[np.ndarray, " windows"],
         window_ms: tuple[float, float],
     ) -> Float64[np.ndarray, "windows *readouts"]:
-        """The response x of each group in the window after each of some times, Hz per channel.
+        """The response x of each group in a window after each pulse, in Hz per channel.
 
             x = S / (T N),  S: spikes of the group's N channels in a window of T
 
         Edges are as in `animat.responses.windows.count_spikes`.
 
         Args:
-            members: of its channels (`members`).
-            after_s: of the pulses, in seconds on the clock of the spikes.
+            members: which of its channels belong to each group (`members`).
+            after_s: times of the pulses, in seconds on the clock of the spikes.
             window_ms: start and end of the window after each.
 
         Returns:
-            A row a window; without the axis of readouts where there is one.
+            A row per window; with a single readout, without the axis of readouts.
         """
         window, spike = spikes_in(recording, after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3)
         channel = recording.spike_channels[spike]
         spikes = np.array([np.bincount(window[group[channel]], minlength=len(after_s)) for group in members])
         rate_hz = spikes.T / ((window_ms[1] - window_ms[0]) * 1e-3 * members.sum(axis=1))
-        return self.alone(rate_hz)
+        return self.squeeze(rate_hz)
 
-    def alone(self, values: Float64[np.ndarray, "*any readouts"]) -> Float64[np.ndarray, "*any_readouts"]:
-        """Values of each group, without their axis where there is one group: the paper's shapes."""
+    def squeeze(self, values: Float64[np.ndarray, "*any readouts"]) -> Float64[np.ndarray, "*any_readouts"]:
+        """Values of each group; for a single group, without the axis of readouts (the paper's shapes)."""
         return values[..., 0] if len(self) == 1 else values
 
     def to_dict(self) -> dict[str, Any] | None:
-        """As JSON data, in the order of the groups; None: one group of all channels."""
+        """As JSON data, in the order of the groups; None for one group of all channels."""
         if self.electrodes is None:
             return None
         return {"names": list(self.names), "electrodes": [list(group) for group in self.electrodes]}
 
     @classmethod
     def from_dict(cls, data: Any) -> Readouts:
-        """What `to_dict` made this of.
-
-        Raises:
-            InvalidArgument: for anything else.
-        """
+        """The inverse of `to_dict`; raises InvalidArgument for anything else."""
         return cls() if data is None else read_record(cls, data, "readouts")
 
 
@@ -140,7 +136,7 @@ ALL = Readouts()
 
 
 def readouts_named(text: str) -> str | Readouts:
-    """The name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`.
+    """Read the name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`.
 
     Raises:
         InvalidArgument: for anything else.
@@ -157,38 +153,34 @@ def readouts_named(text: str) -> str | Readouts:
 
 
 def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
-    """The same, also in a file.
-
-    Raises:
-        InvalidFile: naming the file, what was expected and what came.
-    """
+    """The same, or the name of a file with such JSON; raises InvalidFile if it cannot be read."""
     if text == "all" or text in CUT or str(text).lstrip().startswith("{"):
         return readouts_named(str(text))
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:
-        raise InvalidFile(f"{error}; readouts that have names are all, {' and '.join(CUT)}") from error
+        raise InvalidFile(f"{error}; named readouts are all, {' and '.join(CUT)}") from error
     with in_file(text):
         return readouts_named(written)
 
 
 def count_readouts(readouts: str | Readouts) -> int:
-    """How many there are."""
+    """The number of readouts."""
     return count_places(readouts) if isinstance(readouts, str) else len(readouts)
 
 
 def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
-    """Readouts by the electrodes of a table of channels.
+    """Readouts defined by the electrodes of a recording's channels.
 
-    Halves are the electrodes with the smaller and the larger x, as many in each as can be; each is cut by y for
-    quadrants, as places are (`animat.stimulation.places`).
+    Halves are the electrodes with the smaller and the larger x, split as evenly as possible; for quadrants each half is
+    split by y, as for places (`animat.stimulation.places`).
 
     Args:
-        readouts: `all`, `halves`, `quadrants`, or groups that are known.
+        readouts: `all`, `halves`, `quadrants`, or given groups.
         channels: of a recording.
 
     Raises:
-        InvalidArgument: for channels of which it is not known which electrode they read and where it is, or too few.
+        InvalidArgument: for too few channels, or channels whose electrodes or positions are not known.
         Mismatch: for channels that do not read all electrodes of the groups.
     """
     if readouts == "all":
@@ -201,12 +193,11 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
         electrodes, first = np.unique(channels.electrode, return_index=True)
         if UNKNOWN in electrodes or len(electrodes) < count_places(readouts):
             raise InvalidArgument(
-                f"readouts: expected channels whose electrodes are known to cut into {readouts}, "
-                f"{count_places(readouts)} or more, got {np.count_nonzero(electrodes != UNKNOWN)} of "
-                f"{len(channels)} channels"
+                f"readouts: expected {count_places(readouts)} or more channels, all of whose electrodes are known, to "
+                f"form {readouts}, got {np.count_nonzero(electrodes != UNKNOWN)} electrodes of {len(channels)} channels"
             )
         if not channels.has_positions:
-            raise InvalidArgument(f"readouts: expected channels whose positions are known to cut into {readouts}")
+            raise InvalidArgument(f"readouts: expected channels whose positions are known to form {readouts}")
         groups = electrodes_of(readouts, electrodes, channels.x_um[first], channels.y_um[first])
         return Readouts(CUT_NAMES[readouts], groups)
     readouts.members(channels)

@@ -1,4 +1,4 @@
-"""The culture's responses: what a stimulus of each condition makes it do, one row per stimulus."""
+"""The culture's responses to the stimuli of each condition, one row per stimulus."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from animat.tables import briefly, read_only
 
 
 @dataclass(frozen=True, eq=False)
-class Presented:
-    """All trials of a recording, in the order of time: what a culture may remember when it answers.
+class Trials:
+    """All trials of a recording in the order of time, which form the history of each response.
 
     Attributes:
-        condition: index of each, `NO_CONDITION` where it has none, shape (presentations,).
+        condition: index of each, `NO_CONDITION` if it has none, shape (presentations,).
         rate_hz: x of each, shape (presentations,).
-        is_burst: whether the response was one, shape (presentations,).
+        is_burst: whether the response was a burst, shape (presentations,).
         is_rested: whether there was no pulse in the second before it, shape (presentations,).
-        time_s: of the pulse that it was read after, shape (presentations,); None where it is not known.
+        time_s: of the pulse after which it was read, shape (presentations,); None if it is not known.
     """
 
     __repr__ = briefly
@@ -55,23 +55,23 @@ class Responses:
         rate_hz: x, spikes in the window per second and channel, shape (responses,).
         active_ratio: share of channels with at least one spike in the window, shape (responses,).
         is_burst: whether `active_ratio` is above `threshold`, shape (responses,).
-        conditions: what the agent can choose from, in the order of their index.
-        window_ms: start and end of the window, after the last pulse of each presentation.
-        n_channels: channels that x is a mean over.
-        threshold: of the active ratio, by Otsu's method unless it was given; 1 where that separates nothing, NaN
-            without responses.
-        separability: between-class over total variance of the active ratio, of Otsu's classes or of those that a given
-            threshold makes; NaN where that leaves one (see `animat.responses.bursts`).
-        presentation: how stimuli were presented, None where it is not known.
+        conditions: from which the agent chooses, in the order of their index.
+        window_ms: start and end of the window, after the last pulse of each trial.
+        n_channels: the number of channels over which x is a mean.
+        threshold: of the active ratio, by Otsu's method unless given; 1 if that separates nothing, NaN without
+            responses.
+        separability: between-class over total variance of the active ratio, for Otsu's classes or those of a given
+            threshold; NaN if that leaves only one (see `animat.responses.bursts`).
+        presentation: how stimuli were presented; None if it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
-        time_s: of the pulse that each response was read after, on the recording's clock, shape (responses,); None for
-            responses that come from elsewhere.
-        presented: all trials of the recording, also those without a condition; None: these responses are all,
-            one soon after the other (see `presentations`).
-        place: where among them each response is, shape (responses,).
-        by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None where it is not known.
-        burst_threshold: the threshold that was given in place of Otsu's; None: none was.
-        readouts: what is read of each response; by default all channels as one.
+        time_s: of the pulse after which each response was read, on the recording's clock, shape (responses,); None if
+            it is not known.
+        presented: all trials of the recording, including those without a condition; None: these responses are all, in
+            close succession (see `presentations`).
+        place: the index of each response among them, shape (responses,).
+        by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
+        burst_threshold: the given threshold; None: it is Otsu's.
+        readouts: the groups of channels read; by default all channels as one.
         readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None for all channels as
             one, whose x is `rate_hz`.
 
@@ -94,7 +94,7 @@ class Responses:
     start_min: float = 0.0
     findings: tuple[Finding, ...] = ()
     time_s: Float64[np.ndarray, " responses"] | None = None
-    presented: Presented | None = None
+    presented: Trials | None = None
     place: Int64[np.ndarray, " responses"] | None = None
     by: str | None = None
     burst_threshold: float | None = None
@@ -109,10 +109,10 @@ class Responses:
                 continue
             array = read_only(self, name, dtype)
             if array.shape != (len(self),):
-                raise Mismatch(f"responses.{name}: expected {len(self)} values, one a response, got {array.shape}")
+                raise Mismatch(f"responses.{name}: expected {len(self)} values, one per response, got {array.shape}")
         self._check_places()
         if (self.readout_hz is None) != self.readouts.are_all:
-            raise Mismatch("responses.readout_hz: expected some where readouts are groups of channels, and only there")
+            raise Mismatch("responses.readout_hz: expected if, and only if, readouts are groups of channels")
         if self.readout_hz is not None:
             array = read_only(self, "readout_hz", np.float64)
             if array.shape != (shape := (len(self),) if len(self.readouts) == 1 else (len(self), len(self.readouts))):
@@ -139,15 +139,15 @@ class Responses:
 
     @property
     def is_blocked(self) -> bool:
-        """Whether all trials of a condition were presented together; False where that is not known."""
+        """Whether all trials of a condition were presented together; False if that is not known."""
         return self.presentation is not None and self.presentation.order == "blocked"
 
     @property
-    def presentations(self) -> tuple[Presented, Int64[np.ndarray, " responses"]]:
-        """All trials of the recording in the order of time, and where among them each response is."""
+    def presentations(self) -> tuple[Trials, Int64[np.ndarray, " responses"]]:
+        """All trials of the recording in the order of time, and the index of each response among them."""
         if self.presented is not None and self.place is not None:
             return self.presented, self.place
-        every = Presented(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
+        every = Trials(self.condition, self.rate_hz, self.is_burst, np.zeros(len(self), np.bool_))
         return every, np.arange(len(self))
 
     @property
@@ -159,7 +159,7 @@ class Responses:
 
     @property
     def read_hz(self) -> Float64[np.ndarray, "responses *readouts"]:
-        """x of the readouts, Hz: what simulators are made of, and decoders read."""
+        """x of the readouts, Hz: what simulators are fitted to and decoders read."""
         return self.rate_hz if self.readout_hz is None else self.readout_hz
 
     def read_of(self, condition: int) -> Float64[np.ndarray, "non_bursts *readouts"]:
@@ -167,9 +167,9 @@ class Responses:
         return np.asarray(self.read_hz[(self.condition == condition) & ~self.is_burst])
 
     def of_readout(self, readout: int) -> Responses:
-        """The responses of one of several readouts, as if it were all that is read."""
+        """The responses of one of several readouts, as if it were the only one."""
         rate_hz = self.read_hz[:, readout]
-        # What was presented without a condition is known of all channels only.
+        # Trials without a condition are only known for all channels together.
         return replace(self, rate_hz=rate_hz, readouts=ALL, readout_hz=None, presented=None, place=None)
 
     @property
@@ -188,17 +188,16 @@ class Responses:
         return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
 
     def bootstrapped(self, rng: np.random.Generator) -> Responses:
-        """As many non-burst responses to each condition again, drawn from them with replacement: a bootstrap sample.
+        """A bootstrap sample: as many non-burst responses to each condition, drawn from them with replacement.
 
-        Each keeps what was presented before it. Bursts are left out, and a condition without other responses stays
-        without.
+        Each keeps its history. Bursts are left out, and a condition without other responses remains empty.
         """
         rows = [np.flatnonzero((self.condition == c) & ~self.is_burst) for c in range(len(self.conditions))]
         drawn = np.sort(np.concatenate([rng.choice(of, len(of)) for of in rows if len(of)] or [np.empty(0, np.int64)]))
         return replace(self.at_rows(drawn), findings=())
 
     def only(self, conditions: Sequence[int]) -> Responses:
-        """The responses to some conditions, by index; what was presented before them is kept."""
+        """The responses to some conditions, by index; their history is kept."""
         index = np.full(len(self.conditions) + 1, NO_CONDITION)
         index[list(conditions)] = np.arange(len(conditions))
         kept = self.at_rows(np.flatnonzero(index[self.condition] != NO_CONDITION))
@@ -207,12 +206,12 @@ class Responses:
             kept,
             condition=index[kept.condition],
             conditions=tuple(self.conditions[i] for i in conditions),
-            # No condition is the last index, -1, and stays none.
+            # NO_CONDITION, -1, is the last index, and stays.
             presented=replace(presented, condition=index[presented.condition]),
         )
 
     def at_rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
-        """Some of the responses; what was presented before them is kept."""
+        """Some of the responses; their history is kept."""
         presented, place = self.presentations
         columns: dict[str, Any] = {
             name: getattr(self, name)[rows] for name in ("condition", "rate_hz", "active_ratio", "is_burst")

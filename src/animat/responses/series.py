@@ -1,4 +1,4 @@
-"""From the recordings of one culture to their responses, with what makes training on them pointless refused."""
+"""From the recordings of one culture to their responses, refusing those on which training is pointless."""
 
 from __future__ import annotations
 
@@ -38,31 +38,32 @@ def extract_series(
     allow: Sequence[str] = (),
     readouts: str | Readouts = ALL,
 ) -> list[Responses]:
-    """Extract the responses of recordings that are to be learned from.
+    """Extract the responses of recordings, to fit simulators to them.
 
     Args:
         recordings: of one culture; tables of responses too.
-        by: what makes a condition; None: by frequency where it is known, by place where the protocol has places.
+        by: the rule of the conditions; None: by frequency if it is known, by place if the protocol has places.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
-        allow: names of findings (`"dead-window"`) to go on in spite of.
+        allow: names of findings (`"dead-window"`) to ignore.
         readouts: groups of channels, the same electrodes in all recordings; `halves` and `quadrants` are those of the
             first one.
 
     Raises:
-        UnusableData: if a finding says that learning from a recording makes no sense, or simulated recordings are of
-            several seeds, and that is not in `allow`.
-        InvalidArgument: for a name in `allow` of no finding that refuses, or readouts that the channels cannot have.
+        UnusableData: if a finding refuses a recording, or simulated recordings have different seeds, unless `allow`
+            names it.
+        InvalidArgument: for a name in `allow` that is not a refusing finding, or readouts that the channels do not
+            have.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
-    kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings makes"
+    kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings returns"
     recordings = expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
     cultures = [each.culture for each in recordings if isinstance(each, Recording)]
     seeds = {str(culture.seed) for culture in cultures if culture and culture.kind == "virtual"}
     if len(seeds) > 1 and "several-cultures" not in allow:
         raise UnusableData(
-            f"recordings: expected those of one culture, got simulated ones of seeds {', '.join(sorted(seeds))}; "
+            f"recordings: expected those of one culture, got simulated ones with seeds {', '.join(sorted(seeds))}; "
             "leave out all but one culture's (to allow it: --allow several-cultures)"
         )
     series = []
@@ -71,7 +72,7 @@ def extract_series(
             readouts = readouts_on(readouts, recording.channels)
             responses = extract_responses(recording, by, window_ms, burst_threshold, readouts)
         except (UnusableData, Mismatch) as error:
-            # The argument that it begins with stays at the front.
+            # Appended, as the message begins with the argument.
             raise type(error)(f"{error} (the recording at {in_min(recording.start_min)})") from error
         for finding in (*recording_findings(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
@@ -84,11 +85,7 @@ def extract_series(
 
 
 def check_allowed(names: Sequence[str]) -> None:
-    """Raise unless all are names of findings that refuse: a misspelt one would be asked for in vain.
-
-    Raises:
-        InvalidArgument: naming the first that is not.
-    """
+    """Raise InvalidArgument unless all are names of refusing findings: a misspelt one would have no effect."""
     for name in names:
         if name not in REFUSING:
             raise InvalidArgument(f"allow: expected findings among {', '.join(REFUSING)}, got {name!r}")

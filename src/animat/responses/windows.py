@@ -15,8 +15,8 @@ from animat.errors import InvalidArgument, expect_several, shown
 DEFAULT_WINDOW_MS = (2.0, 10.0)
 """The paper's window: the first 2 ms after a stimulus are lost in its artefact."""
 HALF_NS_S = 0.5e-9
-"""Histograms of lags begin each bin so much earlier, as if lags were rounded to a nanosecond: else the rounding of
-differences would decide about lags on an edge, where times on a sampling grid often lie."""
+"""Histograms of lags begin each bin this much earlier, as if lags were rounded to a nanosecond: otherwise rounding
+errors would decide about lags on an edge, which are common with times on a sampling grid."""
 
 
 class Spiking(Protocol):
@@ -39,16 +39,16 @@ class Spiking(Protocol):
 def read_windows(
     recording: Spiking, after_s: Float64[np.ndarray, " windows"], window_ms: tuple[float, float]
 ) -> tuple[Float64[np.ndarray, " windows"], Float64[np.ndarray, " windows"]]:
-    """The response in the window after each of some times: its rate x and its ratio of active channels.
+    """The response in a window after each pulse: its rate x and its ratio of active channels.
 
         x = S / (T N)
 
-    Offline and in a closed loop a response is what this function says it is. From the same times it gives the same
-    bits, from a piece of a recording as from the whole.
+    This function defines a response, both offline and in a closed loop. For the same times the result is the same to
+    the bit, from a piece of a recording as from the whole.
 
     Args:
         recording: the spikes, on at least one channel.
-        after_s: of the pulses, in seconds on the clock of the spikes.
+        after_s: times of the pulses, in seconds on the clock of the spikes.
         window_ms: start and end of the window after each.
     """
     from_s, to_s = after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3
@@ -85,9 +85,9 @@ def count_spikes(
 ) -> Int64[np.ndarray, " windows"]:
     """The number of spikes with from_s <= time < to_s, on all channels together.
 
-    Windows are half-open, so that windows that touch share no spike. The comparison is the plain one of double
-    precision numbers. Times on a sampling grid can lie exactly on an edge; there the rounding of the sum of the
-    stimulus' time and the window's edge decides, one sample (0.05 ms at 20 kHz) either way.
+    Windows are half-open, so that adjacent windows share no spike. Times are compared in double precision. Those on a
+    sampling grid can lie exactly on an edge; there the rounding of the sum of stimulus time and window edge decides,
+    one sample (0.05 ms at 20 kHz) either way.
 
     Args:
         from_s, to_s: the windows, in seconds on the recording's clock, shape (windows,).
@@ -108,6 +108,6 @@ def spikes_in(
 def _first_and_count(
     recording: Spiking, from_s: Float64[np.ndarray, " windows"], to_s: Float64[np.ndarray, " windows"]
 ) -> tuple[Int64[np.ndarray, " windows"], Int64[np.ndarray, " windows"]]:
-    """The number of the first spike of each window, and how many there are; edges as in `count_spikes`."""
+    """The index of the first spike of each window, and the number of spikes; edges as in `count_spikes`."""
     first = recording.spike_times_s.searchsorted(from_s)
     return first, recording.spike_times_s.searchsorted(to_s) - first

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from pydantic import BeforeValidator, Field
 
 from animat.errors import InvalidArgument, shown
-from animat.late import Array, jax
+from animat.lazy import Array, jax
 from animat.records import Number, Whole
 
 State = TypeVar("State")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from animat.errors import AnimatError, InvalidArgument, first_line, shown
-from animat.late import jax, jnp
+from animat.lazy import jax, jnp
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
 from animat.robots.grid import Grid
 from animat.robots.host import Bodies, HostRobot

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
 from animat.errors import InvalidArgument
-from animat.late import Axes
+from animat.lazy import Axes
 from animat.robots.base import Robot, capability
 
 Colour = tuple[int, int, int]

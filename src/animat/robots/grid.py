@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from animat.errors import InvalidArgument, first_line, shown
-from animat.late import Array, jnp
+from animat.lazy import Array, jnp
 from animat.robots.base import Robot, capability
 
 _FINEST = 8192.0

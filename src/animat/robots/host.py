@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 
 from animat.errors import AnimatError, BodyFailed, InvalidArgument, first_line
-from animat.late import Array, jnp
+from animat.lazy import Array, jnp
 from animat.robots.base import Robot
 
 Answer = TypeVar("Answer")

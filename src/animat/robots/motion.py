@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from jaxtyping import Float
 
-from animat.late import Array, jax, jnp
+from animat.lazy import Array, jax, jnp
 
 Numbers = TypeVar("Numbers")
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.late import Array, Axes, jnp
+from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, AIM, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from animat.errors import InvalidArgument
-from animat.late import Array, Axes, jax, jnp
+from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
 from animat.robots.base import Iterations, Quantity, Robot, Size
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from animat.late import Array
+from animat.lazy import Array
 from animat.records import Number
 from animat.robots.base import Size
 

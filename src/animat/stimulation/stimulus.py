@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from animat.errors import InvalidArgument, UnusableData
 from animat.stimulation.plain import number, seconds, whole_number
 from animat.stimulation.pulse import Pulse
-from animat.tables import FASTEST_HZ, UNKNOWN, briefly, expect_rising_times, freeze, made_anew
+from animat.tables import FASTEST_HZ, UNKNOWN, briefly, expect_rising_times, freeze, reduce_dataclass
 
 _ONLY_INT = frozenset({int})
 NOTHING = -2
@@ -109,7 +109,7 @@ class Stimuli:
             (stimuli,).
     """
 
-    __repr__, __reduce__ = briefly, made_anew
+    __repr__, __reduce__ = briefly, reduce_dataclass
 
     time_s: Float64[np.ndarray, " stimuli"]
     frequency_hz: Float64[np.ndarray, " stimuli"]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, final
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.trains import train_alone
-from animat.progress import InTurn, Progress
+from animat.progress import EqualPhases, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
-from animat.responses.readouts import USUAL_READOUTS
+from animat.responses.readouts import DEFAULT_READOUTS
 from animat.responses.responses import Responses
 from animat.studies.task import draw_seed
 
@@ -137,7 +137,7 @@ class RobotTask(ContextTask):
         from animat.responses.series import extract_series
 
         recordings = read_sources([self.recordings(folder, self.n_commands)])
-        return extract_series(recordings, readouts=USUAL_READOUTS[self.n_commands])
+        return extract_series(recordings, readouts=DEFAULT_READOUTS[self.n_commands])
 
     def seed_for(self, purpose: str) -> int:
         """A seed for each culture and robot; otherwise sessions of all would begin at the same few starts."""
@@ -191,7 +191,7 @@ class Judge(RobotTask):
             seed=self.seed_for("judge"),
             optimum_resolution=self.study.optimum_resolution,
             interventions=True,
-            progress=InTurn(progress, 3),
+            progress=EqualPhases(progress, 3),
         )
         return [write_json(self.path(folder, SIMULATED), evaluation.to_dict())]
 
@@ -227,7 +227,7 @@ class Measure(RobotTask):
                 pulse=protocol.pulse,
                 patterns=protocol.patterns,
                 # Best coupling, prediction, closed loop, optimal return.
-                progress=InTurn(progress, 4),
+                progress=EqualPhases(progress, 4),
             )
         if gap.session.ending.by != "plan":
             raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to continue")

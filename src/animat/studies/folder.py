@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from animat.differences import description_in, first_difference, of_another, with_fingerprint
+from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
@@ -156,7 +156,7 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
         Mismatch: if it belongs to other work, or holds other files.
         InvalidFile: if its description, the first of its files, cannot be read.
     """
-    found = description_in(folder / files[0], what)
+    found = read_description(folder / files[0], what)
     if found is None:
         if folder.is_dir() and not all(map(_is_hidden, folder.iterdir())):
             raise Mismatch(f"{folder}: expected an empty folder or one of this {what}, got one with other files in it")
@@ -166,7 +166,7 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
     # Work that stopped at its first step left only these files, and may be replaced.
     left = (path for path in folder.rglob("*") if not path.is_dir() and not _is_hidden(path))
     if any(path.name not in files for path in left):
-        raise of_another(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
+        raise folder_mismatch(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
 
 

@@ -13,7 +13,7 @@ from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, placed
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
@@ -155,7 +155,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
     try:
         with safe_open(path, framework="numpy") as file:
             metadata: dict[str, Any] = json.loads(file.metadata()["animat"])
-            arrays = {name: placed(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
+            arrays = {name: to_jax(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
         conditions = tuple(Condition(**each) for each in metadata["conditions"])
         labels = tuple(condition.label for condition in conditions)
         presentation = metadata["presentation"]

@@ -15,10 +15,10 @@ import numpy as np
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
-from animat.differences import description_in, fingerprint_of, first_difference, of_another
+from animat.differences import fingerprint_of, first_difference, folder_mismatch, read_description
 from animat.errors import InvalidArgument, Mismatch
+from animat.folder_kinds import expect_no_other
 from animat.goals.robot import without_goal
-from animat.marks import expect_no_other
 from animat.neurons.timeline import SimulatorTimeline
 from animat.plain_file import expect_no_file
 from animat.robots.checking import check_robot
@@ -133,7 +133,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
         unknown = ("simulators", *_BESIDE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
         if difference := _first_difference(found, describe(training, None), unknown):
-            raise of_another(folder, "training", difference)
+            raise folder_mismatch(folder, "training", difference)
 
 
 def is_finished(training: Training, folder: Path) -> bool:
@@ -173,13 +173,13 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     found = _description_in(folder)
     if found is not None and found["fingerprint"] != manifest["fingerprint"]:
         difference = _first_difference(found, manifest, _NOT_TOLD) or "other responses"
-        raise of_another(folder, "training", difference)
+        raise folder_mismatch(folder, "training", difference)
     return found is not None
 
 
 def _description_in(folder: Path) -> dict[str, Any] | None:
     """What a folder says it holds; None if it is free."""
-    if (found := description_in(folder / MANIFEST, "training")) is not None:
+    if (found := read_description(folder / MANIFEST, "training")) is not None:
         return found
     expect_no_file(folder, "the policies")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):

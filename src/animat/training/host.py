@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
-from animat.neurons.history import AT_FIRST
+from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot, Snapshot
 from animat.training.exploration import ended_episodes
@@ -35,7 +35,7 @@ from animat.training.sac import (
     uniforms_of,
 )
 from animat.training.settings import SAC
-from animat.wrappers import EpisodeLimit, TrialCosts, costing, net_return
+from animat.wrappers import EpisodeLimit, TrialCosts, add_cost, net_return
 
 
 class Acted(NamedTuple):
@@ -99,7 +99,7 @@ def learn_and_act(
     after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons)
     net = reward
     if acted.cost is not None:
-        after, net = costing(after, acted.cost), reward - acted.cost
+        after, net = add_cost(after, acted.cost), reward - acted.cost
     state, next_state = state_of(environment, before), state_of(environment, after)
     # Critics see the time left: at the limit the return ends. Where a body cut an episode off before, it goes on.
     is_last = terminated | (after.iteration >= environment.robot.episode_limit)
@@ -111,7 +111,7 @@ def learn_and_act(
         episodes=after._replace(
             robot=begun,
             iteration=jnp.where(ended, 0, after.iteration),
-            neurons=jnp.where(ended[:, None], jnp.array(AT_FIRST, jnp.float32), after.neurons),
+            neurons=jnp.where(ended[:, None], jnp.array(INITIAL_HISTORY, jnp.float32), after.neurons),
             info=jax.tree.map(lambda cost: jnp.where(ended, 0.0, cost), after.info),
         ),
         returns=jnp.where(ended, 0.0, returns),
@@ -218,7 +218,7 @@ class _Chunks:
         anew = episodes._replace(
             iteration=jnp.zeros_like(episodes.iteration),
             info=jax.tree.map(jnp.zeros_like, episodes.info),
-            neurons=jnp.broadcast_to(jnp.array(AT_FIRST, jnp.float32), episodes.neurons.shape),
+            neurons=jnp.broadcast_to(jnp.array(INITIAL_HISTORY, jnp.float32), episodes.neurons.shape),
         )
         return learners._replace(episodes=anew, returns=jnp.zeros_like(learners.returns)), self._bodies
 

@@ -21,8 +21,8 @@ from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
 from animat.goals.robot import body_and_goal, robot_of, without_goal
-from animat.neurons.history import AT_FIRST
-from animat.plain_file import expect_plain_file, is_folder, is_nothing
+from animat.neurons.history import INITIAL_HISTORY
+from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.records import Number, read_record
 from animat.responses.condition import Condition, abbreviated
 from animat.responses.readouts import ALL, Readouts
@@ -121,7 +121,7 @@ class Policy:
         if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
-        seen = len(self.robot.observation_spec) + len(AT_FIRST) * self.neural_observation
+        seen = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation
         widths = [seen, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
@@ -382,7 +382,7 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     """
     path = Path(path)
     if not is_folder(path):
-        if is_nothing(path):
+        if is_absent(path):
             raise InvalidFile(f"{path}: expected a policy file or a folder of them, got no such file; train them first")
         return {path.stem: Policy.load(path)}
     # Hidden files are unfinished ones: a process was killed while it wrote them.

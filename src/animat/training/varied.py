@@ -24,7 +24,7 @@ from animat.goals.robot import RobotWithGoal, without_goal
 from animat.neurons.simulator import NeuronSimulator, Stored
 from animat.robots.base import Robot
 from animat.training.lessons import Lesson
-from animat.wrappers import Wrapper, with_inmost
+from animat.wrappers import Wrapper, replace_innermost
 
 Kind = TypeVar("Kind", bound=Robot[Any])
 
@@ -125,7 +125,7 @@ class Varied(Wrapper[RobotState]):
         if not values:
             return self.inside
         varied = with_parameters(self.robot, values)
-        return with_inmost(self.inside, lambda inmost: dataclasses.replace(inmost, robot=varied))  # type: ignore[type-var]
+        return replace_innermost(self.inside, lambda inmost: dataclasses.replace(inmost, robot=varied))  # type: ignore[type-var]
 
     def _drawn(self, state: State, simulator: NeuronSimulator | None) -> NeuronSimulator | None:
         if not self.varying.recordings:

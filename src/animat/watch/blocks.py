@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from animat.progress import duration_in_words
+from animat.progress import format_duration
 from animat.watch.plain import number, text
 
 Width = Literal["third", "half", "two-thirds", "whole"]
@@ -77,4 +77,4 @@ def time_left(seconds: float | None, state: dict[str, Any]) -> str:
     """The remaining time of work in a state (`animat.watch.state.state_of`)."""
     if state["state"] != "running":
         return "none: it has ended" if state["state"] == "ended" else "none: it is not running"
-    return "not known yet" if (known := number(seconds)) is None else duration_in_words(known)
+    return "not known yet" if (known := number(seconds)) is None else format_duration(known)

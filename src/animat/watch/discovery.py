@@ -11,12 +11,12 @@ from typing import Literal
 from animat.closed_loop.session_data import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
-from animat.marks import MARKS
+from animat.folder_kinds import MARKERS
 
 Kind = Literal["session", "training", "study", "cultures", "tuning", "recording"]
 
 _MARKED: tuple[Kind, ...] = ("session", "training", "tuning", "study", "cultures")
-_MARKS = tuple((kind, MARKS[kind][0]) for kind in _MARKED)
+_MARKS = tuple((kind, MARKERS[kind][0]) for kind in _MARKED)
 """The file that identifies each kind."""
 _DEPTH, _MOST_FOLDERS, _MOST_ITEMS = 4, 4000, 2000
 _SKIPPED = ("jobs", "figures", "tables", "checkpoints")

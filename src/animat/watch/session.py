@@ -13,7 +13,7 @@ from animat.closed_loop.log import Record
 from animat.closed_loop.outline import Outline
 from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
-from animat.progress import duration_in_words
+from animat.progress import format_duration
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
 from animat.watch.blocks import time_left
@@ -195,7 +195,7 @@ class SessionView(View):
     def _state(self) -> dict[str, Any]:
         """The session's state, with a message."""
         silent_s = max(0.0, time.time() - self.tail.path.stat().st_mtime)
-        silent = f"nothing was written for {duration_in_words(silent_s)}"
+        silent = f"nothing was written for {format_duration(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()
         last = {} if not len(self.tail) else (self.tail.peek(len(self.tail) - 1) or {})
         damage = self.tail.damage

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
 
-from animat.compilation import kept_njit
+from animat.compilation import cached_njit
 from animat.cultures.tissue.arrays import Arrivals, Constants, State, Wiring
 
 ORDER = (
@@ -42,7 +42,7 @@ SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 """Mean and standard deviation of the sum of four uniform 16-bit integers."""
 
 
-compiled = kept_njit(error_model="numpy", fastmath=False)
+compiled = cached_njit(error_model="numpy", fastmath=False)
 # Without inlining, every call would copy the descriptors of all its arrays, and every function be compiled separately.
 inlined = numba.njit(error_model="numpy", inline="always")
 

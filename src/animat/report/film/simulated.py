@@ -58,7 +58,7 @@ def scene_of_policies(
     if first.mapping is not None and timeline is not None:
         if timeline.conditions != first.conditions:
             raise InvalidArgument("recordings: expected the conditions that the policies choose from, got others")
-        row = timeline.row_asked_for(timeline.start_min[-1] if at_min is None else at_min)
+        row = timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)
         fixed = timeline.with_first_percentiles() if first.percentiles == "first" else timeline
         simulator = fixed.at(float(timeline.start_min[row]))
         environment = Animat(robot, first.mapping, len(first.conditions))

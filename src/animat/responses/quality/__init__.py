@@ -1,1 +1,1 @@
-"""What makes responses doubtful: the findings, apart from the extraction."""
+"""Findings that make responses doubtful, separate from their extraction."""

@@ -1,4 +1,4 @@
-"""Whether a culture answers at the end of a recording as it did at the beginning."""
+"""Whether a culture responds at the end of a recording as it did at the beginning."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 
 LARGE = 0.25
-"""Change over the recording, relative to the mean response, that is warned of."""
+"""Change over the recording, relative to the mean response, above which there is a warning."""
 CERTAIN = 4.0
-"""Standard errors that it must be away from none."""
+"""Standard errors by which the change must differ from 0."""
 FEWEST = 20
 
 
 def drift_findings(responses: Responses) -> Iterator[Finding]:
-    """A finding on drift within the recording (`drift`), if there is some.
+    """A finding on drift within the recording (`drift`), if there is any.
 
-    Least squares of x / m_c = 1 + s t over the non-burst responses, m_c the mean of the response's condition and t its
-    time relative to the mean time of its condition, in units of the time that the condition was presented for: so that
-    what differs between conditions, which a blocked protocol presents one after the other, is not taken for drift. s is
+    Least squares of x / m_c = 1 + s t over the non-burst responses, with m_c the mean of the response's condition and t
+    its time relative to the mean time of its condition, in units of the time over which the condition was presented. So
+    differences between conditions, which a blocked protocol presents one after the other, do not count as drift. s is
     the relative change from a condition's first stimuli to its last; its standard error comes from the residuals.
 
     Args:
-        responses: with their times; those of a table without any are taken in the order of its rows.
+        responses: with their times; without times, the order of rows is used.
     """
     if len(responses) < FEWEST:
         return
@@ -64,7 +64,7 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
         f"(+- {100 * error:.0f} %) from a condition's first stimuli to its last "
         + ("(in the order of the rows)" if responses.time_s is None else f"(recording: {span_s / 60:.1f} min)")
         + (
-            ": one simulator stands for a culture that changes; record for a shorter time or wait until it has settled"
+            ": one simulator represents a culture that changes; record for a shorter time or wait until it has settled"
             + ("" if is_mixed else ", or present conditions mixed, so that drift is not taken for a difference")
             if large
             else ""

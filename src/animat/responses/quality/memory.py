@@ -1,4 +1,4 @@
-"""Whether what a culture answers depends on what it answered just before."""
+"""Whether a culture's response depends on its previous response."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from animat.recordings.findings import Finding
 from animat.responses.responses import Responses
 
 CERTAIN = 4.0
-"""Standard errors that the difference must be away from none."""
+"""Standard errors by which the difference must differ from 0."""
 STRETCH = 250
-"""Responses in a stretch of the recording, which has a median of its own: a drift is no memory."""
+"""Responses in a stretch of the recording; each stretch has its own median, as drift is not memory."""
 
 
 def memory_findings(responses: Responses) -> Iterator[Finding]:
-    """A finding on the culture's memory from one response to the next (`memory`), if there is some.
+    """A finding on the culture's memory from one response to the next (`memory`), if there is any.
 
-    For each condition in each stretch of the recording, how often its non-burst responses pass the stretch's median
-    after a response that did, p1, and after one that did not, p0. The difference is averaged over all of these with the
-    weights w = n1 n0 / (n1 + n0), so that neither what differs between conditions nor what drifts is taken for memory.
-    Its standard error is sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0): that of independent
-    responses.
+    For each condition in each stretch of the recording, p1 is how often its non-burst responses pass the stretch's
+    median after a response that did, and p0 after one that did not. The difference is averaged over all of these with
+    the weights w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count as memory. Its standard
+    error is that of independent responses, sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0).
 
     Args:
         responses: in the order of time.
@@ -53,8 +52,8 @@ def memory_findings(responses: Responses) -> Iterator[Finding]:
     if abs(after_one - after_none) <= CERTAIN * error:
         return
     message = (
-        f"the culture remembers: after a response that passes the median {100 * after_one:.0f} % of the next ones do, "
-        f"after one that does not {100 * after_none:.0f} %, conditions apart; histograms know nothing of it, the "
-        f"memory simulator does{', of recordings with --order mixed' if responses.is_blocked else ''}"
+        f"the culture remembers: of the responses after one that passes the median {100 * after_one:.0f} % pass it "
+        f"too, of the others {100 * after_none:.0f} %, within conditions; histogram simulators ignore this, memory "
+        f"simulators do not{' (fitted to recordings with --order mixed)' if responses.is_blocked else ''}"
     )
     yield Finding("memory", "note", message, after_one - after_none)

@@ -1,4 +1,4 @@
-"""Whether times of spikes are fine enough for the window that responses are read in."""
+"""Whether spike times are fine enough for the response window."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 
 COARSE = 0.25
-"""Of the window, above which a step of the times is too coarse for it."""
+"""Share of the window above which a step of the times is too coarse."""
 ENOUGH_SPIKES, ENOUGH_STEPS = 1000, 20
 WHOLE, NEARLY_ALL = 0.01, 0.99
-"""How near to whole numbers of steps intervals are, and which share of them."""
+"""How close intervals must be to a whole number of steps, and the share of intervals that must be."""
 
 
 def resolution_findings(recording: Recording, window_ms: tuple[float, float]) -> Iterator[Finding]:
-    """A finding on times of spikes that come in steps of more than a quarter of the window (`coarse-times`).
+    """A finding on spike times that come in steps of more than a quarter of the window (`coarse-times`).
 
-    The step is the shortest interval between spikes of different times, if nearly all intervals are whole multiples of
-    it. Only the later half is looked at, as times in single precision grow coarser.
+    The step is the shortest interval between different spike times, if nearly all intervals are whole multiples of it.
+    Only the later half is examined, as times in single precision grow coarser.
 
     Args:
         recording: with any spikes.
@@ -37,7 +37,7 @@ def resolution_findings(recording: Recording, window_ms: tuple[float, float]) ->
     if not is_grid or 1e3 * step_s <= COARSE * width_ms:
         return
     message = (
-        f"times of spikes come in steps of {1e3 * step_s:.3g} ms, too coarse for a window of {width_ms:g} ms: which "
-        "spikes it holds is chance; bring times in double precision (float64, more decimals), or use a longer window"
+        f"spike times come in steps of {1e3 * step_s:.3g} ms, too coarse for a window of {width_ms:g} ms: which spikes "
+        "it holds is chance; supply times in double precision (float64, more decimals), or use a longer window"
     )
     yield Finding("coarse-times", "warning", message, 1e3 * step_s)

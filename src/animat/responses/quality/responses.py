@@ -1,4 +1,4 @@
-"""What makes responses doubtful: every finding on a recording's responses, with what it means and what to do."""
+"""Every finding on a recording's responses: what makes them doubtful, what it means and what to do."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from animat.responses.responses import Responses
 from animat.stimulation.stimulus import Stimuli
 
 FEW_SAMPLES = 30
-"""Below this many non-burst responses of a condition, its distribution is little more than a guess."""
+"""With fewer non-burst responses of a condition, its distribution is little more than a guess."""
 MANY_BURSTS = 0.25
 SMALL_DIFFERENCE = 0.1
-"""Conditions whose P(x >= P50) lie closer together leave a policy nothing to choose between."""
+"""If P(x >= P50) of all conditions differ by less, a policy has nothing to choose between."""
 LITTLE_DIFFERENCE = 0.2
-"""Below this a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200
+"""If they differ by less, a robot can hardly be steered: an organoid's 0.16 is worth 7 of the cartpole's 200
 (docs/evidence/optimal-return.md)."""
 
 _WINDOW_PARTS = 8
 _PLACES = {CUT_NAMES["halves"]: "corners", CUT_NAMES["quadrants"]: "quadrants"}
-"""What to record for readouts that are cut so."""
+"""The places to record for such readouts."""
 _NAMED_ALONE = ("frequency", "electrode", "pattern")
-"""Kinds of conditions that are named without values: all of them that a recording has."""
+"""Kinds of conditions that may be named without values: all that occur in a recording."""
 
 
 def findings_on(
@@ -54,28 +54,28 @@ def findings_on(
     bursts: BurstSeparation,
     inside: Bool[np.ndarray, " stimuli"] | None = None,
 ) -> tuple[Finding, ...]:
-    """Everything there is to say about how far responses can be trusted.
+    """All findings on how far responses can be trusted.
 
     Args:
-        source: what they are of; of a table, what takes the times of spikes cannot be told.
+        source: of the responses; findings that need spike times are left out for a table.
         inside: whether a pulse's window ends within the recording, shape (stimuli,); None: all do.
     """
     if isinstance(source, ResponseTable):
         message = (
-            "the table has no times of spikes, so it is not known whether its window holds the response, an artefact "
-            "or a blank, nor how the culture fires without stimuli"
+            "the table has no spike times, so it is not known whether its window holds the response, an artefact or a "
+            "blank, nor how the culture fires without stimuli"
         )
         found = [Finding("spike-times-unknown", "warning", message)]
     elif not len(source.stimuli):
         message = (
-            "the recording holds no stimuli, so there is no response to learn from: give the stimuli's times with the "
-            "spikes"
+            "the recording holds no stimuli, so there is no response to learn from: supply the stimulus times with "
+            "the spikes"
         )
         return (Finding("no-stimuli", "refuse", message, 0.0),)
     else:
         response = None if source.stimuli.is_rest.all() else find_response(source)
         found = [*_timing(responses, source, assignment, response)]
-        # Two windows to use are one too many: where the response is elsewhere, its own is told.
+        # Only one window is recommended: if the response is elsewhere, that is the one around it.
         outside = any(finding.name in ("dead-window", "response-elsewhere") for finding in found)
         is_elsewhere = outside and response is not None
         found += artefact_findings(source, responses.window_ms, is_elsewhere=is_elsewhere)
@@ -101,10 +101,10 @@ def _left_out(
     without = int(np.count_nonzero(read & ~has_condition))
     if without == n_read:
         kind = by.partition(":")[0]
-        there = conditions_named(kind).assign(stimuli).conditions if kind in _NAMED_ALONE else ()
-        known = f"; the recording has {some_of([each.label for each in there])}" if there else ""
+        occurring = conditions_named(kind).assign(stimuli).conditions if kind in _NAMED_ALONE else ()
+        known = f"; the recording has {some_of([each.label for each in occurring])}" if occurring else ""
         message = (
-            f"no stimulus of {n_read} belongs to the conditions {by}{known}: choose others (--conditions frequency, "
+            f"none of {n_read} stimuli belongs to the conditions {by}{known}: choose others (--conditions frequency, "
             "interval, electrode or pattern)"
         )
         yield Finding("no-condition", "refuse", message, float(without))
@@ -134,7 +134,7 @@ def _timing(
     if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
         message = (
             f"{overlapping} of {np.count_nonzero(read)} stimuli are followed by another pulse before their window ends "
-            f"at {end_ms:g} ms, so their responses hold its artefact and its response: use a shorter window"
+            f"at {end_ms:g} ms, so its artefact and response are counted in theirs: use a shorter window"
         )
         yield Finding("stimuli-too-close", "warning", message, float(overlapping))
     rate_hz, _ = spontaneous_rate(recording, after_ms=end_ms)
@@ -142,7 +142,8 @@ def _timing(
     if math.isnan(rate_hz) and parts.count.any():
         message = (
             "stimuli follow each other too fast to see how the culture fires without them (less than a second in all "
-            "is 100 ms after a pulse and before the next), so it is not known whether the window holds a response"
+            "lies 100 ms or more after a pulse and before the next), so it is not known whether the window holds a "
+            "response"
         )
         yield Finding("window-not-tested", "note", message)
         return
@@ -152,7 +153,7 @@ def _timing(
     elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
     if spikes <= expected:
         message = (
-            f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes a "
+            f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes per "
             f"stimulus (without an eighth at its start, where an artefact may be) against {per_stimulus:.2f} in as "
             f"much time before the stimulus"
             + (
@@ -180,14 +181,14 @@ def _timing(
 
 
 def _without_artefact(parts: PostStimulusHistogram) -> int:
-    """Spikes in the window; an artefact that reaches into it, in the busier of its first two parts, is no response."""
+    """Spikes in the window without the busier of its first two parts, into which an artefact may reach."""
     return int(parts.count.sum() - parts.count[:2].max())
 
 
 def _dead_conditions(
     responses: Responses, recording: Recording, assignment: Assignment, per_stimulus: float
 ) -> Iterator[Finding]:
-    """Conditions whose window is dead though that of all together is not."""
+    """A finding on conditions whose window is dead, though that of all together is not."""
     start_ms, end_ms = responses.window_ms
     dead, worst = [], math.inf
     for i, condition in enumerate(assignment.conditions if len(assignment.conditions) > 1 else ()):
@@ -205,8 +206,8 @@ def _dead_conditions(
         listed = ", ".join(dead[:8]) + (f" and {len(dead) - 8} more" if len(dead) > 8 else "")
         message = (
             f"after stimuli of some conditions the window from {start_ms:g} to {end_ms:g} ms holds no more spikes than "
-            f"as much time before a stimulus, {per_stimulus:.2f} (without an eighth at its start): {listed}; what is "
-            "in it is no response: leave them out, or use a window that suits all"
+            f"as much time before a stimulus, {per_stimulus:.2f} (without an eighth at its start), and so no response: "
+            f"{listed}; leave them out, or use a window that suits all"
         )
         yield Finding("dead-condition", "warning", message, worst)
 
@@ -216,13 +217,12 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
         n_all = int(np.count_nonzero(responses.condition == i))
         n = len(responses.rates_of(i))
         if not n:
-            all_bursts = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)"
-            what = all_bursts if n_all else "no stimulus"
+            what = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)" if n_all else "no stimulus"
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
             message = (
-                f"condition {condition.label}: {n} non-burst response{'' if n == 1 else 's'}; a distribution takes "
+                f"condition {condition.label}: {n} non-burst response{'' if n == 1 else 's'}; a distribution needs "
                 f"{FEW_SAMPLES} or more"
             )
             yield Finding("few-samples", "warning", message, float(n))
@@ -241,8 +241,8 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
                 else "as the ratios of active channels do not form two groups"
             )
             message = (
-                f"no response is set apart as a burst, {why}: Otsu's threshold, {bursts.rejected:.3f}, would part "
-                f"{above} of {len(responses)} responses from the others ({values})"
+                f"no response is set apart as a burst, {why}: Otsu's threshold, {bursts.rejected:.3f}, would set apart "
+                f"{above} of {len(responses)} responses ({values})"
             )
             yield Finding("bursts-not-separable", "note", message, bursts.separability)
         return
@@ -250,8 +250,8 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
     dropped = f"{n_bursts} of {len(responses)} responses ({100 * share:.1f} %) are set apart as bursts"
     if share > MANY_BURSTS:
         message = (
-            f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest stimuli that "
-            "failed: look at the panels of burst separation, and use --burst-threshold 1 to keep all"
+            f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest failed stimuli: "
+            "look at the panels of burst separation, and use --burst-threshold 1 to keep all"
         )
         yield Finding("many-bursts", "warning", message, share)
     else:
@@ -261,14 +261,14 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
 
 def _difference(responses: Responses) -> Iterator[Finding]:
     shares = responses.shares_above_median()
-    # A share of three responses says nothing: conditions with few samples count only where there are no others.
+    # A share of three responses says nothing: conditions with few samples count only if there are no others.
     n = np.array([len(responses.rates_of(i)) for i in range(len(shares))])
     enough = n >= FEW_SAMPLES if np.count_nonzero(n >= FEW_SAMPLES) >= 2 else n > 0
     known = [(c.label, float(p)) for c, p, ok in zip(responses.conditions, shares, enough, strict=True) if ok]
     if len(known) < 2:
         if len(responses.conditions) == 1:
             message = (
-                "there is one condition only, so an agent has nothing to choose: to train, sort the stimuli by "
+                "there is only one condition, so an agent has nothing to choose: to train, sort the stimuli by "
                 "frequency, interval, electrode or pattern"
             )
             yield Finding("one-condition", "warning", message, 1.0)
@@ -280,29 +280,26 @@ def _difference(responses: Responses) -> Iterator[Finding]:
         f"with one threshold the choice moves the mean command from {2 * lowest[1] - 1:+.2f} to "
         f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
     )
+    differ = "hardly differ" if spread < SMALL_DIFFERENCE else f"differ by {spread:.2f} at most"
+    message = f"the conditions {differ}: P(x >= P50) is {listed}; {reach}, the rest is chance"
     if spread < SMALL_DIFFERENCE:
-        message = (
-            f"the conditions hardly differ: P(x >= P50) is {listed}; {reach}, the rest is chance, so no policy can "
-            "steer a robot much better than at random: stimulate in ways that differ more"
-        )
+        message += ", so no policy can steer a robot much better than at random: stimulate in ways that differ more"
         yield Finding("no-difference", "warning", message, spread)
     elif spread < LITTLE_DIFFERENCE:
-        message = (
-            f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance, so "
-            "a robot can hardly be steered: `animat inspect --optimum` computes how far; stimulate in ways that differ "
-            "more"
+        message += (
+            ", so a robot can hardly be steered: `animat inspect --optimum` computes how far; stimulate in ways that "
+            "differ more"
         )
         yield Finding("little-difference", "warning", message, spread)
     else:
-        message = f"the conditions differ by {spread:.2f} at most: P(x >= P50) is {listed}; {reach}, the rest is chance"
         yield Finding("difference", "note", message, spread)
 
 
 def _readouts(responses: Responses) -> Iterator[Finding]:
-    """Whether conditions separate the readouts, so that an agent can give their commands apart; the worst pair is told.
+    """A finding on the worst pair of readouts that conditions do not separate, so that their commands go together.
 
-    P(x >= P50) of one less that of the other must differ between two conditions, by two standard errors more than what
-    hardly steers a robot.
+    P(x >= P50) of one less that of the other must differ between two conditions by `LITTLE_DIFFERENCE` plus two
+    standard errors.
     """
     names, conditions = responses.readouts.names, responses.conditions
     enough = [i for i in range(len(conditions)) if len(responses.rates_of(i)) >= FEW_SAMPLES]
@@ -322,10 +319,10 @@ def _readouts(responses: Responses) -> Iterator[Finding]:
     if alike:
         spread, pair, between = min(alike)
         is_known = spread < LITTLE_DIFFERENCE
-        does = "the conditions hardly separate" if is_known else "so few responses cannot tell whether they separate"
+        does = "the conditions hardly separate" if is_known else "there are too few responses to know if they separate"
         message = (
             f"{does} the readouts {pair}: P(x >= P50) of the first less that of the second is {between}, and a policy "
-            "needs them apart to give one command without the other: record more, or at places that differ "
+            "needs them separated to give one command without the other: record more, or at places that differ "
             f"(animat record --places {_PLACES.get(names, 'FILE')})"
         )
         yield Finding("readouts-alike", "warning", message, spread)

@@ -1,4 +1,4 @@
-"""What the moments around a stimulus tell of its artefact: spikes that are none, and stretches that were blanked."""
+"""Artefacts around a stimulus: spikes that are none, and blanked stretches."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
 BIN_MS = 0.5
 SPAN_MS = (-10.0, 20.0)
 LOOKED_AT_MS = (-2.0, 10.0)
-"""Where an artefact is looked for; a response that is sharper than one comes later."""
+"""Where artefacts are sought; a response can be as sharp, but comes later."""
 ARTEFACT_UNTIL_MS = 2.0
 """An artefact begins before this."""
 TIMES = 5.0
-"""As many spikes as elsewhere, and more, are an artefact; as few, and fewer, were blanked."""
+"""This many times more spikes than elsewhere are an artefact; this many times fewer were blanked."""
 AFTERWARDS = 6
-"""Bins after an artefact that tell whether a response follows."""
+"""Bins after an artefact that show whether a response follows."""
 TIMES_RESPONSE = 2.0
 LEFT_OUT, LEFT_OUT_SHARE = 2, 0.02
-"""Stimuli with the most spikes in the artefact's largest bin, without which it must still be one: a burst may have
-happened to fall there."""
+"""Number and share of the stimuli with most spikes in the artefact's largest bin, without which it must still be an
+artefact: a burst may happen to fall there."""
 ENOUGH = 10.0
-"""Spikes expected without a blank, to tell one."""
+"""Spikes expected in a stretch for its absence to count as a blank."""
 
 
 def artefact_findings(
@@ -35,19 +35,22 @@ def artefact_findings(
 ) -> Iterator[Finding]:
     """Findings on spikes that are artefacts (`artefact-spikes`) and on blanked stretches (`blanked-window`).
 
-    Both compare the spikes in half-millisecond bins from the stimulus, b(t). The artefact is the run of bins around
-    the largest one before 2 ms in which b is above five times both the spontaneous rate and the median of b from 3
-    to 20 ms after, above twice the upper quartile of the latter, which is the response where there is one, and, if
-    the culture goes on firing afterwards or rises again, above a third of the largest bin. Where the bins rise from
-    there to twice as much without a valley, the response begins early and there is no artefact; nor where the
-    largest bin is not above all that without the two stimuli, or the fiftieth of them, that have the most spikes in
-    it. The blank is the run of bins around 0, without the artefact, in which b is below a fifth of the spontaneous
-    rate; it is looked for where 10 spikes or more would be in it.
+    Both use the spikes b(t) in half-millisecond bins from the stimulus. The artefact is the run of bins around the
+    largest one before 2 ms in which b is above
+
+    - five times both the spontaneous rate and the median of b from 3 to 20 ms,
+    - twice the upper quartile of b from 3 to 20 ms, which is the response if there is one, and
+    - a third of the largest bin, if the culture goes on firing afterwards or rises again.
+
+    There is no artefact if the bins rise from there to twice as much without a valley (the response begins early), or
+    if the largest bin is not above these bounds without the two stimuli, or the fiftieth of them, that have most spikes
+    in it. The blank is the run of bins around 0, artefact aside, in which b is below a fifth of the spontaneous rate;
+    it is sought if 10 spikes or more would be in it.
 
     Args:
         recording: with stimuli.
         window_ms: of the responses.
-        is_elsewhere: whether they lie outside of the window, which is said with the one to use.
+        is_elsewhere: whether they lie outside the window; another finding then gives the window to use.
     """
     stimuli = recording.stimuli
     read = stimuli.is_last_of_presentation & ~stimuli.is_rest
@@ -55,7 +58,7 @@ def artefact_findings(
         return
     gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
     before_ms = 1e3 * np.concatenate([[np.inf], np.diff(stimuli.time_s)])
-    # Bins must not hold what belongs to a neighbouring pulse.
+    # Bins must not hold spikes that belong to a neighbouring pulse.
     apart = read & (gap_ms >= SPAN_MS[1]) & (before_ms >= -SPAN_MS[0] + SPAN_MS[1])
     chosen = apart if int(apart.sum()) >= min(20, int(read.sum())) else read
     histogram = post_stimulus_histogram(recording, *SPAN_MS, BIN_MS, chosen)
@@ -63,7 +66,7 @@ def artefact_findings(
     spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * histogram.n_stimuli
     later = histogram.count[_centre_ms(histogram) > 3.0]
     usual = max(spontaneous, float(np.median(later)), 1.0)
-    # Responses can begin before 2 ms: what is no sharper than the response later on is one.
+    # Responses can begin before 2 ms: spikes no sharper than the later response belong to it.
     usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
     artefact = _artefact(histogram, usual, max(spontaneous, 1.0), recording.spike_times_s, stimuli.time_s[chosen])
     if artefact is not None:
@@ -83,7 +86,7 @@ def _artefact(
     spike_times_s: Float64[np.ndarray, " spikes"],
     stimulus_s: Float64[np.ndarray, " stimuli"],
 ) -> tuple[int, int] | None:
-    """First and last bin of the artefact; None where there is none."""
+    """First and last bin of the artefact; None if there is none."""
     centre_ms, count = _centre_ms(histogram), histogram.count
     above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
     early = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
@@ -92,7 +95,7 @@ def _artefact(
         height, after = count[largest], count[largest : last + 1]
         top, low = int(np.argmax(after)), np.flatnonzero(after < height / 3)
         if after[top] >= TIMES_RESPONSE * height and after[: top + 1].min() >= height / 2:
-            # Artefacts are largest first: this is how a response begins.
+            # Artefacts are largest at first; this is how a response begins.
             continue
         rises_again = len(low) > 0 and after[low[0] :].max() >= height / 2
         edges_s = stimulus_s[:, None] + 1e-3 * (centre_ms[largest] + np.array([-0.5, 0.5]) * BIN_MS)
@@ -101,14 +104,14 @@ def _artefact(
         if of_each[: max(len(of_each) - left_out, 0)].sum() <= TIMES * usual:
             continue
         if rises_again or np.mean(count[last + 1 : last + 1 + AFTERWARDS]) > spontaneous:
-            # A response may follow at once: the artefact ends where its spikes are a third as many as at its height.
+            # A response may follow immediately: the artefact ends where its spikes fall to a third of its height.
             first, last = _run(above & (count >= height / 3), largest)
         return first, last
     return None
 
 
 def _run(flags: Bool[np.ndarray, " bins"], start: int, gap: int = 1) -> tuple[int, int]:
-    """First and last of the flags that are set around one, over gaps of so many."""
+    """First and last of the run of set flags around `start`, across gaps of up to `gap` flags."""
     first = last = start
     while first > 0 and flags[max(first - 1 - gap, 0) : first].any():
         first -= 1
@@ -139,7 +142,7 @@ def _artefact_finding(
     message = (
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
         f"{spikes / (usual * len(count)):.3g} times as many as is usual in as much time: an artefact counted "
-        f"as spikes{'' if from_ms < 0 else ', or neurons that the pulse itself fired'} "
+        f"as spikes{'' if from_ms < 0 else ', or neurons fired directly by the pulse'} "
         f"({100 * spikes / max(n_spikes, 1):.1f} % of all); {remedy}"
     )
     return Finding("artefact-spikes", "warning" if reaches else "note", message, spikes / n_stimuli)

@@ -1,6 +1,6 @@
-"""What is heavy, for files that are read without it: JAX is imported when something of it is first used, not before.
+"""JAX for modules that must be importable without it: it is imported on first use.
 
-`Array` and `Axes` stand in annotations only.
+`Array` and `Axes` are for annotations only.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 __all__ = ["Array", "Axes", "jax", "jnp"]
 
 
-class _Late:
-    """A module that is not imported yet."""
+class _LazyModule:
+    """A module that is imported when one of its attributes is first used."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -27,4 +27,4 @@ if TYPE_CHECKING:
     from jax import Array
     from matplotlib.axes import Axes
 else:
-    jax, jnp, Array, Axes = _Late("jax"), _Late("jax.numpy"), Any, Any
+    jax, jnp, Array, Axes = _LazyModule("jax"), _LazyModule("jax.numpy"), Any, Any

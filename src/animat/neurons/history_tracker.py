@@ -1,4 +1,4 @@
-"""The history state of a culture in a closed loop, trial by trial, as the simulator of a recording has it."""
+"""The history state of a culture in a closed loop, trial by trial, as defined by the simulator of a recording."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float64
 
-from animat.neurons.history import AT_FIRST, NO_MEMORY, Memory, Ranked, left_by, ranks_among
+from animat.neurons.history import INITIAL_HISTORY, NO_MEMORY, Memory, Ranked, ranks_among, trace_increment
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.responses import Responses
 
 
-class Remembered(NamedTuple):
-    """The history state after a trial, and when that was: trace and load as in `animat.neurons.history.Memory`."""
+class HistoryState(NamedTuple):
+    """The history state after a trial, and its time: trace and load as in `animat.neurons.history.Memory`."""
 
     trace: float = 0.0
     load: float = 0.0
@@ -24,14 +24,14 @@ class Remembered(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Remembering:
-    """What a response on the culture adds to the history state, by the ranks of a recording's responses.
+class HistoryTracker:
+    """Updates the history state by responses of the culture, ranked among a recording's responses.
 
     Attributes:
-        memory: of the recording's simulator; without memory the state stays as it is at first.
+        memory: of the recording's simulator; without memory the state does not change.
         added: what a trial adds to the load.
         sorted_hz: non-burst responses of that recording, all channels as one, rising, shape (responses,).
-        mean_ranks: of each condition's, shape (conditions,).
+        mean_ranks: the mean rank of each condition's responses, shape (conditions,).
     """
 
     memory: Memory
@@ -41,53 +41,53 @@ class Remembering:
 
     @classmethod
     def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
-        """As a simulator of these responses remembers."""
+        """With the memory of a simulator of these responses."""
         ranked = Ranked(responses)
         memory, added = NO_MEMORY, 0.0
         if isinstance(simulator, MemorySimulator):
             memory, added = simulator.memory, float(simulator.added)
         return cls(memory, added, ranked.sorted_hz, ranked.means)
 
-    def when(self, before: Remembered, at_s: float, *, is_rested: bool) -> Remembered:
-        """The state when a trial comes.
+    def when(self, before: HistoryState, at_s: float, *, is_rested: bool) -> HistoryState:
+        """The state at a trial.
 
         Args:
-            before: the state after the trial before it; `Remembered()` after silence.
-            at_s: the pulse that it is read after, s.
+            before: the state after the previous trial; `HistoryState()` after silence.
+            at_s: the pulse after which the trial is read, s.
             is_rested: whether there was no pulse in the second before it.
         """
         load_s = self.memory.load_s
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
-        return Remembered(0.0 if is_rested else before.trace, float(load), float(at_s))
+        return HistoryState(0.0 if is_rested else before.trace, float(load), float(at_s))
 
-    def after(self, came: Remembered, condition: int, rate_hz: float, *, is_burst: bool) -> Remembered:
+    def after(self, came: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
         """The state after a trial.
 
         Args:
-            came: the state when it came.
-            condition: of the trial; `NO_CONDITION` where it has none.
+            came: the state at the trial.
+            condition: of the trial; `NO_CONDITION` if it has none.
             rate_hz: the response of all channels, Hz per channel.
-            is_burst: whether the response was a burst, after which nothing is known of the trace.
+            is_burst: whether the response was a burst, after which the trace is not known.
         """
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
-        # Of what has no condition of its own the middle one's is as good as any.
+        # For trials without a condition, the middle rank is as good as any.
         mean = 0.5 if condition == NO_CONDITION else float(self.mean_ranks[condition])
-        (more,) = left_by(rank, mean, self.memory).tolist()
+        (more,) = trace_increment(rank, mean, self.memory).tolist()
         trace = 0.5 if is_burst else self.memory.decay * came.trace + more
-        return Remembered(float(trace), came.load + self.added, came.at_s)
+        return HistoryState(float(trace), came.load + self.added, came.at_s)
 
-    def observed(self, state: Remembered) -> tuple[float, float]:
+    def observed(self, state: HistoryState) -> tuple[float, float]:
         """Trace and load as a policy sees them (`animat.wrappers.NeuralObservation`)."""
         if self.memory == NO_MEMORY:
-            return AT_FIRST
-        return state.trace, state.load if self.memory.load_s else AT_FIRST[1]
+            return INITIAL_HISTORY
+        return state.trace, state.load if self.memory.load_s else INITIAL_HISTORY[1]
 
-    def beside(
-        self, observation: Float64[np.ndarray, " numbers"], state: Remembered
+    def append_to(
+        self, observation: Float64[np.ndarray, " numbers"], state: HistoryState
     ) -> Float64[np.ndarray, " more_numbers"]:
-        """What a policy is given: the robot's observation, then trace and load."""
+        """What a policy observes: the robot's observation, then trace and load."""
         return np.concatenate([observation, self.observed(state)])
 
     def to_dict(self) -> dict[str, float]:
-        """What it is made with, as plain data."""
+        """Its parameters as plain data."""
         return {**self.memory._asdict(), "added": self.added}

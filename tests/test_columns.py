@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from animat.lined_up import lined_up
+from animat.columns import align_columns
 
 
-def test_words_stand_to_the_left_and_numbers_under_the_end_of_their_columns_name() -> None:
-    assert lined_up(
+def test_text_is_aligned_left_and_numbers_right_under_their_headings() -> None:
+    assert align_columns(
         ["", "mean", "p", ""], [["policies", "96.0", "", ""], ["random", "-80.25", "0.001", "any action"]]
     ) == [
         "              mean      p",
@@ -16,4 +16,4 @@ def test_words_stand_to_the_left_and_numbers_under_the_end_of_their_columns_name
 
 
 def test_a_table_without_rows_is_its_head() -> None:
-    assert lined_up(["name", "mean", "meaning"], []) == ["  name  mean  meaning"]
+    assert align_columns(["name", "mean", "meaning"], []) == ["  name  mean  meaning"]

@@ -1,14 +1,14 @@
-"""Tables for a terminal: columns under their names."""
+"""Tables for a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 
-def lined_up(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, indented: the first column and the last, which are words, to the left, the others to the right.
+def align_columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Indented lines of a table: the first and last column, which are text, aligned left, the others right.
 
-    A column that needs no name has an empty one.
+    A column without a heading has an empty one.
     """
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = []

@@ -1,4 +1,4 @@
-"""By which files it is known what a folder holds, so that the work of one command is not put among another's."""
+"""The files that identify what a folder holds, so that two commands do not mix their work in one folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from animat.plain_file import is_folder
 
 Kind = Literal["session", "training", "tuning", "study", "cultures", "recording", "live"]
 
-MARKS: dict[Kind, tuple[str, ...]] = {
+MARKERS: dict[Kind, tuple[str, ...]] = {
     "session": ("session.log",),
     "training": ("training.json", "[!.]*.safetensors"),
     "tuning": ("tune.json",),
@@ -19,8 +19,8 @@ MARKS: dict[Kind, tuple[str, ...]] = {
     "recording": ("recording_*_min.nwb", "culture.state"),
     "live": ("live.log",),
 }
-"""Names or patterns, one of which is enough; the modules that write the files import JAX, which others do without."""
-_TOLD: dict[Kind, str] = {
+"""Names or patterns, any one of which is enough. The modules that write these files import JAX; this one does not."""
+_DESCRIPTIONS: dict[Kind, str] = {
     "session": "a session",
     "training": "policies",
     "tuning": "a tuning",
@@ -32,12 +32,12 @@ _TOLD: dict[Kind, str] = {
 
 
 def expect_no_other(folder: Path, kind: Kind) -> None:
-    """Raise Mismatch if a folder holds work of other kinds and none of this one; a missing one holds nothing."""
+    """Raise Mismatch if a folder holds work of other kinds and none of this kind; a missing folder holds nothing."""
     if not is_folder(folder):
         return
-    found = {each: [file.name for name in names for file in folder.glob(name)] for each, names in MARKS.items()}
-    others = [f"{_TOLD[each]} ({min(names)})" for each, names in found.items() if names]
-    # Where some of it is there already it goes on, whatever came beside.
+    found = {each: [file.name for name in names for file in folder.glob(name)] for each, names in MARKERS.items()}
+    others = ", ".join(f"{_DESCRIPTIONS[each]} ({min(names)})" for each, names in found.items() if names)
+    # Work of this kind continues, whatever else is in the folder.
     if others and not found[kind]:
-        there = ", ".join(others)
-        raise Mismatch(f"{folder}: expected a folder for {_TOLD[kind]}, got one of {there}; choose another folder")
+        wanted = _DESCRIPTIONS[kind]
+        raise Mismatch(f"{folder}: expected a folder for {wanted}, got one with {others}; choose another folder")
