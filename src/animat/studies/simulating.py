@@ -13,7 +13,7 @@ from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, to_jax
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
