@@ -65,7 +65,7 @@ def test_a_damaged_part_is_not_reported_as_missing(where: str, tmp_path: Path) -
     with path.open("r+b") as file:
         file.seek(begins)
         file.write(b"\xff" * 8)
-    with pytest.raises(InvalidFile, match=r"recording\.nwb: expected a whole NWB recording, but it is .*damaged"):
+    with pytest.raises(InvalidFile, match=r"recording\.nwb: expected a complete NWB recording, but it is .*damaged"):
         read_nwb(path)
 
 

@@ -759,9 +759,9 @@ def test_training_reports_the_memory() -> None:
     assert f"counts {decay:.2g} times as much as the next one, and its stimulus {weight:.2g} times as" in first
     n = int(np.median([np.count_nonzero(series[0].condition == c) for c in range(2)]))
     near = int(np.median([np.rint(len(series[0].rates_of(c)) ** neighbour_exponent) for c in range(2)]))
-    assert first.endswith(f"draws from the {near} responses with the most similar history, of the {n} of a condition")
+    assert first.endswith(f"draws from the {near} responses with the most similar history, out of {n} per condition")
     (message,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
-    assert message.endswith(". How much was stimulated in the last 1 s counts too")
+    assert message.endswith(". The amount of stimulation in the last 1 s counts too")
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 

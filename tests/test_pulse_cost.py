@@ -274,7 +274,7 @@ def test_a_cost_is_of_neurons_whose_electrodes_are_known(tmp_path: Path) -> None
     ):
         trained(asked, timeline_of(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InvalidArgument, match="pulse_cost: expected 0, as conditions of a live run"):
+    with pytest.raises(InvalidArgument, match="pulse_cost: expected 0, as all conditions of a live run cost the same"):
         check_plan(asked, Protocol(), tmp_path / "live", Timetable(), 1, {})
 
 

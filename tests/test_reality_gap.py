@@ -34,6 +34,7 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.evaluation.verdict import EpisodeComparison
+from animat.neurons.history_tracker import HistoryState
 from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ

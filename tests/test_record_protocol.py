@@ -210,6 +210,6 @@ def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Pa
 def test_an_invalid_protocol_is_refused_before_anything_is_delivered() -> None:
     with FakeCulture() as culture:
         for other, got in (({"trials": 5}, r"\{'trials': 5\}"), (None, "None"), (Protocol, "<class")):
-            with pytest.raises(InvalidArgument, match=rf"protocol: expected a Protocol, as .* makes one, got {got}"):
+            with pytest.raises(InvalidArgument, match=rf"protocol: expected a Protocol, such as .*, got {got}"):
                 culture.record(other)  # type: ignore[arg-type]
         assert culture.delivered == 0
