@@ -22,7 +22,7 @@ import pytest
 from animat.cli import _parse, main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.execution.cluster import Cluster
-from animat.execution.dask_worker import _own_cores, made_of
+from animat.execution.dask_worker import _own_cores, versions_tag
 from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.local_cluster import local_cluster
 from animat.execution.task import Task
@@ -61,7 +61,7 @@ def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
     shutil.rmtree(folder)
     (tmp_path / "elsewhere").mkdir()
     folder.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(InvalidFile, match="expected a folder of this user's"):
+    with pytest.raises(InvalidFile, match="expected a folder of this user, got another user's or a link"):
         _own_cores(1)
     assert victim.read_text() == "all there" and core in os.sched_getaffinity(0)
     held.pop().close()
@@ -86,7 +86,7 @@ def test_a_place_that_is_no_scheduler_s_is_a_line(tmp_path: Path, capsys: pytest
             "no.json",
             "animat: --cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got 'no.json'",
         ),
-        (str(tmp_path / "cluster.json"), "expected a scheduler's file, got one that holds no address"),
+        (str(tmp_path / "cluster.json"), "expected a scheduler's file, got one without an address"),
     ):
         assert main(["study", str(TINY), "--out", str(tmp_path / "out"), "--cluster", where]) == 1
         said = capsys.readouterr().err
@@ -158,7 +158,7 @@ def test_what_fails_twice_is_done_and_thrice_is_reported(running: Running, tmp_p
         Job("in vain", Join("in vain", ("thrice",)), ("thrice",)),
         Job("other", Join("other")),
     ]
-    words = "^thrice: a.nwb: expected a recording, got none; waiting for what failed: 1$"
+    words = "^thrice: a.nwb: expected a recording, got none; not run, as they need failed jobs: 1$"
     with Cluster(running.file) as cluster, pytest.raises(AnimatError, match=words):
         run(jobs, tmp_path, cluster)
     assert (tmp_path / "thrice").read_text().count("tried") == 3
@@ -229,7 +229,7 @@ def test_what_kills_is_reported_and_what_ran_beside_it_is_done(
             with Cluster(file) as cluster, pytest.raises(AnimatError) as raised:
                 run(jobs, folder, cluster)
             how = r"worker tcp://\S+ ended" if worker else r"its process ended with status -9, on \S+"
-            words = rf"ends: what it ran on ended 3 times, at last: {how} \(is there memory enough\? .*"
+            words = rf"ends: its process or worker ended 3 times, last: {how} \(is there enough memory\? .*"
             assert re.fullmatch(words, str(raised.value))
             assert log.read_text().count("tried") == 3
             assert {path.stem for path in (folder / "jobs").iterdir()} == {"a", "b", "behind"}
@@ -282,7 +282,7 @@ def test_all_that_failed_is_told_at_the_end(running: Running, tmp_path: Path) ->
 def test_a_worker_of_another_version_is_named_and_gets_nothing(
     running: Running, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = made_of().replace("animat:", "animat:0.0.")
+    other = versions_tag().replace("animat:", "animat:0.0.")
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(running.file)]
     with subprocess.Popen([*worker, "--no-dashboard", "--nthreads", "9", "--resources", f"{other}=9"]) as process:
         with distributed.Client(scheduler_file=str(running.file), set_as_default=False) as client:
@@ -297,7 +297,7 @@ def test_a_worker_of_another_version_is_named_and_gets_nothing(
 
 @oracle
 def test_where_all_are_of_another_version_it_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.execution.cluster.made_of", lambda: "animat:9/Python:3.99")
+    monkeypatch.setattr("animat.execution.cluster.versions_tag", lambda: "animat:9/Python:3.99")
     with local_cluster(1, tmp_path / "cluster.json"):
         with distributed.Client(scheduler_file=str(tmp_path / "cluster.json"), set_as_default=False) as client:
             client.wait_for_workers(1, timeout=300)
@@ -462,7 +462,7 @@ def test_a_scheduler_that_dies_is_told_and_the_same_command_goes_on(without: dic
         scheduler.kill()
         said, _ = process.communicate()
     assert process.returncode == 1
-    assert re.fullmatch(r"animat: .* has ended; start \w+, and then this again to go on", last(said))
+    assert re.fullmatch(r"animat: .* has ended; start it, then run this again to continue", last(said))
     with local_cluster(2, file):
         finish(out, "--cluster", str(file))
     assert contents(out) == without

@@ -154,17 +154,17 @@ def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
             Starve(),
             AnimatError,
             r"job: out of memory \(256. PiB more were asked for\): it grows with policies \(10\), culture.channels "
-            r"\(256\): ask for less, or use a machine with more memory",
+            r"\(256\): reduce these, or use a machine with more memory",
         ),
         (
             Die(),
             AnimatError,
-            r"job: its process ended with status 7 \(is there memory enough\? .*\); start again to go on",
+            r"job: its process ended with status 7 \(is there enough memory\? .*\); run again to continue",
         ),
         pytest.param(
             Killed(),
             AnimatError,
-            r"job: its process ended with status -15 \(another program ended it\); start again to go on",
+            r"job: its process ended with status -15 \(another program ended it\); run again to continue",
             marks=pytest.mark.oracle,
         ),
     ],

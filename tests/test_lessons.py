@@ -99,7 +99,7 @@ def test_an_episode_moves_as_the_robot_with_the_parameter_that_was_drawn(name: s
     value = float(np.float32(getattr(usual, parameter) * 0.9))
     lesson = Lesson(parameters={parameter: (value, value)})
     if (name, parameter) in BY_SHAPE:
-        with pytest.raises(InvalidArgument, match=rf"parameters\.{parameter}: .* cannot vary while it is compiled"):
+        with pytest.raises(InvalidArgument, match=rf"parameters\.{parameter}: .* must be known at compile time"):
             expect_varied(usual, varying_in([lesson], recordings=False))
         return
     plain, drawn = WithoutNeurons(replace(usual, **{parameter: value}), None), varied(lesson, usual)
@@ -203,13 +203,13 @@ def course_of(
         return np.array([[mean] * 10 for _, mean in rows]), np.array(succeeded)
 
     course._programs = (*course._programs[:2], assessment)
-    course.standing = course.standing._replace(best=np.zeros((2, 1)))
+    course.state = course.state._replace(best=np.zeros((2, 1)))
     lessons_at = []
     for index in range(n_chunks or len(successes_and_returns)):
         course.assess(index, networks + 100 * index, None)
-        lessons_at.append(course.standing.lesson.tolist())
+        lessons_at.append(course.state.lesson.tolist())
     assert next(made, None) is None
-    return course.standing, lessons_at
+    return course.state, lessons_at
 
 
 def test_a_policy_goes_on_at_its_share_each_for_itself_and_the_best_is_that_of_the_table() -> None:
@@ -401,10 +401,10 @@ def test_recordings_are_drawn_of_those_that_shadowing_would_have_used() -> None:
         ("starts.angle_rad = [0, nan]", "expected a finite number"),
         ("success = 1.2", "success: expected at most 1, got 1.2"),
         ("success = 0.0", "success: expected more than 0, got 0"),
-        ("success = 0.8", "got cartpole, which has no method `succeeded`; go on by until_return"),
-        ("success = 0.8\nuntil_return = 4", "expected one way to go on, got success too"),
+        ("success = 0.8", "got cartpole, which has no method `succeeded`; use until_return"),
+        ("success = 0.8\nuntil_return = 4", "expected either success or until_return, got both"),
         ("[[lessons]]", "lesson 1: expected success or until_return, .*got neither"),
-        ("recordings_min = [0, 10]", "recordings_min: expected only where shadowing is 'drawn'"),
+        ("recordings_min = [0, 10]", "recordings_min: expected only with shadowing 'drawn'"),
         ("until_return = 121", "until_return: expected at most 120, the highest return of cartpole, got 121"),
         ("sucess = 0.8", "sucess: no such setting"),
         ("starts.angle_rad = [", "expected TOML, got a mistake"),
@@ -423,7 +423,7 @@ def test_what_is_stepped_elsewhere_or_has_no_neurons_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="lessons: expected a robot that is stepped by JAX, got gymnasium"):
         Training(host, "9-thresholds", lessons=(Lesson(),))
     for asked in ({"assess": 3}, {"shadowing": "drawn"}):
-        with pytest.raises(InvalidArgument, match="robot: expected one that is stepped by JAX"):
+        with pytest.raises(InvalidArgument, match="robot: expected one stepped by JAX"):
             Training(host, "9-thresholds", **asked)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="shadowing: expected a mapping with 'drawn', got none"):
         Training("cartpole", None, shadowing="drawn")
@@ -458,7 +458,7 @@ def test_the_command_teaches_and_tells_where_each_policy_is(tmp_path: Path, caps
     assert main(["evaluate", str(out / "best"), "--episodes", "3"]) == 0
     file.write_text('[[lessons]]\nname = "early"\nrecordings_min = [0, 10]\n')
     assert main(["train", "swing-up", "--mapping", "none", "--lessons", str(file), *few, "--out", str(out)]) == 1
-    said = "lesson 1 (early): recordings_min: expected only where shadowing is 'drawn' (--shadowing drawn), got it"
+    said = "lesson 1 (early): recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it"
     assert f"{file}: {said}" in capsys.readouterr().err
     assert main(["train", "swing-up", "--mapping", "none", "--assess", "0", *few, "--out", str(out)]) == 1
     assert "assess: expected at least 1" in capsys.readouterr().err

@@ -34,7 +34,7 @@ from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.networks import Layer, forward
 from animat.training.policy import Policy, load_policies
-from animat.training.provenance import Simulated, Trained
+from animat.training.provenance import SimulatorProvenance, TrainingProvenance
 from animat.training.specification import Percentiles
 from animat.wrappers import Delivery
 
@@ -504,6 +504,6 @@ def test_networks_of_another_build_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:
-    hints = get_type_hints(Trained) | get_type_hints(Simulated)
+    hints = get_type_hints(TrainingProvenance) | get_type_hints(SimulatorProvenance)
     for name, choices in (("kind", Kind), ("percentiles", Percentiles), ("delivery", Delivery)):
         assert get_args(hints[name]) == get_args(choices)

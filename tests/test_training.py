@@ -260,7 +260,7 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
     fewer = {name: array for name, array in arrays.items() if name != last}
     for others in (fewer, arrays | {last: arrays[last][..., None]}, arrays | {"leaf0": arrays["leaf0"].astype(float)}):
         np.savez(checkpoint, **others)
-        with pytest.raises(InvalidFile, match=r"as this animat writes it, of .*: rm '"):
+        with pytest.raises(InvalidFile, match=r"as this version of animat writes it, of .*: rm '"):
             train_group(group, checkpoint, stop, checkpoint_s=0.0)
     # Flags and compression of the first entry in the table at the end: zipfile has errors of other kinds for these.
     table = whole.index(b"PK\x01\x02")
@@ -393,7 +393,10 @@ def test_neurons_and_mapping_come_together(tmp_path: Path) -> None:
         train(replace(SHORT, mapping=None), timeline_of(), tmp_path)
     with pytest.raises(InvalidArgument, match="workers"):
         train(SHORT, timeline_of(), tmp_path, workers=0)
-    with ThreadPoolExecutor(1) as executor, pytest.raises(InvalidArgument, match="workers: expected none beside"):
+    with (
+        ThreadPoolExecutor(1) as executor,
+        pytest.raises(InvalidArgument, match="workers: expected None with an executor"),
+    ):
         train(SHORT, timeline_of(), tmp_path, workers=1, executor=executor)
 
 
@@ -439,13 +442,16 @@ def test_what_no_training_can_have_is_told(named: dict[str, Any], told: str) -> 
             {"training": "cartpole"},
             "training: expected a Training, such as animat.Training('cartpole', '9-thresholds')",
         ),
-        ({"timeline": "recordings/"}, "timeline: expected simulators, as animat.fit_timeline makes, or None, got 'rec"),
+        ({"timeline": "recordings/"}, "timeline: expected simulators from animat.fit_timeline, or None, got 'rec"),
         ({"folder": 3}, "folder: expected a path, or None, got 3"),
         (
             {"callbacks": print},
-            "callbacks: expected a list of functions, each of a row of a learning curve, got <built",
+            "callbacks: expected a list of functions that take a row of a learning curve, got <built",
         ),
-        ({"callbacks": [None]}, "callbacks: expected a list of functions, each of a row of a learning curve, got None"),
+        (
+            {"callbacks": [None]},
+            "callbacks: expected a list of functions that take a row of a learning curve, got None",
+        ),
     ],
 )
 def test_what_stands_in_the_place_of_something_else_is_told(changed: dict[str, Any], told: str) -> None:

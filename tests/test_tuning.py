@@ -31,13 +31,13 @@ from animat.training.policy import CURVE
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
-from animat.tuning.journal import JOURNAL, Told, read_journal
-from animat.tuning.results import BEST, HISTORY, RESULTS, Tuned
+from animat.tuning.journal import JOURNAL, TrialResult, read_journal
+from animat.tuning.results import BEST, HISTORY, RESULTS, TuningResult
 from animat.tuning.run import tune
 from animat.tuning.side_by_side import Trials
 from animat.tuning.space import Range, first_settings, with_settings
 from animat.tuning.specification import Tuning, read_tuning, tuning_of
-from animat.tuning.tasks import Trial, same_shapes
+from animat.tuning.tasks import Trial, group_by_shape
 from synthetic_recordings import synthetic_recording
 
 pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")
@@ -63,7 +63,7 @@ class Ends(ThreadPoolExecutor):
         return fn(*args, **kwargs)
 
 
-def run(folder: Path, executor: Executor | None = None, tuning: Tuning | None = None) -> Tuned:
+def run(folder: Path, executor: Executor | None = None, tuning: Tuning | None = None) -> TuningResult:
     """In this process, where programs are compiled once."""
     with ThreadPoolExecutor(1) as own:
         return tune(tuning or read_tuning(TINY), folder, base=TINY.parent, executor=executor or own)
@@ -230,7 +230,7 @@ def test_trials_of_one_program_are_together_five_policies_at_most(policies: int)
             )
             for i in range(n)
         ]
-        groups = same_shapes(among, policies)
+        groups = group_by_shape(among, policies)
         assert sorted(trial.number for group in groups for trial in group) == list(range(n))
         for group in groups:
             assert len(group) * policies <= max(5, policies)
@@ -244,9 +244,9 @@ def test_after_a_study_s_own_settings_the_defaults_are_tried_and_both_go_to_the_
     file.write_text(own.replace("trials = 7", "trials = 4").replace("3000", "240").replace("rungs = 2", "rungs = 3"))
     tuned = tune(read_tuning(file), tmp_path / "out", base=TINY.parent)
     kind = {"simulator": "histogram"}
-    assert tuned.told[0].settings == {"learning_rate": 1e-4, "discount": 0.95, **kind}
-    assert tuned.told[1].settings == {"learning_rate": SAC().learning_rate, "discount": SAC().discount, **kind}
-    assert [len(each.chunks) for each in tuned.told[:2]] == [3, 3]
+    assert tuned.trials[0].settings == {"learning_rate": 1e-4, "discount": 0.95, **kind}
+    assert tuned.trials[1].settings == {"learning_rate": SAC().learning_rate, "discount": SAC().discount, **kind}
+    assert [len(each.chunks) for each in tuned.trials[:2]] == [3, 3]
     assert [each.trial for each in tuned.finals[:2]] == [0, 1]
     file.write_text(own.replace("high = 0.999", "high = 0.98"))
     tuning = read_tuning(file)
@@ -275,7 +275,7 @@ def test_importance_finds_the_setting_that_decides() -> None:
     space = {"tau": Range(0.0, 1.0), "discount": Range(0.01, 0.99, True), "mapping": ("linear", "1-threshold")}
     told = []
     # However well it began.
-    told.append(Told(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
+    told.append(TrialResult(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
     for i in range(60):
         settings: Any = {
             "tau": rng.random(),
@@ -283,7 +283,7 @@ def test_importance_finds_the_setting_that_decides() -> None:
             "mapping": ("linear", "1-threshold")[i % 2],
         }
         returns = -((settings["tau"] - 0.3) ** 2) + 1e-3 * rng.random()
-        told.append(Told(i, settings, "complete", (60,), ((float(returns),),)))
+        told.append(TrialResult(i, settings, "complete", (60,), ((float(returns),),)))
     shares = importance_of(space, told)
     assert next(iter(shares)) == "tau" and shares["tau"] > 0.8
     assert sum(shares.values()) == pytest.approx(1)
