@@ -69,7 +69,7 @@ def assert_same(ones: Iterable[Policy], others: Iterable[Policy]) -> None:
 
 
 class AtOnce(NamedTuple):
-    """What came of two policies of each of the arms, and the rows that were told meanwhile."""
+    """What came of two policies of each of the arms, and the rows that were reported."""
 
     policies: list[list[Policy]]
     rows: list[list[np.ndarray]]
@@ -112,9 +112,9 @@ def test_stopped_at_a_checkpoint_all_go_on_to_the_same_bits(at_once: AtOnce, tmp
     groups, checkpoint, rows = [group_of(arm, 0, 1) for arm in ARMS], tmp_path / "kept.npz", list[np.ndarray]()
     with pytest.raises(KeyboardInterrupt):
         train_groups(groups, checkpoint, Stopping(), checkpoint_s=0.0, add_parts=[None, None])
-    told = Kept()
-    again = train_groups(groups, checkpoint, told, add_parts=[None, rows.append])
-    assert [done for done, _ in told.told] == [CHUNKS - 2, CHUNKS - 1, CHUNKS]
+    kept = Kept()
+    again = train_groups(groups, checkpoint, kept, add_parts=[None, rows.append])
+    assert [done for done, _ in kept.updates] == [CHUNKS - 2, CHUNKS - 1, CHUNKS]
     assert_same(chain(*again), chain(*at_once.policies))
     np.testing.assert_array_equal(rows, at_once.rows[1])
 
@@ -357,7 +357,7 @@ def test_where_no_gpu_is_found_it_says_so_in_a_line(
     assert err == said
 
 
-def test_a_training_tells_its_device_and_is_not_gone_on_with_on_another(tmp_path: Path) -> None:
+def test_a_training_records_its_device_and_is_not_continued_on_another(tmp_path: Path) -> None:
     on = {name: describe(SHORTEST, timeline_of(), device=name) for name in (None, "NVIDIA H100", "NVIDIA A100")}
     assert len({manifest["fingerprint"] for manifest in on.values()}) == 3
     assert "device" not in on[None]["versions"]
@@ -374,7 +374,7 @@ def test_a_training_with_a_gpu_comes_from_one_process_of_its_own(
     monkeypatch.setattr(in_folders, "find_gpu", lambda: "pretended")
     seven, progress, rows = replace(SHORTEST, policies=7), Kept(), list[Any]()
     at_once = train(seven, timeline_of(), tmp_path, progress=progress, callbacks=[rows.append])
-    assert progress.told[-1] == (7 * CHUNKS, 7 * CHUNKS)
+    assert progress.updates[-1] == (7 * CHUNKS, 7 * CHUNKS)
     assert list(bits(tmp_path)) == [f"p{i}.safetensors" for i in range(7)]
     assert not (tmp_path / ".unfinished").exists()
     assert len(rows) == 7 * CHUNKS
@@ -384,13 +384,13 @@ def test_a_training_with_a_gpu_comes_from_one_process_of_its_own(
         jax.tree.map(np.testing.assert_array_equal, arrays(one), arrays(other))
 
 
-def test_a_study_tells_its_device_and_is_not_gone_on_with_on_another(
+def test_a_study_records_its_device_and_is_not_continued_on_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = replace(read_study(TINY), culture=Source())
-    told = describe_study(study, {}, "NVIDIA H100")
-    assert told["fingerprint"] != describe_study(study, {})["fingerprint"]
-    (tmp_path / "study.json").write_text(json.dumps(told))
+    description = describe_study(study, {}, "NVIDIA H100")
+    assert description["fingerprint"] != describe_study(study, {})["fingerprint"]
+    (tmp_path / "study.json").write_text(json.dumps(description))
     (tmp_path / "jobs").mkdir()
     (tmp_path / "jobs" / "fit.json").write_text("{}")
     with pytest.raises(Mismatch, match=r"versions\.device: 'NVIDIA H100' there, nothing now"):
@@ -421,8 +421,8 @@ from animat.process import pin_worker
 cores = os.sched_getaffinity(0)
 pin_worker(None)
 assert os.sched_getaffinity(0) == cores
-told = [os.environ.get(n) for n in ("JAX_PLATFORMS", "XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_DEFAULT_MATMUL_PRECISION")]
-print(*told, file=sys.stderr)
+values = [os.environ.get(n) for n in ("JAX_PLATFORMS", "XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_DEFAULT_MATMUL_PRECISION")]
+print(*values, file=sys.stderr)
 """
 
 

@@ -106,13 +106,13 @@ def test_an_episode_moves_as_the_robot_with_the_parameter_that_was_drawn(name: s
     expect_varied(usual, drawn.varying)
 
     def episode(environment: Any) -> Any:
-        state, told = environment.reset(jax.random.key(3)), []
+        state, steps = environment.reset(jax.random.key(3)), []
         for key in jax.random.split(jax.random.key(4), 6):
             uniforms = jax.random.uniform(key, (environment.noise_size + usual.n_commands,))
             command = jnp.squeeze(2 * uniforms[: usual.n_commands] - 1)
             state = environment.advance(uniforms[usual.n_commands :], state, command, None)
-            told.append((state.robot, state.reward, state.ended, environment.observe(state)))
-        return told
+            steps.append((state.robot, state.reward, state.ended, environment.observe(state)))
+        return steps
 
     for moved, wanted in zip(jax.tree.leaves(episode(drawn)), jax.tree.leaves(episode(plain)), strict=True):
         np.testing.assert_allclose(moved, wanted, rtol=2e-5, atol=2e-6)
@@ -261,7 +261,7 @@ def test_the_page_s_lessons_are_some(tmp_path: Path) -> None:
     expect_trainable(Training("swing-up", None, commands=(-1.0, 1.0), lessons=lessons), is_saved=True)
 
 
-def test_a_robot_that_tells_no_success_goes_on_by_its_return() -> None:
+def test_a_robot_without_success_moves_on_by_its_return() -> None:
     standing, at = course_of(
         [(0.0, -5.0), (0.0, 0.0)], [(0.0, 1.0), (0.0, 3.0)], lessons=(Lesson(until_return=0.0),), robot=Cartpole()
     )
@@ -270,7 +270,7 @@ def test_a_robot_that_tells_no_success_goes_on_by_its_return() -> None:
 
 
 @pytest.mark.oracle
-def test_policies_are_kept_at_their_best_beside_the_averaged_ones_and_tell_their_lessons(tmp_path: Path) -> None:
+def test_the_best_policies_are_kept_next_to_the_averaged_ones_with_their_lessons(tmp_path: Path) -> None:
     policies = trained(TAUGHT, timeline_of(), tmp_path)
     best = load_policies(tmp_path / "best")
     assert sorted(file.name for file in tmp_path.iterdir()) == [
@@ -300,7 +300,7 @@ def test_policies_are_kept_at_their_best_beside_the_averaged_ones_and_tell_their
         assert is_last == (row == CHUNKS - 1)
     progress = Kept()
     assert list(trained(TAUGHT, timeline_of(), tmp_path, progress=progress)) == ["p0", "p1"]
-    assert not progress.told
+    assert not progress.updates
 
 
 class Stop(Exception):
@@ -442,7 +442,9 @@ def test_a_lesson_that_does_not_name_what_another_varies_is_as_the_robot_has_it(
 
 
 @pytest.mark.oracle
-def test_the_command_teaches_and_tells_where_each_policy_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_trains_by_lessons_and_reports_each_policy_s_lesson(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, out = tmp_path / "lessons.toml", tmp_path / "policies"
     file.write_text("[[lessons]]\nstarts.angle_rad = [-0.3, 0.3]\nuntil_return = -1\n")
     few = ["--policies", "1", "--iterations", "2000", "--sac", "environments=8", "hidden=8", "replay=1024", "batch=16"]

@@ -124,8 +124,8 @@ def test_an_observation_of_another_shape_is_refused(make: Callable[[], Policy], 
     for act in (policy.act_greedily, lambda seen: policy.act(seen, np.random.default_rng(0)), policy.outputs):
         with pytest.raises(InvalidArgument) as raised:
             act(np.zeros(shape))
-        told = f"observation: expected one of {policy.robot.name}, shape ({n},), got shape {shape}"
-        assert str(raised.value) == told
+        message = f"observation: expected one of {policy.robot.name}, shape ({n},), got shape {shape}"
+        assert str(raised.value) == message
         # A list is as good as an array.
         np.testing.assert_array_equal(act([0.0] * n), act(np.zeros(n)))  # type: ignore[arg-type]
 
@@ -438,15 +438,15 @@ def change_everything(make: Callable[[], Policy], tmp_path: Path, every: int) ->
     arrays, whole = taken_apart(replace(make(), provenance=TRAINED), tmp_path)
     path, refusals = tmp_path / "p0.safetensors", 0
     for place, strange in list(itertools.product(places(whole), ("left out", *STRANGE)))[::every]:
-        told = json.loads(json.dumps(whole))
-        node = told
+        changed = json.loads(json.dumps(whole))
+        node = changed
         for key in place[:-1]:
             node = node[key]
         if strange == "left out":
             del node[place[-1]]
         else:
             node[place[-1]] = strange
-        path.write_bytes(save(arrays, {"animat": json.dumps(told)}))
+        path.write_bytes(save(arrays, {"animat": json.dumps(changed)}))
         try:
             loaded = Policy.load(path)
         except InvalidFile as error:

@@ -233,7 +233,7 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     action = draw_action(environment, learner.trained.actor, wanted, uniforms)
     command = np.asarray(action if commands is None else jnp.array(commands)[action])
     mistake = np.abs(command - np.asarray(wanted)[:, 0])
-    # Acting at random misses by 0.7 on average; what is left is the entropy that the policy is told to keep.
+    # Acting at random misses by 0.7 on average; what is left is the entropy that the policy has as its target.
     assert mistake.mean() < 0.15
 
 

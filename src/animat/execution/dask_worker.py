@@ -171,7 +171,7 @@ def _own_cores(threads: int) -> list[int]:
         except OSError:
             file.close()
             continue
-        # Until this process ends.
+        # Held until this process ends.
         _HELD.append(file)
         own.append(core)
         if len(own) == threads:

@@ -29,15 +29,15 @@ class PinnedProcesses(ThreadPoolExecutor):
     """
 
     def __init__(self, cores: Sequence[int | None]) -> None:
-        super().__init__(len(cores), initializer=self._settle)
+        super().__init__(len(cores), initializer=self._init_thread)
         self._cores = list(reversed(cores))
-        self._mine = threading.local()
+        self._local = threading.local()
         self._processes: list[Process] = []
         self._lock, self._is_killed = threading.Lock(), False
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Submit a call, which is pickled immediately."""
-        return super().submit(self._hand_over, pickle.dumps((fn, args, kwargs)))
+        return super().submit(self._run, pickle.dumps((fn, args, kwargs)))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Shut the executor down and end its processes."""
@@ -61,20 +61,20 @@ class PinnedProcesses(ThreadPoolExecutor):
         else:
             self.kill_workers()
 
-    def _settle(self) -> None:
-        self._mine.core, self._mine.process = self._cores.pop(), None
+    def _init_thread(self) -> None:
+        self._local.core, self._local.process = self._cores.pop(), None
 
-    def _hand_over(self, call: bytes) -> Any:
-        process: Process | None = self._mine.process
+    def _run(self, call: bytes) -> Any:
+        process: Process | None = self._local.process
         if process is None or process.is_spent:
             with self._lock:
                 if self._is_killed:
                     raise BrokenExecutor("its process was ended before it began")
                 if process is not None:
                     self._processes.remove(process)
-                    self._mine.process = None
+                    self._local.process = None
                     process.end()
-                process = self._mine.process = Process("gpu" if self._mine.core is None else self._mine.core)
+                process = self._local.process = Process("gpu" if self._local.core is None else self._local.core)
                 self._processes.append(process)
         return process.answer(call)
 

@@ -328,7 +328,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             if "animat" not in metadata:
-                raise InvalidFile(f"{path}: expected a policy of animat, got a safetensors file of other origin")
+                raise InvalidFile(f"{path}: expected a policy of animat, got another kind of safetensors file")
             kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
             if set(kinds) - {"assessments"} != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
                 listing = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
