@@ -251,7 +251,7 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
 
     with pytest.raises(Stop):
         train_group(group, checkpoint, stop, checkpoint_s=0.0)
-    with pytest.raises(InvalidFile, match="of another"):
+    with pytest.raises(InvalidFile, match="got another training's"):
         train_group(replace(group, fingerprint="other"), checkpoint, stop, checkpoint_s=0.0)
     whole = checkpoint.read_bytes()
     with np.load(checkpoint) as kept:

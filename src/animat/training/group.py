@@ -362,9 +362,7 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Any) -> tuple[int, Any,
                     f"{path}: expected a checkpoint of at most {most:,} bytes, got {unpacked:,}; remove it"
                 )
             if str(file["fingerprint"]) != fingerprint:
-                raise InvalidFile(
-                    f"{path}: expected a checkpoint of this training, got one of a different training; remove it"
-                )
+                raise InvalidFile(f"{path}: expected a checkpoint of this training, got another training's; remove it")
             arrays = [file[f"leaf{i}"] for i in range(sum(name.startswith("leaf") for name in file.files))]
             done, curve = int(file["done"]), file["curve"]
             is_alike = [(a.shape, a.dtype) for a in arrays] == [(leaf.shape, leaf.dtype) for leaf in leaves]
