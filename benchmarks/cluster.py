@@ -24,7 +24,7 @@ from animat.execution.cluster import Cluster
 from animat.execution.jobs import Job, Jobs
 from animat.execution.local_cluster import local_cluster
 from animat.execution.receipts import Receipt, receipt_path
-from animat.execution.task import Done, Task, carry_out_alone
+from animat.execution.task import Task, TaskResult, carry_out_alone
 from animat.execution.training import train
 from animat.progress import Silent
 from animat.studies.cultures import run_over_cultures
@@ -116,7 +116,7 @@ def sizes(scheduler: Path, rounds: int) -> dict[str, Any]:
             assert receipt is not None
             notice = receipt_path(folder / RECEIPTS, job.name)
             task = pickle.dumps((carry_out_alone, (job.task, folder, notice), {}))
-            answer = pickle.dumps(Done(dict(receipt.outputs), 1.0))
+            answer = pickle.dumps(TaskResult(dict(receipt.outputs), 1.0))
             left = sum((folder / name).stat().st_size for name in receipt.outputs)
             by_kind.setdefault(job.name.split("/")[0], []).append((len(task), len(answer), left))
     names = ("task", "answer", "files")

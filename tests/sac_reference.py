@@ -11,12 +11,12 @@ from scipy import stats
 
 from animat.training.networks import Network, initial_networks
 from animat.training.replay import Batch
-from animat.training.sac import Trained
+from animat.training.sac import Parameters
 
 
 def drawn_networks(
     seed: int, n: int, hidden: int, n_actions: int | None, n_commands: int = 1
-) -> tuple[Trained, Network]:
+) -> tuple[Parameters, Network]:
     """Actor, critics, log alpha and target critics with weights of ordinary size everywhere, biases included."""
     continuous = (n + 1 + n_commands, 1, 2 * n_commands)
     inputs, values, outputs = continuous if n_actions is None else (n + 1, n_actions, n_actions)
@@ -35,7 +35,7 @@ def drawn_networks(
     def drawn(network: Network) -> Any:
         return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0, 0.6, leaf.shape), jnp.float32), network)
 
-    return Trained(drawn(actor), drawn(critics), jnp.float32(rng.uniform(-3, 1))), drawn(targets)
+    return Parameters(drawn(actor), drawn(critics), jnp.float32(rng.uniform(-3, 1))), drawn(targets)
 
 
 def drawn_batch(seed: int, size: int, n: int, n_actions: int | None, n_commands: int = 1) -> Batch:
@@ -81,7 +81,7 @@ def log_density(action_z: float, mean: float, log_std: float) -> float:
 
 
 def discrete_losses(
-    trained: Trained, targets: Network, batch: Batch, *, discount: float, entropy_wanted: float
+    trained: Parameters, targets: Network, batch: Batch, *, discount: float, entropy_wanted: float
 ) -> tuple[float, float, float]:
     """Losses of critics, actor and alpha (Christodoulou 2019, equations 10 to 12), averaged over the batch.
 
@@ -104,7 +104,7 @@ def discrete_losses(
 
 
 def continuous_losses(
-    trained: Trained, targets: Network, batch: Batch, uniforms: np.ndarray, *, discount: float, entropy_wanted: float
+    trained: Parameters, targets: Network, batch: Batch, uniforms: np.ndarray, *, discount: float, entropy_wanted: float
 ) -> tuple[float, float, float]:
     """The same for continuous actions (Haarnoja et al. 2018, equations 5, 7 and 18), their entropies added up."""
     alpha = np.exp(trained.log_alpha)

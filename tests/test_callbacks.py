@@ -27,9 +27,9 @@ def assert_whole(rows: list[CurveRow], policies: dict[str, Policy]) -> None:
     """Every row of every policy once, in its order."""
     assert {row.policy for row in rows} == set(policies)
     for name, policy in policies.items():
-        told = [astuple(row)[1:] for row in rows if row.policy == name]
-        assert len(told) == CHUNKS
-        np.testing.assert_array_equal(told, policy.learning_curve)
+        reported = [astuple(row)[1:] for row in rows if row.policy == name]
+        assert len(reported) == CHUNKS
+        np.testing.assert_array_equal(reported, policy.learning_curve)
 
 
 def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,9 +48,9 @@ def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path, monkeypatch
         came.set()
 
     monkeypatch.setattr(CurveFile, "add", add_and_wait)
-    told = trained(FOUR, timeline_of(), tmp_path / "told", callbacks=[on_row])
-    assert bits(tmp_path / "plain") == bits(tmp_path / "told")
-    assert_whole(rows, told)
+    followed = trained(FOUR, timeline_of(), tmp_path / "followed", callbacks=[on_row])
+    assert bits(tmp_path / "plain") == bits(tmp_path / "followed")
+    assert_whole(rows, followed)
     # In memory, one by one; and of a folder that is finished.
     in_memory: list[CurveRow] = []
     alone = train(FOUR, timeline_of(), None, callbacks=[in_memory.append])
@@ -58,11 +58,11 @@ def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path, monkeypatch
     for name, policy in plain.items():
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
     again: list[CurveRow] = []
-    assert_whole(again, trained(FOUR, timeline_of(), tmp_path / "told", callbacks=[again.append]))
+    assert_whole(again, trained(FOUR, timeline_of(), tmp_path / "followed", callbacks=[again.append]))
 
 
 @pytest.mark.oracle
-def test_a_training_that_goes_on_tells_all_rows_again_from_the_first(tmp_path: Path) -> None:
+def test_a_continued_training_reports_all_rows_again_from_the_first(tmp_path: Path) -> None:
     trained(SHORT, timeline_of(), tmp_path / "whole")
     rows: list[CurveRow] = []
 

@@ -682,7 +682,7 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --pulse-cost -1", "--pulse-cost: expected at least 0, got -1"),
         ("train --pulse-cost 1 --mapping none", "--pulse-cost: expected 0 without neurons, got 1"),
         ("train --pulse-cost 1 --assess 3", "--pulse-cost: expected 0 with assessments"),
-        ("train --neural-observation --mapping none", "--neural-observation: expected none without a mapping"),
+        ("train --neural-observation --mapping none", "--neural-observation: expected only with a mapping"),
         ("train --mapping none --delivery shuffled", "--delivery: expected none without neurons"),
         ("train --mapping none --recordings .", "--recordings: expected none without neurons, got ."),
         ("record --culture replay", "--recordings: expected some for --culture replay, got none"),

@@ -22,7 +22,7 @@ import pytest
 from animat.cli import _parse, main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.execution.cluster import Cluster
-from animat.execution.dask_worker import _own_cores, made_of
+from animat.execution.dask_worker import _own_cores, versions_tag
 from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.local_cluster import local_cluster
 from animat.execution.task import Task
@@ -61,7 +61,7 @@ def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
     shutil.rmtree(folder)
     (tmp_path / "elsewhere").mkdir()
     folder.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(InvalidFile, match="expected a folder of this user's"):
+    with pytest.raises(InvalidFile, match="expected a folder of this user, got another user's or a link"):
         _own_cores(1)
     assert victim.read_text() == "all there" and core in os.sched_getaffinity(0)
     held.pop().close()
@@ -86,7 +86,7 @@ def test_a_place_that_is_no_scheduler_s_is_a_line(tmp_path: Path, capsys: pytest
             "no.json",
             "animat: --cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got 'no.json'",
         ),
-        (str(tmp_path / "cluster.json"), "expected a scheduler's file, got one that holds no address"),
+        (str(tmp_path / "cluster.json"), "expected a scheduler's file, got one without an address"),
     ):
         assert main(["study", str(TINY), "--out", str(tmp_path / "out"), "--cluster", where]) == 1
         said = capsys.readouterr().err
@@ -139,15 +139,15 @@ class Tried(Sized):
 @oracle
 def test_each_has_a_core_and_jobs_come_in_order(running: Running, tmp_path: Path) -> None:
     with Cluster(running.file) as cluster:
-        told = [future.result() for future in [cluster.submit(tell_process) for _ in range(6)]]
-        assert all(len(cores) == 1 for _, cores in told)
-        assert len({process for process, _ in told}) <= 2
+        processes = [future.result() for future in [cluster.submit(tell_process) for _ in range(6)]]
+        assert all(len(cores) == 1 for _, cores in processes)
+        assert len({process for process, _ in processes}) <= 2
         jobs = [Job(name, Join(name, tuple(of)), tuple(of)) for name, of in (("a", ""), ("b", "a"), ("c", "ab"))]
         assert run(jobs, tmp_path, cluster) == {"a", "b", "c"}
         assert (tmp_path / "c").read_text() == "(c(a)(b(a)))"
     # Another client gets another process: what it has imported may have changed.
     with Cluster(running.file) as cluster:
-        assert cluster.submit(tell_process).result()[0] not in {process for process, _ in told}
+        assert cluster.submit(tell_process).result()[0] not in {process for process, _ in processes}
 
 
 @oracle
@@ -158,7 +158,7 @@ def test_what_fails_twice_is_done_and_thrice_is_reported(running: Running, tmp_p
         Job("in vain", Join("in vain", ("thrice",)), ("thrice",)),
         Job("other", Join("other")),
     ]
-    words = "^thrice: a.nwb: expected a recording, got none; waiting for what failed: 1$"
+    words = "^thrice: a.nwb: expected a recording, got none; not run, as they need failed jobs: 1$"
     with Cluster(running.file) as cluster, pytest.raises(AnimatError, match=words):
         run(jobs, tmp_path, cluster)
     assert (tmp_path / "thrice").read_text().count("tried") == 3
@@ -229,7 +229,7 @@ def test_what_kills_is_reported_and_what_ran_beside_it_is_done(
             with Cluster(file) as cluster, pytest.raises(AnimatError) as raised:
                 run(jobs, folder, cluster)
             how = r"worker tcp://\S+ ended" if worker else r"its process ended with status -9, on \S+"
-            words = rf"ends: what it ran on ended 3 times, at last: {how} \(is there memory enough\? .*"
+            words = rf"ends: its process or worker ended 3 times, last: {how} \(is there enough memory\? .*"
             assert re.fullmatch(words, str(raised.value))
             assert log.read_text().count("tried") == 3
             assert {path.stem for path in (folder / "jobs").iterdir()} == {"a", "b", "behind"}
@@ -238,13 +238,13 @@ def test_what_kills_is_reported_and_what_ran_beside_it_is_done(
         len(re.findall(r"^warning: cluster: worker tcp://\S+ ended; its tasks \(\d\) go to others$", said, re.M)) == 3
     )
     assert (
-        len(re.findall(r"^warning: cluster: ends: its process ended with status -9, on \S+; it is tried", said, re.M))
+        len(re.findall(r"^warning: cluster: ends: its process ended with status -9, on \S+; trying again$", said, re.M))
         == 2
     )
 
 
 @pytest.mark.long
-def test_a_frozen_worker_and_a_frozen_scheduler_are_told(
+def test_a_frozen_worker_and_a_frozen_scheduler_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("animat.execution.dispatch._SILENT_S", 3)
@@ -271,7 +271,7 @@ def test_a_frozen_worker_and_a_frozen_scheduler_are_told(
 
 
 @oracle
-def test_all_that_failed_is_told_at_the_end(running: Running, tmp_path: Path) -> None:
+def test_all_failures_are_reported_at_the_end(running: Running, tmp_path: Path) -> None:
     tasks: list[Task] = [Fail(), Fail(), Join("other")]
     with Cluster(running.file) as cluster, pytest.raises(InvalidFile, match=r"^0: a\.nwb: .*; 1: a\.nwb: .* none$"):
         run([Job(str(i), task) for i, task in enumerate(tasks)], tmp_path, cluster)
@@ -282,22 +282,22 @@ def test_all_that_failed_is_told_at_the_end(running: Running, tmp_path: Path) ->
 def test_a_worker_of_another_version_is_named_and_gets_nothing(
     running: Running, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = made_of().replace("animat:", "animat:0.0.")
+    other = versions_tag().replace("animat:", "animat:0.0.")
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(running.file)]
     with subprocess.Popen([*worker, "--no-dashboard", "--nthreads", "9", "--resources", f"{other}=9"]) as process:
         with distributed.Client(scheduler_file=str(running.file), set_as_default=False) as client:
             client.wait_for_workers(3, timeout=300)
         with Cluster(running.file) as cluster:
             warned = capsys.readouterr().err
-            told = [future.result() for future in [cluster.submit(tell_process) for _ in range(12)]]
+            processes = [future.result() for future in [cluster.submit(tell_process) for _ in range(12)]]
         process.terminate()
-    assert len({pid for pid, _ in told}) <= 2
+    assert len({pid for pid, _ in processes}) <= 2
     assert re.fullmatch(r"warning: worker tcp://\S+: expected animat 0\.1\S+, jax .*, got animat 0\.0\..*\n", warned)
 
 
 @oracle
 def test_where_all_are_of_another_version_it_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.execution.cluster.made_of", lambda: "animat:9/Python:3.99")
+    monkeypatch.setattr("animat.execution.cluster.versions_tag", lambda: "animat:9/Python:3.99")
     with local_cluster(1, tmp_path / "cluster.json"):
         with distributed.Client(scheduler_file=str(tmp_path / "cluster.json"), set_as_default=False) as client:
             client.wait_for_workers(1, timeout=300)
@@ -453,7 +453,7 @@ def test_a_cluster_ends_where_its_scheduler_died_as_its_workers_began(
 
 
 @oracle
-def test_a_scheduler_that_dies_is_told_and_the_same_command_goes_on(without: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_dead_scheduler_is_reported_and_the_same_command_continues(without: dict[str, bytes], tmp_path: Path) -> None:
     out, file = tmp_path / "study", tmp_path / "cluster.json"
     with local_cluster(2, file) as (scheduler, _):
         process = started(out, "--cluster", str(file))
@@ -462,7 +462,7 @@ def test_a_scheduler_that_dies_is_told_and_the_same_command_goes_on(without: dic
         scheduler.kill()
         said, _ = process.communicate()
     assert process.returncode == 1
-    assert re.fullmatch(r"animat: .* has ended; start \w+, and then this again to go on", last(said))
+    assert re.fullmatch(r"animat: .* has ended; start it, then run this again to continue", last(said))
     with local_cluster(2, file):
         finish(out, "--cluster", str(file))
     assert contents(out) == without

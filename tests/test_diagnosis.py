@@ -107,7 +107,7 @@ def test_what_is_learned_does_not_depend_on_it(tmp_path: Path, monkeypatch: pyte
     short = replace(SHORT, policies=1, iterations=2_000)
     with_it = trained(short, timeline_of(), tmp_path / "with")["p0"]
     none = Diagnosis(*np.full((3, 1), np.nan))
-    monkeypatch.setattr("animat.training.group.diagnosing", lambda *_: lambda *_: none)
+    monkeypatch.setattr("animat.training.group.diagnosis_program", lambda *_: lambda *_: none)
     without = trained(short, timeline_of(), tmp_path / "without")["p0"]
     for ours, theirs in zip((*with_it.weights, *with_it.biases), (*without.weights, *without.biases), strict=True):
         np.testing.assert_array_equal(ours, theirs)

@@ -19,14 +19,14 @@ from animat.neurons.timeline import SimulatorTimeline
 from animat.responses.condition import Condition
 from animat.robots import SwingUp, robot_named
 from animat.stimulation.protocol import Presentation
-from animat.training.exploration import Exploration, ended_episodes, explore, is_worth_it, n_uniforms, nothing_held
+from animat.training.exploration import Exploration, count_ended, explore, is_useful, n_uniforms, nothing_held
 from animat.training.specification import Training
 
 ENVIRONMENT = Animat(SwingUp(), mapping_named("9-thresholds"), 5)
 NOT_ENDED = jnp.zeros(64, bool)
 
 compiled_explore = jax.jit(explore, static_argnums=0)
-compiled_ended_episodes = jax.jit(ended_episodes)
+compiled_count_ended = jax.jit(count_ended)
 
 
 def history(
@@ -77,7 +77,7 @@ def test_a_held_action_stays_the_same_for_its_length_and_ends_with_its_episode()
     taken, exploration = compiled_explore(ENVIRONMENT, nothing_held(n, 1), policy, begin)
     for _ in range(length - 1):
         assert np.asarray(taken)[n // 2 :].tolist() == (n // 2) * [2]
-        exploration = compiled_ended_episodes(exploration, NOT_ENDED, jnp.zeros(n))
+        exploration = compiled_count_ended(exploration, NOT_ENDED, jnp.zeros(n))
         # What would begin another one changes nothing while one is held.
         taken, exploration = compiled_explore(ENVIRONMENT, exploration, policy, never)
     assert np.asarray(taken)[n // 2 :].tolist() == (n // 2) * [2]
@@ -85,7 +85,7 @@ def test_a_held_action_stays_the_same_for_its_length_and_ends_with_its_episode()
     assert (np.asarray(taken) == 7).all()
 
     _, exploration = compiled_explore(ENVIRONMENT, nothing_held(n, 1), policy, begin)
-    exploration = compiled_ended_episodes(exploration, ~NOT_ENDED, jnp.zeros(n))
+    exploration = compiled_count_ended(exploration, ~NOT_ENDED, jnp.zeros(n))
     assert not np.asarray(exploration.was_held).any()
     taken, _ = compiled_explore(ENVIRONMENT, exploration, policy, never)
     assert (np.asarray(taken) == 7).all()
@@ -114,7 +114,7 @@ def test_what_is_known_of_late_episodes_is_their_weighted_mean() -> None:
     for _ in range(200):
         which, value = int(rng.integers(4)), float(rng.normal())
         returns = jnp.full(4, 1e6).at[which].set(value)
-        after = compiled_ended_episodes(exploration, jnp.arange(4) == which, returns)
+        after = compiled_count_ended(exploration, jnp.arange(4) == which, returns)
         exploration = after._replace(was_held=exploration.was_held)
         kind = weights[which // 2]
         kind[0], kind[1] = 0.98 * kind[0] + 1.0, 0.98 * kind[1] + value
@@ -137,9 +137,9 @@ def test_actions_are_held_until_the_policy_alone_does_better(
 ) -> None:
     episodes, returns = zip(alone, with_held, strict=True)
     exploration = nothing_held(8, 1)._replace(episodes=jnp.array(episodes, float), returns=jnp.array(returns, float))
-    assert bool(is_worth_it(exploration)) == expected
+    assert bool(is_useful(exploration)) == expected
     # A single environment holds nothing that could be compared with.
-    assert not is_worth_it(exploration._replace(left=exploration.left[:1]))
+    assert not is_useful(exploration._replace(left=exploration.left[:1]))
     uniforms = jnp.zeros((8, 3))
     taken, _ = jax.jit(partial(explore, ENVIRONMENT))(exploration, jnp.full(8, 7), uniforms)
     assert bool((np.asarray(taken) != 7).any()) == expected

@@ -21,13 +21,13 @@ import pytest
 
 from animat import devices
 from animat.errors import Mismatch, UnusableData
-from animat.execution import gpu, trains
+from animat.execution import gpu, training_task
 from animat.execution import training as in_folders
-from animat.execution.gpu import WithGpu, find_gpu, programs_among
+from animat.execution.gpu import WithGpu, find_gpu, group_by_program
 from animat.execution.jobs import Jobs
-from animat.execution.task import Done, reported
+from animat.execution.task import TaskResult, reported
 from animat.execution.training import TrainGroup, train
-from animat.execution.trains import Trains, Work, train_at_once
+from animat.execution.training_task import TrainingTask, TrainingWork, train_together
 from animat.progress import Silent
 from animat.robots import Cartpole
 from animat.studies import run as studies
@@ -69,7 +69,7 @@ def assert_same(ones: Iterable[Policy], others: Iterable[Policy]) -> None:
 
 
 class AtOnce(NamedTuple):
-    """What came of two policies of each of the arms, and the rows that were told meanwhile."""
+    """What came of two policies of each of the arms, and the rows that were reported."""
 
     policies: list[list[Policy]]
     rows: list[list[np.ndarray]]
@@ -112,9 +112,9 @@ def test_stopped_at_a_checkpoint_all_go_on_to_the_same_bits(at_once: AtOnce, tmp
     groups, checkpoint, rows = [group_of(arm, 0, 1) for arm in ARMS], tmp_path / "kept.npz", list[np.ndarray]()
     with pytest.raises(KeyboardInterrupt):
         train_groups(groups, checkpoint, Stopping(), checkpoint_s=0.0, add_parts=[None, None])
-    told = Kept()
-    again = train_groups(groups, checkpoint, told, add_parts=[None, rows.append])
-    assert [done for done, _ in told.told] == [CHUNKS - 2, CHUNKS - 1, CHUNKS]
+    kept = Kept()
+    again = train_groups(groups, checkpoint, kept, add_parts=[None, rows.append])
+    assert [done for done, _ in kept.updates] == [CHUNKS - 2, CHUNKS - 1, CHUNKS]
     assert_same(chain(*again), chain(*at_once.policies))
     np.testing.assert_array_equal(rows, at_once.rows[1])
 
@@ -126,16 +126,16 @@ def test_what_all_remember_is_written_in_place_and_not_scattered() -> None:
     wanted[:, :, 5:7] = rows
     np.testing.assert_array_equal(write(replays, rows, 5), wanted)
     assert "scatter" not in write.lower(replays, rows, 5).as_text()
-    with pytest.raises(ValueError, match="one place for all"):
+    with pytest.raises(ValueError, match="one position for all"):
         jax.vmap(remember)(replays[0], rows[0], np.arange(3))
 
 
-def tasks_of(training: Training, *groups: tuple[int, ...]) -> list[Trains]:
-    return [TrainGroup(group_of(training, *members), 0.0, tells_rows=True) for members in groups]
+def tasks_of(training: Training, *groups: tuple[int, ...]) -> list[TrainingTask]:
+    return [TrainGroup(group_of(training, *members), 0.0, writes_rows=True) for members in groups]
 
 
 @dataclass(frozen=True)
-class Elsewhere(Trains):
+class Elsewhere(TrainingTask):
     """Trains a group into a folder by its name."""
 
     name: str
@@ -149,9 +149,9 @@ class Elsewhere(Trains):
     def training(self) -> Training:
         return self.group.training
 
-    def prepare(self, folder: Path) -> Work:
+    def prepare(self, folder: Path) -> TrainingWork:
         vars(self)["ran_on"] = threading.current_thread().name
-        return Work(self.group, folder / self.name, folder / "none.npz")
+        return TrainingWork(self.group, folder / self.name, folder / "none.npz")
 
 
 def test_tasks_of_one_program_are_done_at_once_and_the_others_on_cores(at_once: AtOnce, tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_tasks_of_one_program_are_done_at_once_and_the_others_on_cores(at_once: 
     tasks = [first, Join("a"), second]
     notices = [tmp_path / f"{number}.json" for number in range(3)]
     with ThreadPoolExecutor(1, "cores") as cores, ThreadPoolExecutor(1, "gpu") as process:
-        done = [future.result() for future in WithGpu(cores, process).hand_in(tasks, tmp_path, notices)]
+        done = [future.result() for future in WithGpu(cores, process).submit_tasks(tasks, tmp_path, notices)]
     assert [sorted(each.files) for each in done] == [
         ["moving/p0.safetensors", "moving/p1.safetensors"],
         ["a"],
@@ -175,14 +175,14 @@ def test_tasks_of_one_program_are_done_at_once_and_the_others_on_cores(at_once: 
 
 def test_what_fails_at_once_fails_for_each(tmp_path: Path) -> None:
     tasks = tasks_of(SHORTEST, (0,), (1,))
-    failing: Future[list[Done]] = Future()
+    failing: Future[list[TaskResult]] = Future()
 
     class Process(ThreadPoolExecutor):
         def submit(self, *_: Any) -> Any:
             return failing
 
     with ThreadPoolExecutor(1) as cores, Process(1) as process:
-        futures = WithGpu(cores, process).hand_in(tasks, tmp_path, [tmp_path / "a", tmp_path / "b"])
+        futures = WithGpu(cores, process).submit_tasks(tasks, tmp_path, [tmp_path / "a", tmp_path / "b"])
         assert not any(future.done() for future in futures)
         failing.set_exception(UnusableData("no number"))
     assert [str(future.exception()) for future in futures] == ["no number"] * 2
@@ -200,13 +200,13 @@ def test_a_program_is_of_one_environment_one_algorithm_and_one_length() -> None:
         "the same lessons": replace(SHORTEST, lessons=(Lesson(until_return=1.0),)),
     }
     tasks = [task for training in trainings.values() for task in tasks_of(training, (0,))]
-    assert programs_among([*tasks, Join("a")]) == [[0, 1], [2], [3], [4], [5, 7], [6]]
+    assert group_by_program([*tasks, Join("a")]) == [[0, 1], [2], [3], [4], [5, 7], [6]]
 
 
 def test_arms_of_a_study_share_programs_and_those_that_are_not_trained_have_none() -> None:
     study = read_study(TINY)
     tasks = [TrainArm(study, study.robots[0], arm, (0, 1)) for arm in study.arms]
-    assert programs_among([*tasks, replace(tasks[1], arm=replace(study.arms[1], name="again"))]) == [[1, 4], [2], [3]]
+    assert group_by_program([*tasks, replace(tasks[1], arm=replace(study.arms[1], name="again"))]) == [[1, 4], [2], [3]]
 
 
 def test_a_device_s_memory_decides_on_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,12 +227,12 @@ def test_a_device_s_memory_decides_on_the_parts(monkeypatch: pytest.MonkeyPatch)
 def test_killed_between_two_parts_the_first_is_not_trained_again_and_the_bits_are_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trains, "parts_that_fit", lambda groups: [[0, 1], [2]])
+    monkeypatch.setattr(training_task, "parts_that_fit", lambda groups: [[0, 1], [2]])
     tasks = tasks_of(SHORTEST, (0,), (1,), (2,))
     for name in ("whole", "killed"):
         (tmp_path / name).mkdir()
     notices = [tmp_path / f"{number}.json" for number in range(3)]
-    train_at_once(tasks, tmp_path / "whole", notices)
+    train_together(tasks, tmp_path / "whole", notices)
     rounds: list[int] = []
     plain = SideBySide.train
 
@@ -244,9 +244,9 @@ def test_killed_between_two_parts_the_first_is_not_trained_again_and_the_bits_ar
 
     monkeypatch.setattr(SideBySide, "train", stopping)
     with pytest.raises(KeyboardInterrupt):
-        train_at_once(tasks, tmp_path / "killed", notices)
+        train_together(tasks, tmp_path / "killed", notices)
     rounds.clear()
-    train_at_once(tasks, tmp_path / "killed", notices)
+    train_together(tasks, tmp_path / "killed", notices)
     assert rounds == list(range(CHUNKS))
     assert bits(tmp_path / "killed") == bits(tmp_path / "whole")
     assert not list((tmp_path / "killed").glob(".unfinished/*.npz"))
@@ -254,10 +254,10 @@ def test_killed_between_two_parts_the_first_is_not_trained_again_and_the_bits_ar
 
 @pytest.mark.oracle
 def test_what_does_not_fit_into_memory_is_trained_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trains, "parts_that_fit", lambda groups: [[0, 1], [2]])
+    monkeypatch.setattr(training_task, "parts_that_fit", lambda groups: [[0, 1], [2]])
     tasks = tasks_of(SHORTEST, (0,), (1,), (2,))
     notices = [tmp_path / f"{number}.json" for number in range(3)]
-    done = train_at_once(tasks, tmp_path, notices)
+    done = train_together(tasks, tmp_path, notices)
     assert [list(each.files) for each in done] == [[f"p{i}.safetensors"] for i in range(3)]
     groups = [task.prepare(tmp_path).group for task in tasks]
     wanted = [*train_groups(groups[:2], None, Silent(), add_parts=[None] * 2), train_group(groups[2], None, Silent())]
@@ -357,7 +357,7 @@ def test_where_no_gpu_is_found_it_says_so_in_a_line(
     assert err == said
 
 
-def test_a_training_tells_its_device_and_is_not_gone_on_with_on_another(tmp_path: Path) -> None:
+def test_a_training_records_its_device_and_is_not_continued_on_another(tmp_path: Path) -> None:
     on = {name: describe(SHORTEST, timeline_of(), device=name) for name in (None, "NVIDIA H100", "NVIDIA A100")}
     assert len({manifest["fingerprint"] for manifest in on.values()}) == 3
     assert "device" not in on[None]["versions"]
@@ -374,7 +374,7 @@ def test_a_training_with_a_gpu_comes_from_one_process_of_its_own(
     monkeypatch.setattr(in_folders, "find_gpu", lambda: "pretended")
     seven, progress, rows = replace(SHORTEST, policies=7), Kept(), list[Any]()
     at_once = train(seven, timeline_of(), tmp_path, progress=progress, callbacks=[rows.append])
-    assert progress.told[-1] == (7 * CHUNKS, 7 * CHUNKS)
+    assert progress.updates[-1] == (7 * CHUNKS, 7 * CHUNKS)
     assert list(bits(tmp_path)) == [f"p{i}.safetensors" for i in range(7)]
     assert not (tmp_path / ".unfinished").exists()
     assert len(rows) == 7 * CHUNKS
@@ -384,13 +384,13 @@ def test_a_training_with_a_gpu_comes_from_one_process_of_its_own(
         jax.tree.map(np.testing.assert_array_equal, arrays(one), arrays(other))
 
 
-def test_a_study_tells_its_device_and_is_not_gone_on_with_on_another(
+def test_a_study_records_its_device_and_is_not_continued_on_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = replace(read_study(TINY), culture=Source())
-    told = describe_study(study, {}, "NVIDIA H100")
-    assert told["fingerprint"] != describe_study(study, {})["fingerprint"]
-    (tmp_path / "study.json").write_text(json.dumps(told))
+    description = describe_study(study, {}, "NVIDIA H100")
+    assert description["fingerprint"] != describe_study(study, {})["fingerprint"]
+    (tmp_path / "study.json").write_text(json.dumps(description))
     (tmp_path / "jobs").mkdir()
     (tmp_path / "jobs" / "fit.json").write_text("{}")
     with pytest.raises(Mismatch, match=r"versions\.device: 'NVIDIA H100' there, nothing now"):
@@ -421,8 +421,8 @@ from animat.process import pin_worker
 cores = os.sched_getaffinity(0)
 pin_worker(None)
 assert os.sched_getaffinity(0) == cores
-told = [os.environ.get(n) for n in ("JAX_PLATFORMS", "XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_DEFAULT_MATMUL_PRECISION")]
-print(*told, file=sys.stderr)
+values = [os.environ.get(n) for n in ("JAX_PLATFORMS", "XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_DEFAULT_MATMUL_PRECISION")]
+print(*values, file=sys.stderr)
 """
 
 

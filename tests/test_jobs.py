@@ -32,13 +32,13 @@ CORE = min(os.sched_getaffinity(0))
 
 
 class Kept:
-    """A progress that keeps what it is told."""
+    """A progress that keeps its updates."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[float, float, str]] = []
+        self.updates: list[tuple[float, float, str]] = []
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self.told.append((done, total, note))
+        self.updates.append((done, total, note))
 
 
 def run(
@@ -112,15 +112,15 @@ def test_what_is_lost_or_changed_is_done_again_and_what_rests_on_other_bytes(tmp
 
 def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
     # A run that was killed left its last words.
-    stale = receipt_path(tmp_path / ".unfinished" / "told", "b")
+    stale = receipt_path(tmp_path / ".unfinished" / ".told", "b")
     stale.parent.mkdir(parents=True)
     stale.write_text(json.dumps([0.9, "nearly"]))
     kept = Kept()
     run([joined("a", cost_s=3.0, takes_s=0.5), joined("b", "a", takes_s=0.5)], tmp_path, progress=kept)
-    done = [told[0] for told in kept.told]
+    done = [update[0] for update in kept.updates]
     assert done == sorted(done)
-    assert (done[-1], {told[1] for told in kept.told}) == (4.0, {4.0})
-    notes = {told[2] for told in kept.told}
+    assert (done[-1], {update[1] for update in kept.updates}) == (4.0, {4.0})
+    notes = {update[2] for update in kept.updates}
     assert {"0 of 2 jobs; a 50 % half", "1 of 2 jobs; b 50 % half"} <= notes
     assert not any("nearly" in note for note in notes)
 
@@ -130,11 +130,11 @@ def test_what_is_planned_and_what_it_costs_is_in_a_file_until_all_is_done(tmp_pa
     for _ in ("anew", "going on"):
         with pytest.raises(InvalidFile):
             run(jobs, tmp_path)
-        told = json.loads((tmp_path / ".unfinished" / PLANNED).read_text())
-        assert list(told.items()) == [("b", 2.5), ("a", 0.1), ("c/d", 1.0)]
+        planned = json.loads((tmp_path / ".unfinished" / PLANNED).read_text())
+        assert list(planned.items()) == [("b", 2.5), ("a", 0.1), ("c/d", 1.0)]
 
 
-def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
+def test_a_task_reports_its_progress_in_a_file(tmp_path: Path) -> None:
     assert reported(tmp_path / "notice.json") is None
     done = carry_out(Join("a"), tmp_path, tmp_path / "notice.json")
     assert reported(tmp_path / "notice.json") == [0.5, "half"]
@@ -154,17 +154,17 @@ def test_what_a_task_tells_is_in_a_file(tmp_path: Path) -> None:
             Starve(),
             AnimatError,
             r"job: out of memory \(256. PiB more were requested\): it grows with policies \(10\), culture.channels "
-            r"\(256\): ask for less, or use a machine with more memory",
+            r"\(256\): reduce these, or use a machine with more memory",
         ),
         (
             Die(),
             AnimatError,
-            r"job: its process ended with status 7 \(is there memory enough\? .*\); start again to go on",
+            r"job: its process ended with status 7 \(is there enough memory\? .*\); run again to continue",
         ),
         pytest.param(
             Killed(),
             AnimatError,
-            r"job: its process ended with status -15 \(another program ended it\); start again to go on",
+            r"job: its process ended with status -15 \(another program ended it\); run again to continue",
             marks=pytest.mark.oracle,
         ),
     ],
@@ -242,7 +242,7 @@ def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
     freezes: bool, ours: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("animat.execution.task.SILENT_S", 1.0 if freezes else 60.0)
-    (notice := tmp_path / "told" / "a.json").parent.mkdir()
+    (notice := tmp_path / "notices" / "a.json").parent.mkdir()
     log = tmp_path / "log"
     elsewhere = ours.submit(carry_out_alone, Join("a", log=log, takes_s=3.0 if freezes else 0.5), tmp_path, notice)
     while not log.exists():

@@ -99,20 +99,20 @@ def test_an_episode_moves_as_the_robot_with_the_parameter_that_was_drawn(name: s
     value = float(np.float32(getattr(usual, parameter) * 0.9))
     lesson = Lesson(parameters={parameter: (value, value)})
     if (name, parameter) in BY_SHAPE:
-        with pytest.raises(InvalidArgument, match=rf"parameters\.{parameter}: .* cannot vary while it is compiled"):
+        with pytest.raises(InvalidArgument, match=rf"parameters\.{parameter}: .* must be known at compile time"):
             expect_varied(usual, varying_in([lesson], recordings=False))
         return
     plain, drawn = WithoutNeurons(replace(usual, **{parameter: value}), None), varied(lesson, usual)
     expect_varied(usual, drawn.varying)
 
     def episode(environment: Any) -> Any:
-        state, told = environment.reset(jax.random.key(3)), []
+        state, steps = environment.reset(jax.random.key(3)), []
         for key in jax.random.split(jax.random.key(4), 6):
             uniforms = jax.random.uniform(key, (environment.noise_size + usual.n_commands,))
             command = jnp.squeeze(2 * uniforms[: usual.n_commands] - 1)
             state = environment.advance(uniforms[usual.n_commands :], state, command, None)
-            told.append((state.robot, state.reward, state.ended, environment.observe(state)))
-        return told
+            steps.append((state.robot, state.reward, state.ended, environment.observe(state)))
+        return steps
 
     for moved, wanted in zip(jax.tree.leaves(episode(drawn)), jax.tree.leaves(episode(plain)), strict=True):
         np.testing.assert_allclose(moved, wanted, rtol=2e-5, atol=2e-6)
@@ -203,13 +203,13 @@ def course_of(
         return np.array([[mean] * 10 for _, mean in rows]), np.array(succeeded)
 
     course._programs = (*course._programs[:2], assessment)
-    course.standing = course.standing._replace(best=np.zeros((2, 1)))
+    course.state = course.state._replace(best=np.zeros((2, 1)))
     lessons_at = []
     for index in range(n_chunks or len(successes_and_returns)):
         course.assess(index, networks + 100 * index, None)
-        lessons_at.append(course.standing.lesson.tolist())
+        lessons_at.append(course.state.lesson.tolist())
     assert next(made, None) is None
-    return course.standing, lessons_at
+    return course.state, lessons_at
 
 
 def test_a_policy_goes_on_at_its_share_each_for_itself_and_the_best_is_that_of_the_table() -> None:
@@ -261,7 +261,7 @@ def test_the_page_s_lessons_are_some(tmp_path: Path) -> None:
     expect_trainable(Training("swing-up", None, commands=(-1.0, 1.0), lessons=lessons), is_saved=True)
 
 
-def test_a_robot_that_tells_no_success_goes_on_by_its_return() -> None:
+def test_a_robot_without_success_moves_on_by_its_return() -> None:
     standing, at = course_of(
         [(0.0, -5.0), (0.0, 0.0)], [(0.0, 1.0), (0.0, 3.0)], lessons=(Lesson(until_return=0.0),), robot=Cartpole()
     )
@@ -270,7 +270,7 @@ def test_a_robot_that_tells_no_success_goes_on_by_its_return() -> None:
 
 
 @pytest.mark.oracle
-def test_policies_are_kept_at_their_best_beside_the_averaged_ones_and_tell_their_lessons(tmp_path: Path) -> None:
+def test_the_best_policies_are_kept_next_to_the_averaged_ones_with_their_lessons(tmp_path: Path) -> None:
     policies = trained(TAUGHT, timeline_of(), tmp_path)
     best = load_policies(tmp_path / "best")
     assert sorted(file.name for file in tmp_path.iterdir()) == [
@@ -300,7 +300,7 @@ def test_policies_are_kept_at_their_best_beside_the_averaged_ones_and_tell_their
         assert is_last == (row == CHUNKS - 1)
     progress = Kept()
     assert list(trained(TAUGHT, timeline_of(), tmp_path, progress=progress)) == ["p0", "p1"]
-    assert not progress.told
+    assert not progress.updates
 
 
 class Stop(Exception):
@@ -401,10 +401,10 @@ def test_recordings_are_drawn_of_those_that_shadowing_would_have_used() -> None:
         ("starts.angle_rad = [0, nan]", "expected a finite number"),
         ("success = 1.2", "success: expected at most 1, got 1.2"),
         ("success = 0.0", "success: expected more than 0, got 0"),
-        ("success = 0.8", "got cartpole, which has no method `succeeded`; go on by until_return"),
-        ("success = 0.8\nuntil_return = 4", "expected one way to go on, got success too"),
+        ("success = 0.8", "got cartpole, which has no method `succeeded`; use until_return"),
+        ("success = 0.8\nuntil_return = 4", "expected either success or until_return, got both"),
         ("[[lessons]]", "lesson 1: expected success or until_return, .*got neither"),
-        ("recordings_min = [0, 10]", "recordings_min: expected only where shadowing is 'drawn'"),
+        ("recordings_min = [0, 10]", "recordings_min: expected only with shadowing 'drawn'"),
         ("until_return = 121", "until_return: expected at most 120, the highest return of cartpole, got 121"),
         ("sucess = 0.8", "sucess: no such setting"),
         ("starts.angle_rad = [", "expected TOML, got malformed text"),
@@ -423,7 +423,7 @@ def test_what_is_stepped_elsewhere_or_has_no_neurons_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="lessons: expected a robot that is stepped by JAX, got gymnasium"):
         Training(host, "9-thresholds", lessons=(Lesson(),))
     for asked in ({"assess": 3}, {"shadowing": "drawn"}):
-        with pytest.raises(InvalidArgument, match="robot: expected one that is stepped by JAX"):
+        with pytest.raises(InvalidArgument, match="robot: expected one stepped by JAX"):
             Training(host, "9-thresholds", **asked)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="shadowing: expected a mapping with 'drawn', got none"):
         Training("cartpole", None, shadowing="drawn")
@@ -442,7 +442,9 @@ def test_a_lesson_that_does_not_name_what_another_varies_is_as_the_robot_has_it(
 
 
 @pytest.mark.oracle
-def test_the_command_teaches_and_tells_where_each_policy_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_trains_by_lessons_and_reports_each_policy_s_lesson(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, out = tmp_path / "lessons.toml", tmp_path / "policies"
     file.write_text("[[lessons]]\nstarts.angle_rad = [-0.3, 0.3]\nuntil_return = -1\n")
     few = ["--policies", "1", "--iterations", "2000", "--sac", "environments=8", "hidden=8", "replay=1024", "batch=16"]
@@ -458,7 +460,7 @@ def test_the_command_teaches_and_tells_where_each_policy_is(tmp_path: Path, caps
     assert main(["evaluate", str(out / "best"), "--episodes", "3"]) == 0
     file.write_text('[[lessons]]\nname = "early"\nrecordings_min = [0, 10]\n')
     assert main(["train", "swing-up", "--mapping", "none", "--lessons", str(file), *few, "--out", str(out)]) == 1
-    said = "lesson 1 (early): recordings_min: expected only where shadowing is 'drawn' (--shadowing drawn), got it"
+    said = "lesson 1 (early): recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it"
     assert f"{file}: {said}" in capsys.readouterr().err
     assert main(["train", "swing-up", "--mapping", "none", "--assess", "0", *few, "--out", str(out)]) == 1
     assert "assess: expected at least 1" in capsys.readouterr().err

@@ -138,13 +138,13 @@ def test_what_could_not_be_loaded_again_is_refused_before_the_first_iteration(
     progress = Kept()
     with pytest.raises(InvalidArgument, match=words) as raised:
         train(training(robot, mapping), timeline_of(), tmp_path / "out", progress=progress)
-    assert "\n" not in str(raised.value) and not progress.told and not (tmp_path / "out").exists()
+    assert "\n" not in str(raised.value) and not progress.updates and not (tmp_path / "out").exists()
 
 
 def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
     progress = Kept()
     policies = train(training(Slider(), Push()), timeline_of(), None, progress=progress)
-    assert list(policies) == ["p0"] and progress.told[-1] == (60, 60)
+    assert list(policies) == ["p0"] and progress.updates[-1] == (60, 60)
     for policy in policies.values():
         assert policy.act(np.zeros(1, np.float32), np.random.default_rng(0)) in range(3)
         with pytest.raises(InvalidArgument, match="expected a registered one"):

@@ -34,7 +34,7 @@ from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
 from animat.training.networks import Layer, forward
 from animat.training.policy import Policy, load_policies
-from animat.training.provenance import Simulated, Trained
+from animat.training.provenance import SimulatorProvenance, TrainingProvenance
 from animat.training.specification import Percentiles
 from animat.wrappers import Delivery
 
@@ -124,8 +124,8 @@ def test_an_observation_of_another_shape_is_refused(make: Callable[[], Policy], 
     for act in (policy.act_greedily, lambda seen: policy.act(seen, np.random.default_rng(0)), policy.outputs):
         with pytest.raises(InvalidArgument) as raised:
             act(np.zeros(shape))
-        told = f"observation: expected one of {policy.robot.name}, shape ({n},), got shape {shape}"
-        assert str(raised.value) == told
+        message = f"observation: expected one of {policy.robot.name}, shape ({n},), got shape {shape}"
+        assert str(raised.value) == message
         # A list is as good as an array.
         np.testing.assert_array_equal(act([0.0] * n), act(np.zeros(n)))  # type: ignore[arg-type]
 
@@ -438,15 +438,15 @@ def change_everything(make: Callable[[], Policy], tmp_path: Path, every: int) ->
     arrays, whole = taken_apart(replace(make(), provenance=TRAINED), tmp_path)
     path, refusals = tmp_path / "p0.safetensors", 0
     for place, strange in list(itertools.product(places(whole), ("left out", *STRANGE)))[::every]:
-        told = json.loads(json.dumps(whole))
-        node = told
+        changed = json.loads(json.dumps(whole))
+        node = changed
         for key in place[:-1]:
             node = node[key]
         if strange == "left out":
             del node[place[-1]]
         else:
             node[place[-1]] = strange
-        path.write_bytes(save(arrays, {"animat": json.dumps(told)}))
+        path.write_bytes(save(arrays, {"animat": json.dumps(changed)}))
         try:
             loaded = Policy.load(path)
         except InvalidFile as error:
@@ -504,6 +504,6 @@ def test_networks_of_another_build_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:
-    hints = get_type_hints(Trained) | get_type_hints(Simulated)
+    hints = get_type_hints(TrainingProvenance) | get_type_hints(SimulatorProvenance)
     for name, choices in (("kind", Kind), ("percentiles", Percentiles), ("delivery", Delivery)):
         assert get_args(hints[name]) == get_args(choices)

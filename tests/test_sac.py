@@ -20,7 +20,7 @@ from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
 from animat.training.networks import Layer, Network, draw_action, forward, squashed_normal
 from animat.training.replay import Batch
-from animat.training.sac import Trained, continuous_losses, discrete_losses
+from animat.training.sac import Parameters, continuous_losses, discrete_losses
 from animat.training.settings import SAC
 from two_wheels import Wheels
 
@@ -29,7 +29,7 @@ N, HIDDEN, ACTIONS, SIZE = 3, 5, 4, 12
 LOSSES = ("critics", "actor", "alpha")
 
 
-def all_losses(trained: Trained, targets: Network, batch: Batch, uniforms: jax.Array | None) -> jax.Array:
+def all_losses(trained: Parameters, targets: Network, batch: Batch, uniforms: jax.Array | None) -> jax.Array:
     if uniforms is None:
         return jnp.stack(discrete_losses(trained, targets, batch, SETTINGS))
     return jnp.stack(continuous_losses(trained, targets, batch, uniforms, SETTINGS))
@@ -41,7 +41,7 @@ compiled_squashed_normal = jax.jit(squashed_normal)
 compiled_draw_action = jax.jit(draw_action, static_argnums=0)
 
 
-def reference_losses(trained: Trained, targets: Network, batch: Batch, uniforms: jax.Array | None) -> np.ndarray:
+def reference_losses(trained: Parameters, targets: Network, batch: Batch, uniforms: jax.Array | None) -> np.ndarray:
     trained, targets, batch = reference.in_float64((trained, targets, batch))
     if uniforms is None:
         wanted = SETTINGS.target_entropy_ratio * math.log(ACTIONS)
@@ -60,7 +60,7 @@ def reference_losses(trained: Trained, targets: Network, batch: Batch, uniforms:
     )
 
 
-def problem(seed: int, *, commands: int) -> tuple[Trained, Network, Batch, jax.Array | None]:
+def problem(seed: int, *, commands: int) -> tuple[Parameters, Network, Batch, jax.Array | None]:
     """Of so many continuous commands; 0: of discrete actions."""
     n_actions = None if commands else ACTIONS
     trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions, commands)

@@ -13,7 +13,7 @@ import pytest
 import sac_reference as reference
 from animat.training.networks import Layer, Network
 from animat.training.replay import Batch
-from animat.training.sac import Trained, continuous_losses, discrete_losses
+from animat.training.sac import Parameters, continuous_losses, discrete_losses
 from animat.training.settings import SAC
 
 pytestmark = pytest.mark.oracle
@@ -125,13 +125,13 @@ def updated(algorithm: Any, buffer: Any) -> tuple[Any, np.ndarray]:
     return statistics, kept["targets"]
 
 
-def problem(seed: int, n_actions: int | None, n_commands: int = 1) -> tuple[Trained, Network, Batch]:
+def problem(seed: int, n_actions: int | None, n_commands: int = 1) -> tuple[Parameters, Network, Batch]:
     trained, targets = reference.drawn_networks(seed, N, HIDDEN, n_actions, n_commands)
     batch = reference.drawn_batch(seed, SIZE, N, n_actions, n_commands)
     return trained, targets, batch._replace(ended=jnp.arange(SIZE) % 3 == 0)
 
 
-def shared_arguments(trained: Trained, wrapped: list[Any], wanted: float) -> dict[str, Any]:
+def shared_arguments(trained: Parameters, wrapped: list[Any], wanted: float) -> dict[str, Any]:
 
     return {
         "policy_optim": optimiser(),
@@ -228,7 +228,7 @@ def test_continuous_losses_targets_and_gradients(seed: int, commands: int, monke
         np.testing.assert_allclose(expected, their_targets, rtol=1e-5, atol=1e-5)
 
 
-def targets_of(trained: Trained, targets: Network, batch: Batch, uniforms: jax.Array | None) -> np.ndarray:
+def targets_of(trained: Parameters, targets: Network, batch: Batch, uniforms: jax.Array | None) -> np.ndarray:
     """Our target of each transition, out of the critic loss: critics that answer 0 leave the square of the target,
     and critics that answer 1 leave the square of one less."""
 

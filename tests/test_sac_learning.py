@@ -25,7 +25,7 @@ from animat.training.replay import Batch
 from animat.training.sac import (
     Finished,
     Learner,
-    Trained,
+    Parameters,
     begin,
     continuous_losses,
     discrete_losses,
@@ -148,7 +148,7 @@ def test_one_update_is_one_step_of_adam_and_the_targets_follow(commands: tuple[f
     action = rows[:, 2 * n] if commands is not None else rows[:, 2 * n : 2 * n + 1]
     batch = Batch(rows[:, :n], rows[:, n : 2 * n], action, rows[:, 2 * n + 1], rows[:, 2 * n + 2])
 
-    def loss(trained: Trained) -> jax.Array:
+    def loss(trained: Parameters) -> jax.Array:
         if commands is not None:
             return sum(discrete_losses(trained, before.targets, batch, settings, 1.0), jnp.float32(0))
         # The noise of the update is drawn inside; the critics' output at the start hardly depends on it.
@@ -233,7 +233,7 @@ def test_a_trivial_task_is_learned(commands: tuple[float, ...] | None) -> None:
     action = draw_action(environment, learner.trained.actor, wanted, uniforms)
     command = np.asarray(action if commands is None else jnp.array(commands)[action])
     mistake = np.abs(command - np.asarray(wanted)[:, 0])
-    # Acting at random misses by 0.7 on average; what is left is the entropy that the policy is told to keep.
+    # Acting at random misses by 0.7 on average; what is left is the entropy that the policy has as its target.
     assert mistake.mean() < 0.15
 
 

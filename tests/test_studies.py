@@ -983,7 +983,7 @@ def test_a_missing_file_is_reported_in_one_line(tmp_path: Path, capsys: pytest.C
     assert capsys.readouterr().err.endswith("none.toml: no such file\n")
     with pytest.raises(InvalidArgument, match="workers"):
         run_study(read_study(TINY), tmp_path / "out", workers=0)
-    with pytest.raises(InvalidArgument, match="workers: expected none beside an executor"):
+    with pytest.raises(InvalidArgument, match="workers: expected None with an executor"):
         run_study(read_study(TINY), tmp_path / "out", workers=2, executor=Halts())
     assert not (tmp_path / "out").exists()
 

@@ -167,5 +167,5 @@ def test_tuning_searches_readouts_and_teaches_no_lessons() -> None:
     assert tuning.space == {"readouts": ("halves", groups)}
     assert with_settings(plain, {"readouts": groups}).simulators.readouts == groups
     for study in (replace(plain, robots=STUDY.robots), replace(plain, arms=(Arm("drawn", shadowing="drawn"),))):
-        with pytest.raises(InvalidArgument, match=r"robots.lessons: expected none, nor shadowing = 'drawn'"):
+        with pytest.raises(InvalidArgument, match=r"robots.lessons: expected neither lessons nor shadowing = 'drawn'"):
             tuning_of(study, Tune())

@@ -57,13 +57,13 @@ def bits(folder: Path) -> dict[str, bytes]:
 
 
 class Kept:
-    """A progress that keeps what it is told."""
+    """A progress that keeps its updates."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[float, float]] = []
+        self.updates: list[tuple[float, float]] = []
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self.told.append((done, total))
+        self.updates.append((done, total))
 
 
 def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_stays_open(tmp_path: Path) -> None:
@@ -76,22 +76,22 @@ def test_the_same_seed_gives_the_same_bits_in_workers_and_on_an_executor_which_s
     train(four, timeline_of(), tmp_path / "two", workers=2, progress=progress)
     assert list(bits(tmp_path / "two")) == [f"p{i}.safetensors" for i in range(4)]
     assert bits(tmp_path / "two") == bits(tmp_path / "lent")
-    assert progress.told[-1] == (4 * CHUNKS, 4 * CHUNKS)
+    assert progress.updates[-1] == (4 * CHUNKS, 4 * CHUNKS)
     assert not any((tmp_path / name / ".unfinished").exists() for name in ("two", "lent"))
     alone = train(four, timeline_of(), None)
     for name, policy in lent.items():
         np.testing.assert_array_equal(policy.weights[0], alone[name].weights[0])
 
 
-def test_what_is_told_beside_changes_no_policy_and_no_folder(tmp_path: Path) -> None:
+def test_informative_entries_change_no_policy_and_no_folder(tmp_path: Path) -> None:
     short = replace(SHORT, policies=1, iterations=500)
-    told = trained(short, timeline_of(), tmp_path / "told", sources=["a.nwb"], random_return=-12.5)
-    untold = trained(short, timeline_of(), tmp_path / "untold")
-    assert bits(tmp_path / "told") == bits(tmp_path / "untold")
-    assert json.loads((tmp_path / "told" / "training.json").read_text())["random_return"] == -12.5
+    named = trained(short, timeline_of(), tmp_path / "named", sources=["a.nwb"], random_return=-12.5)
+    plain = trained(short, timeline_of(), tmp_path / "plain")
+    assert bits(tmp_path / "named") == bits(tmp_path / "plain")
+    assert json.loads((tmp_path / "named" / "training.json").read_text())["random_return"] == -12.5
     # Asked for again without it, it is the same training.
-    assert trained(short, timeline_of(), tmp_path / "told")["p0"].provenance == told["p0"].provenance
-    assert untold["p0"].provenance == told["p0"].provenance
+    assert trained(short, timeline_of(), tmp_path / "named")["p0"].provenance == named["p0"].provenance
+    assert plain["p0"].provenance == named["p0"].provenance
 
 
 @pytest.mark.oracle
@@ -200,7 +200,7 @@ def test_a_finished_folder_is_read_and_not_trained_again(tmp_path: Path) -> None
     policies = train(replace(SHORT, iterations=1_000), timeline_of(), tmp_path, progress=progress)
     assert list(policies) == ["p0", "p1"]
     assert {file: file.stat().st_mtime_ns for file in tmp_path.iterdir()} == before
-    assert not progress.told
+    assert not progress.updates
 
 
 def test_a_folder_of_another_training_is_refused_and_left_alone(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_a_folder_of_another_training_is_refused_and_left_alone(tmp_path: Path) 
 
 
 @pytest.mark.oracle
-def test_what_a_training_without_neurons_differs_in_is_told_by_name(tmp_path: Path) -> None:
+def test_a_difference_without_neurons_is_reported_by_name(tmp_path: Path) -> None:
     baseline = replace(SHORT, iterations=1_000, policies=1, mapping=None, commands=(-1.0, 1.0))
     trained(baseline, None, tmp_path)
     assert list(train(baseline, None, tmp_path)) == ["p0"]
@@ -251,7 +251,7 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
 
     with pytest.raises(Stop):
         train_group(group, checkpoint, stop, checkpoint_s=0.0)
-    with pytest.raises(InvalidFile, match="of another"):
+    with pytest.raises(InvalidFile, match="got another training's"):
         train_group(replace(group, fingerprint="other"), checkpoint, stop, checkpoint_s=0.0)
     whole = checkpoint.read_bytes()
     with np.load(checkpoint) as kept:
@@ -260,7 +260,7 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
     fewer = {name: array for name, array in arrays.items() if name != last}
     for others in (fewer, arrays | {last: arrays[last][..., None]}, arrays | {"leaf0": arrays["leaf0"].astype(float)}):
         np.savez(checkpoint, **others)
-        with pytest.raises(InvalidFile, match=r"as this animat writes it, of .*: rm '"):
+        with pytest.raises(InvalidFile, match=r"as this version of animat writes it, of .*: rm '"):
             train_group(group, checkpoint, stop, checkpoint_s=0.0)
     # Flags and compression of the first entry in the table at the end: zipfile has errors of other kinds for these.
     table = whole.index(b"PK\x01\x02")
@@ -393,7 +393,10 @@ def test_neurons_and_mapping_come_together(tmp_path: Path) -> None:
         train(replace(SHORT, mapping=None), timeline_of(), tmp_path)
     with pytest.raises(InvalidArgument, match="workers"):
         train(SHORT, timeline_of(), tmp_path, workers=0)
-    with ThreadPoolExecutor(1) as executor, pytest.raises(InvalidArgument, match="workers: expected none beside"):
+    with (
+        ThreadPoolExecutor(1) as executor,
+        pytest.raises(InvalidArgument, match="workers: expected None with an executor"),
+    ):
         train(SHORT, timeline_of(), tmp_path, workers=1, executor=executor)
 
 
@@ -406,14 +409,14 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
     assert policy.robot == Cartpole()
     assert policy.provenance["training"]["seed"] == 1
     assert (policy.percentiles, policy.delivery) == ("moving", "chosen")
-    told = policy.provenance["simulators"]
-    assert (told["kind"], told["bins"], told["range_hz"], told["window_ms"]) == ("histogram", 20, None, [2.0, 10.0])
-    assert told["recorded_at_min"] == [0.0, 10.0, 20.0] and len(told["burst_thresholds"]) == 3
+    made = policy.provenance["simulators"]
+    assert (made["kind"], made["bins"], made["range_hz"], made["window_ms"]) == ("histogram", 20, None, [2.0, 10.0])
+    assert made["recorded_at_min"] == [0.0, 10.0, 20.0] and len(made["burst_thresholds"]) == 3
     assert policy.provenance["versions"]["jax"] == jax.__version__
 
 
 @pytest.mark.parametrize(
-    ("named", "told"),
+    ("named", "message"),
     [
         ({"duration_min": "x"}, "duration_min: expected a number, got 'x'"),
         ({"duration_min": float("inf")}, "duration_min: expected a finite number, got inf"),
@@ -427,30 +430,33 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
         ({"algorithm": 3}, "algorithm: expected SAC, got 3"),
     ],
 )
-def test_what_no_training_can_have_is_told(named: dict[str, Any], told: str) -> None:
-    with pytest.raises(InvalidArgument, match=re.escape(told)):
+def test_invalid_settings_are_refused(named: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidArgument, match=re.escape(message)):
         Training(**{"robot": Cartpole(), "mapping": None, **named})
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [
         (
             {"training": "cartpole"},
             "training: expected a Training, such as animat.Training('cartpole', '9-thresholds')",
         ),
-        ({"timeline": "recordings/"}, "timeline: expected simulators, as animat.fit_timeline makes, or None, got 'rec"),
+        ({"timeline": "recordings/"}, "timeline: expected simulators from animat.fit_timeline, or None, got 'rec"),
         ({"folder": 3}, "folder: expected a path, or None, got 3"),
         (
             {"callbacks": print},
-            "callbacks: expected a list of functions, each of a row of a learning curve, got <built",
+            "callbacks: expected a list of functions that take a row of a learning curve, got <built",
         ),
-        ({"callbacks": [None]}, "callbacks: expected a list of functions, each of a row of a learning curve, got None"),
+        (
+            {"callbacks": [None]},
+            "callbacks: expected a list of functions that take a row of a learning curve, got None",
+        ),
     ],
 )
-def test_what_stands_in_the_place_of_something_else_is_told(changed: dict[str, Any], told: str) -> None:
+def test_values_of_the_wrong_kind_are_refused(changed: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {"training": replace(SHORT, mapping=None), "timeline": None, "folder": None} | changed
-    with pytest.raises(InvalidArgument, match=re.escape(told)):
+    with pytest.raises(InvalidArgument, match=re.escape(message)):
         train(**arguments)
 
 
@@ -459,6 +465,6 @@ def test_commands_are_taken_from_whatever_yields_them() -> None:
         assert Training(Cartpole(), None, commands=given).commands == (-1.0, 0.0, 1.0)  # type: ignore[arg-type]
 
 
-def test_a_shadowing_that_there_is_not_is_told() -> None:
+def test_an_unknown_shadowing_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="shadowing: expected one of True, False, drawn, got 'bogus'"):
         Training(Cartpole(), None, shadowing="bogus")  # type: ignore[arg-type]

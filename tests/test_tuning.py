@@ -31,13 +31,13 @@ from animat.training.policy import CURVE
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
-from animat.tuning.journal import JOURNAL, Told, read_journal
-from animat.tuning.results import BEST, HISTORY, RESULTS, Tuned
+from animat.tuning.journal import JOURNAL, TrialResult, read_journal
+from animat.tuning.results import BEST, HISTORY, RESULTS, TuningResult
 from animat.tuning.run import tune
 from animat.tuning.side_by_side import Trials
 from animat.tuning.space import Range, first_settings, with_settings
 from animat.tuning.specification import Tuning, read_tuning, tuning_of
-from animat.tuning.tasks import Trial, same_shapes
+from animat.tuning.tasks import Trial, group_by_shape
 from synthetic_recordings import synthetic_recording
 
 pytest.importorskip("optuna", reason="animat tune needs the extra [tune]")
@@ -63,7 +63,7 @@ class Ends(ThreadPoolExecutor):
         return fn(*args, **kwargs)
 
 
-def run(folder: Path, executor: Executor | None = None, tuning: Tuning | None = None) -> Tuned:
+def run(folder: Path, executor: Executor | None = None, tuning: Tuning | None = None) -> TuningResult:
     """In this process, where programs are compiled once."""
     with ThreadPoolExecutor(1) as own:
         return tune(tuning or read_tuning(TINY), folder, base=TINY.parent, executor=executor or own)
@@ -128,17 +128,17 @@ def test_a_trial_that_was_stopped_between_two_chunks_goes_on_from_there(
 
 
 def test_the_better_ones_of_each_generation_go_on_and_the_study_s_own_settings_always(finished: Path) -> None:
-    told, settings = read_journal(finished), read_tuning(TINY).tune
-    assert [each.trial for each in told] == list(range(7))
+    trials, settings = read_journal(finished), read_tuning(TINY).tune
+    assert [each.trial for each in trials] == list(range(7))
     for first in (0, 4):
-        generation = told[first : first + 4]
+        generation = trials[first : first + 4]
         ranked = sorted(generation, key=lambda each: -each.means[0])
         # One in three of four or of three, more than that never but for the study's own.
         n = -(-len(generation) // settings.keep)
         on = {each.trial for each in ranked[:n]} | ({0} if first == 0 else set())
         assert {each.trial for each in generation if each.state == "complete"} == on
-    assert all(each.chunks == ((20, 60) if each.state == "complete" else (20,)) for each in told)
-    assert told[0].settings == {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
+    assert all(each.chunks == ((20, 60) if each.state == "complete" else (20,)) for each in trials)
+    assert trials[0].settings == {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
 
 
 def test_the_best_is_a_study_of_the_settings_that_won(finished: Path) -> None:
@@ -152,7 +152,7 @@ def test_the_best_is_a_study_of_the_settings_that_won(finished: Path) -> None:
     assert (finished / BEST).read_text().startswith("# animat study best.toml\n")
 
 
-def test_a_finished_folder_is_told_again_and_nothing_is_trained(finished: Path) -> None:
+def test_a_finished_folder_is_reported_again_and_nothing_is_trained(finished: Path) -> None:
     before = {file: file.stat().st_mtime_ns for file in (finished / "finals").iterdir()}
     with Ends(0) as executor:
         assert run(finished, executor).best.mean > -100
@@ -176,17 +176,17 @@ def test_a_folder_of_another_search_is_refused_and_so_is_a_journal_of_one(finish
 
 
 @pytest.mark.oracle
-def test_a_trial_that_diverges_is_told_as_such_and_leaves_those_beside_it_finite(tmp_path: Path) -> None:
+def test_a_diverging_trial_is_reported_and_leaves_the_others_finite(tmp_path: Path) -> None:
     """Side by side in one program; its learning rate is beyond what float32 can add up."""
     plain = read_tuning(TINY)
     search = {"learning_rate": [1e-3, 1e38], "discount": {"low": 0.9, "high": 0.999}}
     made = tuning_of(plain.study, replace(plain.tune, trials=4, finalists=1, seed=2, search=search))
     run(tmp_path / "out", tuning=made)
-    told = read_journal(tmp_path / "out")
-    for each in told:
+    trials = read_journal(tmp_path / "out")
+    for each in trials:
         assert (each.state == "diverged") == (each.settings["learning_rate"] == 1e38)
-    assert {each.state for each in told} >= {"complete", "diverged"}
-    assert told[0].state == "complete"
+    assert {each.state for each in trials} >= {"complete", "diverged"}
+    assert trials[0].state == "complete"
 
 
 @pytest.mark.oracle
@@ -230,7 +230,7 @@ def test_trials_of_one_program_are_together_five_policies_at_most(policies: int)
             )
             for i in range(n)
         ]
-        groups = same_shapes(among, policies)
+        groups = group_by_shape(among, policies)
         assert sorted(trial.number for group in groups for trial in group) == list(range(n))
         for group in groups:
             assert len(group) * policies <= max(5, policies)
@@ -244,9 +244,9 @@ def test_after_a_study_s_own_settings_the_defaults_are_tried_and_both_go_to_the_
     file.write_text(own.replace("trials = 7", "trials = 4").replace("3000", "240").replace("rungs = 2", "rungs = 3"))
     tuned = tune(read_tuning(file), tmp_path / "out", base=TINY.parent)
     kind = {"simulator": "histogram"}
-    assert tuned.told[0].settings == {"learning_rate": 1e-4, "discount": 0.95, **kind}
-    assert tuned.told[1].settings == {"learning_rate": SAC().learning_rate, "discount": SAC().discount, **kind}
-    assert [len(each.chunks) for each in tuned.told[:2]] == [3, 3]
+    assert tuned.trials[0].settings == {"learning_rate": 1e-4, "discount": 0.95, **kind}
+    assert tuned.trials[1].settings == {"learning_rate": SAC().learning_rate, "discount": SAC().discount, **kind}
+    assert [len(each.chunks) for each in tuned.trials[:2]] == [3, 3]
     assert [each.trial for each in tuned.finals[:2]] == [0, 1]
     file.write_text(own.replace("high = 0.999", "high = 0.98"))
     tuning = read_tuning(file)
@@ -273,9 +273,9 @@ def test_importance_finds_the_setting_that_decides() -> None:
 
     rng = np.random.default_rng(1)
     space = {"tau": Range(0.0, 1.0), "discount": Range(0.01, 0.99, True), "mapping": ("linear", "1-threshold")}
-    told = []
+    results = []
     # However well it began.
-    told.append(Told(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
+    results.append(TrialResult(60, {"tau": 0.9, "discount": 0.5, "mapping": "linear"}, "diverged", (7,), ((1e6,),)))
     for i in range(60):
         settings: Any = {
             "tau": rng.random(),
@@ -283,11 +283,11 @@ def test_importance_finds_the_setting_that_decides() -> None:
             "mapping": ("linear", "1-threshold")[i % 2],
         }
         returns = -((settings["tau"] - 0.3) ** 2) + 1e-3 * rng.random()
-        told.append(Told(i, settings, "complete", (60,), ((float(returns),),)))
-    shares = importance_of(space, told)
+        results.append(TrialResult(i, settings, "complete", (60,), ((float(returns),),)))
+    shares = importance_of(space, results)
     assert next(iter(shares)) == "tau" and shares["tau"] > 0.8
     assert sum(shares.values()) == pytest.approx(1)
-    assert importance_of(space, told[:3]) == {}
+    assert importance_of(space, results[:3]) == {}
 
 
 @pytest.mark.oracle
@@ -318,8 +318,8 @@ def test_the_command_prints_what_was_found(
 ) -> None:
     assert main(["tune", str(TINY), "--out", str(finished), "--json"]) == 0
     *lines, last = capsys.readouterr().out.splitlines()
-    told = json.loads(last)
-    assert told["trials"] == {"complete": 4, "stopped": 3, "diverged": 0}
+    data = json.loads(last)
+    assert data["trials"] == {"complete": 4, "stopped": 3, "diverged": 0}
     assert any("own settings" in line for line in lines)
     assert any(line.startswith("importance: ") for line in lines)
     assert any(str(finished / BEST) in line for line in lines)

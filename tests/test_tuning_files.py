@@ -110,7 +110,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "words"), BAD.values(), ids=list(BAD))
-def test_what_is_wrong_is_told_in_one_line_before_there_is_a_folder(
+def test_errors_take_one_line_and_come_before_there_is_a_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: list[str]
 ) -> None:
     assert main(["tune", str(written(tmp_path, text)), "--out", str(tmp_path / "out")]) == 1
@@ -131,6 +131,6 @@ def test_without_optuna_the_extra_is_named(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_setting_of_a_study_is_told_as_before(tmp_path: Path) -> None:
+def test_an_invalid_setting_of_a_study_is_reported_as_without_tune(tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match="polcies: no such setting at the top"):
         read_tuning(written(tmp_path, f"polcies = 3\n{PLAIN}"))

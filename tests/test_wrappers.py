@@ -210,7 +210,7 @@ def test_no_live_run_shows_what_neurons_remember(tmp_path: Path) -> None:
 
 
 def test_a_neural_observation_is_of_neurons() -> None:
-    with pytest.raises(InvalidArgument, match="neural_observation: expected none without a mapping"):
+    with pytest.raises(InvalidArgument, match="neural_observation: expected only with a mapping"):
         Training("cartpole", None, neural_observation=True)
     with pytest.raises(InvalidArgument, match="neural_observation: expected True or False, got 'yes'"):
         replace(SEEING, neural_observation="yes")  # type: ignore[arg-type]
@@ -223,6 +223,6 @@ def test_a_file_that_is_wrong_about_what_its_policy_sees_is_refused(seeing: Poli
     # Told again by its provenance, further on.
     assert whole.count(field) == 2
     for other in (b"0   ", b"null", b"[5] "):
-        (tmp_path / "other.safetensors").write_bytes(whole.replace(field, field.replace(b"true", other), 1))
-        with pytest.raises(InvalidFile, match=r"a whole policy, got one that does not fit together: (weights|neural)"):
+        (tmp_path / "other.safetensors").write_bytes(whole.replace(told, told.replace(b"true", other), 1))
+        with pytest.raises(InvalidFile, match=r"a complete, consistent policy, got a faulty one: (weights|neural)"):
             Policy.load(tmp_path / "other.safetensors")

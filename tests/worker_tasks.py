@@ -53,7 +53,7 @@ class Join(Sized):
     """Leaves a file of its name in brackets, around what the files of others hold.
 
     Attributes:
-        log: file that is told when it began, and when it ended.
+        log: file that logs when it began, and when it ended.
     """
 
     name: str

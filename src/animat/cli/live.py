@@ -140,7 +140,7 @@ class Live(StimulationOptions):
         return ran.to_dict()
 
     def _report(self, ran: LiveRun) -> None:
-        from animat.execution.training import in_words
+        from animat.execution.training import as_range
 
         print(
             f"{len(ran.recordings)} recordings in {ran.culture_min:.0f} min of the culture's clock "
@@ -149,7 +149,7 @@ class Live(StimulationOptions):
         )
         for swap in ran.swaps:
             print(
-                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {in_words(swap['members'])} after "
+                f"  {swap['at']}  culture at {swap['culture_min']:.1f} min, policies {as_range(swap['members'])} after "
                 f"{swap['iterations']:,} iterations: the recording at {swap['recorded_at_min']:.1f} min"
             )
         print(ran.gap.to_text())

@@ -29,7 +29,7 @@ class TuneFile(JobOptions):
 
         tuning = read_tuning(self.specification)
         expect_optuna()
-        from animat.tuning.results import BEST, HISTORY, IMPORTANCE, settings_in_words
+        from animat.tuning.results import BEST, HISTORY, IMPORTANCE, describe_settings
         from animat.tuning.run import tune
         from animat.tuning.space import first_settings
 
@@ -43,7 +43,7 @@ class TuneFile(JobOptions):
             error = "" if final.standard_error is None else f"{final.standard_error:.2g}"
             name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"
             mean = "diverged" if final.returns is None else f"{final.mean:.4g}"
-            cells.append([name, mean, error, settings_in_words(final.settings)])
+            cells.append([name, mean, error, describe_settings(final.settings)])
         policies, episodes = tuning.study.policies, tuning.study.episodes
         counted = "1 policy" if policies == 1 else f"{policies} policies"
         print(f"retrained, {counted} of each, in {episodes} fresh episodes per policy:")
@@ -55,6 +55,6 @@ class TuneFile(JobOptions):
             print("importance: too few trials with different returns to tell")
         pictures = [HISTORY, *([IMPORTANCE] if tuned.importance else [])]
         counted = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
-        print(f"{len(tuned.told)} trials ({counted}) in {time.monotonic() - began:.0f} s")
+        print(f"{len(tuned.trials)} trials ({counted}) in {time.monotonic() - began:.0f} s")
         print(f"best settings: {self.out / BEST}; figures: {', '.join(str(self.out / name) for name in pictures)}")
         return {"folder": str(tuned.folder), "best_toml": str(self.out / BEST), **tuned.to_dict()}

@@ -1,1 +1,1 @@
-"""Everything long is made of tasks: their receipts, what runs them, and training as the plainest case."""
+"""Tasks, of which all long work consists: their receipts, their executors, and training as the simplest case."""

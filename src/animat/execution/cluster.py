@@ -1,4 +1,4 @@
-"""An executor of the workers of a Dask cluster (https://distributed.dask.org), each with a core of its own."""
+"""An executor on the workers of a Dask cluster (https://distributed.dask.org), with one pinned process per core."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, final
 
 from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, first_line
-from animat.execution.apart import bring_back, carry_out_apart
-from animat.execution.dask_worker import MADE_OF, made_of, work
+from animat.execution.dask_worker import VERSIONS_PREFIX, versions_tag, work
 from animat.execution.dispatch import LONGEST_S, Call, Dispatch
-from animat.execution.pinned import PinnedProcesses
-from animat.execution.task import Done, Task, carry_out_alone
+from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.task import Task, TaskResult, carry_out_alone
+from animat.execution.unshared import bring_back, carry_out_unshared
 from animat.extras import expect_extra
 
 P = ParamSpec("P")
@@ -31,34 +31,34 @@ _CONNECT_S = 60
 
 
 def expect_distributed() -> Any:
-    """Dask's package for clusters, which is imported nowhere else; raises AnimatError if it is not installed."""
+    """Import Dask's package for clusters; raises AnimatError if it is not installed."""
     return expect_extra("distributed", package="Dask", extra="cluster", what="a cluster")
 
 
 @final
 class Cluster(Executor):
-    """The workers of a Dask cluster that are made of the same versions as this process.
+    """The workers of a Dask cluster that have the same software versions as this process.
 
-    Work that fails, or whose process or worker ends, is tried again, three times in all
+    Work that fails, or whose process or worker ends, is tried three times in all
     (`animat.execution.dispatch.Dispatch`).
 
     Args:
-        where: the scheduler's address, or the file in which it wrote it (`dask scheduler --scheduler-file`).
-        longest_s: of a batch of small calls; 0 for none.
-        has_shared_folder: whether workers see the folder of a task at the same place; if not, what tasks read and leave
-            goes through this process.
+        where: the scheduler's address, or the file to which it wrote its address (`dask scheduler --scheduler-file`).
+        longest_s: longest duration of a batch of small calls; 0: no batches.
+        has_shared_folder: whether workers see the folder of a task at the same place; if not, the files that tasks read
+            and write go through this process.
 
     Raises:
         AnimatError: if Dask is not installed, or no scheduler answers.
         InvalidArgument, InvalidFile: if `where` is neither.
-        Mismatch: if no worker is made of the same versions.
+        Mismatch: if no worker has the same versions.
     """
 
     def __init__(
         self, where: str | os.PathLike[str], *, longest_s: float = LONGEST_S, has_shared_folder: bool = True
     ) -> None:
         distributed = expect_distributed()
-        # What is lost is told by what becomes of the work.
+        # `Dispatch` reports losses itself.
         for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         address = _address(where)
@@ -71,27 +71,27 @@ class Cluster(Executor):
             ) from error
         self._refused: set[str] = set()
         self._futures: set[Future[Any]] = set()
-        self._has_shared_folder, self._here = has_shared_folder, PinnedProcesses(sorted(os.sched_getaffinity(0))[-1:])
+        self._has_shared_folder, self._local = has_shared_folder, PinnedProcesses(own_cores()[-1:])
         try:
             self._expect_workers(self._client.scheduler_info()["workers"])
         except BaseException:
             self._client.close()
             raise
-        self._dispatch = Dispatch(self._client, self._ours, longest_s)
+        self._dispatch = Dispatch(self._client, self._usable, longest_s)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """As any executor's; what is called, and with what, is pickled at once. AnimatError if the scheduler ended."""
+        """Submit a call, which is pickled immediately; raises AnimatError if the scheduler has ended."""
         pickled = pickle.dumps((fn, args, kwargs))
-        return self._hand_in(Call(fn.__name__, lambda _: pickled))
+        return self._submit(Call(fn.__name__, lambda _: pickled))
 
     def submit_task(
         self, task: Task, folder: Path, notice: Path, *, name: str, cost_s: float, reads: Mapping[str, str]
-    ) -> Future[Done]:
-        """Have a task carried out (`carry_out_alone`).
+    ) -> Future[TaskResult]:
+        """Submit a task (`carry_out_alone`).
 
         Args:
-            task, folder, notice: as there.
-            name, cost_s: as of a `Job`.
+            task, folder, notice: arguments of `carry_out_alone`.
+            name, cost_s: as in `Job`.
             reads: the digest of each file in the folder that it reads, by its place.
 
         Raises:
@@ -99,71 +99,69 @@ class Cluster(Executor):
         """
         if self._has_shared_folder:
             pickled = pickle.dumps((carry_out_alone, (task, folder, notice), {}))
-            return self._hand_in(Call(name, lambda _: pickled, cost_s))
+            return self._submit(Call(name, lambda _: pickled, cost_s))
         if task.reads_elsewhere:
-            return self._here.submit(carry_out_alone, task, folder, notice)
-        return self._hand_in(
+            return self._local.submit(carry_out_alone, task, folder, notice)
+        return self._submit(
             Call(
                 name,
-                lambda theirs: pickle.dumps((carry_out_apart, (task, dict(reads), theirs), {})),
+                lambda worker_folder: pickle.dumps((carry_out_unshared, (task, dict(reads), worker_folder), {})),
                 cost_s,
                 reads={digest: folder / place for place, digest in reads.items()},
-                finish=lambda came: bring_back(came, folder),
+                finish=lambda unshared: bring_back(unshared, folder),
             )
         )
 
     def cores(self) -> int:
-        """How many cores its workers have now; one if there is no worker yet."""
+        """The number of cores that its workers have now; 1 if there is no worker yet."""
         return max(1, sum(map(int, self._client.nthreads().values())))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """As any executor's; what still runs is ended, if it is not waited for."""
+        """Shut the executor down; running calls are ended unless `wait`."""
         if wait and not cancel_futures:
             wait_for(list(self._futures))
-            self._here.shutdown()
+            self._local.shutdown()
         else:
-            self._here.kill_workers()
+            self._local.kill_workers()
         self._dispatch.close()
         self._client.close()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.shutdown(wait=kind is None)
 
-    def _hand_in(self, call: Call) -> Future[Any]:
+    def _submit(self, call: Call) -> Future[Any]:
         if self._client.status != "running":
-            raise AnimatError("the cluster's scheduler has ended; start it, and then this again to go on")
+            raise AnimatError("the cluster's scheduler has ended; start it, then run this again to continue")
         self._futures.add(call.future)
         call.future.add_done_callback(self._futures.discard)
         self._dispatch.submit(call)
         return call.future
 
     def _expect_workers(self, workers: dict[str, Any]) -> None:
-        ours = self._ours(workers)
-        if workers and not ours:
-            raise Mismatch(f"cluster: {_why_refused(next(iter(workers.items())))}, and there is no other")
+        if workers and not self._usable(workers):
+            raise Mismatch(f"cluster: {_why_refused(*next(iter(workers.items())))}, and there is no other")
         if not workers:
             print("cluster: waiting for workers", file=sys.stderr)
 
-    def _ours(self, workers: dict[str, Any]) -> dict[str, Any]:
-        """Those that are made of the same; of the others it is said in a line each that they get nothing to do."""
-        ours = {address: worker for address, worker in workers.items() if made_of() in worker["resources"]}
-        refused = workers.keys() - ours.keys()
-        for address in refused - self._refused if ours else ():
-            print(f"warning: {_why_refused((address, workers[address]))}", file=sys.stderr)
+    def _usable(self, workers: dict[str, Any]) -> dict[str, Any]:
+        """The workers with the same versions; a warning names each of the others, once, if there are any of these."""
+        usable = {address: worker for address, worker in workers.items() if versions_tag() in worker["resources"]}
+        refused = workers.keys() - usable.keys()
+        for address in refused - self._refused if usable else ():
+            print(f"warning: {_why_refused(address, workers[address])}", file=sys.stderr)
             self._refused.add(address)
-        return ours
+        return usable
 
 
-def _why_refused(worker: tuple[str, dict[str, Any]]) -> str:
-    address, told = worker
-    theirs = [name for name in told["resources"] if name.startswith(MADE_OF)]
-    got = _in_words(theirs[0]) if theirs else "one that was started without --preload " + work.__module__
-    return f"worker {address}: expected {_in_words(made_of())}, got {got}; it gets no work"
+def _why_refused(address: str, worker: dict[str, Any]) -> str:
+    tags = [name for name in worker["resources"] if name.startswith(VERSIONS_PREFIX)]
+    got = _format_tag(tags[0]) if tags else "one that was started without --preload " + work.__module__
+    return f"worker {address}: expected {_format_tag(versions_tag())}, got {got}; it gets no work"
 
 
 @contextmanager
 def on_cluster(where: str | None, shared_folder: bool) -> Iterator[Cluster | None]:
-    """A cluster for as long as the block takes; None without one, and InvalidArgument for no shared folder then."""
+    """A cluster for the duration of the block, or None; raises InvalidArgument for no shared folder without one."""
     if where is None:
         if not shared_folder:
             raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
@@ -174,7 +172,7 @@ def on_cluster(where: str | None, shared_folder: bool) -> Iterator[Cluster | Non
 
 
 def _expect_listener(address: str) -> None:
-    """Wait until something listens there: Dask's own wait cannot be interrupted. OSError or ValueError if none does."""
+    """Wait for a listener, as Dask's own wait cannot be interrupted; raises OSError or ValueError if there is none."""
     kind, has_kind, place = address.rpartition("://")
     host, _, port = place.rpartition(":")
     if has_kind and kind != "tcp":
@@ -196,14 +194,14 @@ def _address(where: str | os.PathLike[str]) -> str:
         try:
             return str(json.loads(path.read_text())["address"])
         except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
-            raise InvalidFile(f"cluster: {path}: expected a scheduler's file, got one that holds no address") from error
+            raise InvalidFile(f"cluster: {path}: expected a scheduler's file, got one without an address") from error
     if ":" not in str(where):
         raise InvalidArgument(
             f"cluster: expected a scheduler's address, such as tcp://host:8786, or its file, got {str(where)!r}, "
-            "which is no file"
+            "which is not a file"
         )
     return str(where)
 
 
-def _in_words(made: str) -> str:
-    return made.replace("/", ", ").replace(":", " ")
+def _format_tag(tag: str) -> str:
+    return tag.replace("/", ", ").replace(":", " ")

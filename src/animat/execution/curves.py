@@ -1,4 +1,4 @@
-"""Learning curves on their way: processes that train write the rows to files, which the one that waits reads."""
+"""Learning curves during training: training processes write the rows to files, which the waiting process reads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FOLDER = "curves"
 
 
 class CurveFile:
-    """The file of a group of policies, by the number of its first, which begins anew with the process that trains."""
+    """The file of a group of policies, named by its first policy; each training process starts it again."""
 
     def __init__(self, folder: Path, first: int) -> None:
         self._path = _file(folder, first)
@@ -26,15 +26,19 @@ class CurveFile:
         self._path.write_text("")
 
     def add(self, part: Float64[ndarray, "policies columns"]) -> None:
-        """Add a part of the training, a row a policy."""
+        """Add one chunk of the training, one row per policy."""
         with self._path.open("a") as file:
             file.write(json.dumps(part.tolist()) + "\n")
 
 
 class Curves:
-    """The rows that were told already, and those that are new; as a progress, it looks for them at each report.
+    """Passes each row to the callbacks once; used as a progress, it looks for new rows at each update.
 
-    A training may have no folder. The groups are numbers of policies; each callback is called with each row.
+    Args:
+        folder: the training's folder; None for a training in memory.
+        groups: numbers of the policies of each group.
+        callbacks: functions that are called with each row.
+        progress: the progress to which updates are passed on.
     """
 
     def __init__(
@@ -45,48 +49,48 @@ class Curves:
         progress: Progress,
     ) -> None:
         self._folder, self._groups, self._callbacks, self._progress = folder, groups, callbacks, progress
-        self._told = dict.fromkeys((member for members in groups for member in members), 0)
-        self._read: dict[int, int] = {}
-        """Of each group's file, how many bytes it had when it was read last."""
+        self._n_reported = dict.fromkeys((member for members in groups for member in members), 0)
+        self._n_bytes: dict[int, int] = {}
+        """Size of each group's file when it was last read."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Tell the rows that are new, and pass the report on."""
-        self.look()
+        """Report new rows, and pass the update on."""
+        self.poll()
         self._progress.update(done, total, note)
 
-    def look(self) -> None:
-        """Tell the rows that are new in the files."""
+    def poll(self) -> None:
+        """Report the rows that are new in the files."""
         if self._folder is None or not self._callbacks:
             return
         for members in self._groups:
             text = _text_of(_file(self._folder, members[0]))
-            # The same file again, or a new one as long as the old: its rows were told.
-            if len(text) == self._read.get(members[0]):
+            # The same file, or a new one of the same size: its rows have been reported.
+            if len(text) == self._n_bytes.get(members[0]):
                 continue
-            self._read[members[0]] = len(text)
-            # The last line may not be whole yet.
+            self._n_bytes[members[0]] = len(text)
+            # The last line may be incomplete.
             parts = [json.loads(line) for line in text.split("\n")[:-1]]
             for column, member in enumerate(members):
-                for part in parts[self._told[member] :]:
-                    self._tell(member, part[column])
+                for part in parts[self._n_reported[member] :]:
+                    self._report(member, part[column])
 
     def add(self, members: Sequence[int], part: Float64[ndarray, "policies columns"]) -> None:
-        """Tell a part of a group that is trained in this process."""
+        """Report one chunk of a group that is trained in this process."""
         for member, row in zip(members, part.tolist(), strict=True):
-            self._tell(member, row)
+            self._report(member, row)
 
-    def _tell(self, member: int, row: Sequence[float]) -> None:
-        self._told[member] += 1
-        iterations, episodes, *numbers = row
-        told = CurveRow(f"p{member}", int(iterations), int(episodes), *numbers)
+    def _report(self, member: int, numbers: Sequence[float]) -> None:
+        self._n_reported[member] += 1
+        iterations, episodes, *others = numbers
+        row = CurveRow(f"p{member}", int(iterations), int(episodes), *others)
         for callback in self._callbacks:
-            callback(told)
+            callback(row)
 
     def finish(self, policies: dict[str, Policy]) -> None:
-        """Tell the rows that are left: also of policies that were trained before."""
-        for member in self._told if self._callbacks else ():
-            for row in policies[f"p{member}"].learning_curve[self._told[member] :].tolist():
-                self._tell(member, row)
+        """Report the remaining rows, including those of policies that were trained earlier."""
+        for member in self._n_reported if self._callbacks else ():
+            for row in policies[f"p{member}"].learning_curve[self._n_reported[member] :].tolist():
+                self._report(member, row)
 
 
 def _file(folder: Path, first: int) -> Path:

@@ -1,7 +1,8 @@
-"""What a Dask worker does with its work: `dask worker ADDRESS --preload animat.execution.dask_worker`.
+"""The extension of a Dask worker: `dask worker ADDRESS --preload animat.execution.dask_worker`.
 
-Each of its threads has a core of its own, and a pinned process on it (`PinnedProcesses`) that does the work: compiled
-programs leave with it, its death is told apart, and the worker goes on answering the scheduler meanwhile.
+Each of its threads has its own core, with a pinned process (`PinnedProcesses`) that does the work. The process takes
+its compiled programs with it when it ends, its death is recognised as such, and meanwhile the worker keeps answering
+the scheduler.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from queue import SimpleQueue
 from typing import Any, TextIO
 
 from animat.errors import AnimatError, InvalidFile
-from animat.execution.apart import store
-from animat.execution.pinned import PinnedProcesses
+from animat.execution.pinned import PinnedProcesses, own_cores
+from animat.execution.unshared import store
 
-MADE_OF, PLACE = "animat:", "animat-place:"
-"""What a worker is made of, and which one it is, as names of its resources."""
+VERSIONS_PREFIX, PLACE_PREFIX = "animat:", "animat-place:"
+"""Prefixes of the resources whose names give a worker's software versions and its identity."""
 _LOOK_EVERY_S = 0.2
 _REPORTED_BYTES = 2**16
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of a call: what it returned, what it raised instead, or how its process ended; and how long it took."""
+    """The outcome of a call: its value, the exception it raised, or how its process ended; and its duration."""
 
     value: Any = None
     error: Exception | None = None
@@ -44,7 +45,7 @@ class Answer:
 
 
 class _Core:
-    """A core, and the process on it, which works for one client only: another one's files may have changed."""
+    """A core and its process, which serves one client only, as the files of another client may differ."""
 
     def __init__(self, number: int) -> None:
         self._number, self._client = number, ""
@@ -59,7 +60,7 @@ class _Core:
         while not wait([future], _LOOK_EVERY_S).done:
             if not _is_wanted(worker, key):
                 self._renew()
-                raise AnimatError("nobody waits for it any more")
+                raise AnimatError("nobody is waiting for it any more")
         took_s = time.monotonic() - began_s
         try:
             return Answer(future.result(), took_s=took_s)
@@ -79,29 +80,29 @@ _HELD: list[TextIO] = []
 
 
 def dask_setup(worker: Any) -> None:
-    """Make a Dask worker one of ours, before the scheduler hears of it; called by Dask."""
+    """Prepare a Dask worker for animat, before the scheduler knows it; called by Dask."""
     threads = worker.state.nthreads
     for core in _own_cores(threads):
         _FREE.put(_Core(core))
-    # The second is of this one alone, and of none that is started in its place.
-    for resource in (made_of(), f"{PLACE}{uuid.uuid4().hex}"):
+    # The second is unique: a worker that replaces this one has a different name.
+    for resource in (versions_tag(), f"{PLACE_PREFIX}{uuid.uuid4().hex}"):
         worker.state.total_resources[resource] = worker.state.available_resources[resource] = threads
 
 
 def work(calls: Sequence[bytes], client: str, longest_s: float, contents: Mapping[str, bytes]) -> list[bytes]:
-    """Do calls one after the other, in a process of its own on a core of its own; in a thread of a Dask worker.
+    """Do calls one after the other in a pinned process on one core; runs in a thread of a Dask worker.
 
-    The client is told of each at once, but for large answers. If nobody waits for them any more, since the client or
-    the scheduler has gone, the process is ended.
+    Each answer is reported to the client immediately, unless it is large. If nobody is waiting any more, as the client
+    or the scheduler has gone, the process is ended.
 
     Args:
-        calls: of each a function, its arguments and its named ones, pickled.
-        client: who asks.
-        longest_s: what has not begun after so long is left undone, but for the first.
-        contents: what is stored in the worker's folder before (`animat.execution.apart.store`).
+        calls: pickled tuples of a function, its positional and its keyword arguments.
+        client: ID of the client.
+        longest_s: time after which no further call is begun; the first one always is.
+        contents: files to store in the worker's folder beforehand (`animat.execution.unshared.store`).
 
     Returns:
-        The pickled answer (`Answer`) to each call that was done, the first ones.
+        The pickled `Answer` to each call that was done, in order.
     """
     from distributed import get_worker
 
@@ -125,13 +126,13 @@ def work(calls: Sequence[bytes], client: str, longest_s: float, contents: Mappin
 
 
 def topic_of(client: str) -> str:
-    """Under which a client hears of its calls."""
+    """The topic of events about a client's calls."""
     return f"animat-{client}"
 
 
 @cache
-def made_of() -> str:
-    """The versions that bits and pickles depend on, as the name of one of a worker's `resources`."""
+def versions_tag() -> str:
+    """The versions on which bits and pickles depend, as the name of one of a worker's `resources`."""
     versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
     return "/".join(f"{name}:{version}" for name, version in {**versions, "Python": platform.python_version()}.items())
 
@@ -147,7 +148,7 @@ def _is_wanted(worker: Any, key: object) -> bool:
 
 
 def _times_starved() -> int:
-    """How often the kernel of this machine ended a process for want of memory."""
+    """How often the kernel of this machine has killed a process as memory ran out."""
     try:
         counts = dict(line.split() for line in Path("/proc/vmstat").read_text().splitlines())
         return int(counts["oom_kill"])
@@ -156,21 +157,21 @@ def _times_starved() -> int:
 
 
 def _own_cores(threads: int) -> list[int]:
-    """Cores that no other worker on this machine has; where there are too few, some are shared."""
+    """Cores that no other worker on this machine has; if there are too few, some are shared."""
     folder = Path(tempfile.gettempdir()) / f"animat-cores-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-        raise InvalidFile(f"{folder}: expected a folder of this user's, got another's or a link: remove it")
-    allowed, own = sorted(os.sched_getaffinity(0)), []
+        raise InvalidFile(f"{folder}: expected a folder of this user, got another user's or a link: remove it")
+    allowed, own = own_cores(), []
     for core in allowed:
-        # No other user can have put a link there that leads to a file of ours.
+        # Links are not followed, so that another user's link cannot lead to a file of ours.
         file = os.fdopen(os.open(folder / str(core), os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600), "r+")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.close()
             continue
-        # Until this process ends.
+        # Held until this process ends.
         _HELD.append(file)
         own.append(core)
         if len(own) == threads:

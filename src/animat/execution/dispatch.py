@@ -1,7 +1,7 @@
-"""Handing calls to the workers of a Dask cluster: which worker gets which, small ones in batches, and who is to blame.
+"""Dispatch of calls to the workers of a Dask cluster: assignment, batches of small calls, and retries.
 
-Dask carries calls and answers. It neither chooses workers nor tries again: it would blame the death of a worker on all
-that the worker had been given.
+Dask only transports calls and answers. It neither chooses workers nor retries: it would blame the death of a worker on
+all calls that the worker had been given.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from pathlib import Path
 from typing import Any, final
 
 from animat.errors import AnimatError
-from animat.execution.dask_worker import PLACE, Answer, topic_of, work
+from animat.execution.dask_worker import PLACE_PREFIX, Answer, topic_of, work
 
 ATTEMPTS = 3
-"""How often a call may fail, or its process end, before that is reported."""
+"""How often a call may fail, or its process end, before this is reported."""
 LONGEST_S = 30.0
-"""Of a batch."""
+"""Longest expected duration of a batch."""
 _SMALL_S = 3.0
-"""What is expected to take less is batched: to hand over takes some hundredths of a second."""
+"""Calls expected to take less than this are batched, as sending one takes some hundredths of a second."""
 _LOOK_EVERY_S = 1.0
 _SILENT_S = 60.0
-"""After which a worker, or the scheduler, is taken for frozen."""
+"""Silence after which a worker, or the scheduler, is considered frozen."""
 
 
 @dataclass(eq=False)
@@ -38,12 +38,12 @@ class Call:
     """A call that waits or runs.
 
     Attributes:
-        name: what it is called in messages.
-        pickled: function, arguments and named ones, for a worker with this folder of its own.
-        cost_s: about how long it takes; None if nobody knows.
-        reads: files that are sent along, by what they are stored under.
-        finish: what is done here with what it returns.
-        future: what becomes of it.
+        name: its name in messages.
+        pickled: returns the pickled function, arguments and keyword arguments for a worker with this folder.
+        cost_s: approximate duration; None if unknown.
+        reads: files that are sent along, by the digests under which they are stored.
+        finish: function applied here to the returned value.
+        future: its result.
         failures, deaths: how often it failed, and how often its process or its worker ended.
     """
 
@@ -59,9 +59,9 @@ class Call:
 
 @dataclass(eq=False)
 class _Batch:
-    """Calls that are done one after the other: so many are done, and of so many of these the answer is here.
+    """Calls that are done one after the other; `done` of them are done, and `answered` have been answered.
 
-    `has_begun`, when its place is lost: one that is to be alone has not, while others run.
+    `has_begun` is set when the place is lost: a batch that must run alone has not begun while others run.
     """
 
     calls: list[Call]
@@ -74,7 +74,7 @@ class _Batch:
 
 @dataclass(eq=False)
 class _Place:
-    """A worker from its start to its end: another one that is started in its place is another place."""
+    """A worker from its start to its end: a worker that replaces it is a new place."""
 
     address: str
     resource: str
@@ -93,56 +93,56 @@ class _Place:
 
 @final
 class Dispatch:
-    """What a client has handed in, and where it runs; all in the client's own thread, but for `submit`.
+    """A client's calls, and where they run; everything but `submit` happens in the client's own thread.
 
-    A call whose process or worker ended runs alone on a worker from then on, so that no other is blamed for its death,
-    nor it for another's.
+    A call whose process or worker ended runs alone on a worker from then on, so that neither it nor another call is
+    blamed for the other's death.
 
     Args:
-        client: Dask's.
-        are_ours: is given the workers, as the scheduler knows them, and returns those that may have work.
-        longest_s: of a batch; 0 for no batches.
+        client: Dask's client.
+        select_usable: takes the workers, as the scheduler describes them, and returns those that may get work.
+        longest_s: longest expected duration of a batch; 0: no batches.
     """
 
     def __init__(
-        self, client: Any, are_ours: Callable[[dict[str, Any]], dict[str, Any]], longest_s: float = LONGEST_S
+        self, client: Any, select_usable: Callable[[dict[str, Any]], dict[str, Any]], longest_s: float = LONGEST_S
     ) -> None:
-        self._client, self._are_ours, self._longest_s = client, are_ours, longest_s
+        self._client, self._select_usable, self._longest_s = client, select_usable, longest_s
         self._waiting: deque[Call] = deque()
         self._places: dict[str, _Place] = {}
         self._batches: dict[str, _Batch] = {}
-        self._carried: set[asyncio.Task[None]] = set()
+        self._running: set[asyncio.Task[None]] = set()
         self._expected_s = self._took_s = 1.0
         self._has_ended, self._is_silent, self._waits_for_workers = False, False, True
         client.loop.add_callback(self._begin)
 
     def submit(self, call: Call) -> None:
-        """Take a call, from any thread."""
-        self._client.loop.add_callback(self._take, call)
+        """Submit a call, from any thread."""
+        self._client.loop.add_callback(self._enqueue, call)
 
     def close(self) -> None:
-        """Ask nothing more of anybody."""
+        """Stop dispatching."""
         self._has_ended = True
 
     async def _begin(self) -> None:
-        self._client.subscribe_topic(topic_of(self._client.id), self._hear)
+        self._client.subscribe_topic(topic_of(self._client.id), self._on_call_done)
         while not self._has_ended:
             try:
-                await self._look()
+                await self._poll_workers()
             except Exception as error:
                 return self._end(error)
             await asyncio.sleep(_LOOK_EVERY_S)
         return None
 
-    def _take(self, call: Call) -> None:
+    def _enqueue(self, call: Call) -> None:
         if self._has_ended:
             _cancel(call)
         else:
             self._waiting.append(call)
-            self._hand_out()
+            self._assign()
 
-    async def _look(self) -> None:
-        """See which workers there are."""
+    async def _poll_workers(self) -> None:
+        """Ask the scheduler which workers exist."""
         if self._client.status != "running":
             return self._end()
         try:
@@ -155,21 +155,21 @@ class Dispatch:
             self._is_silent = True
             return None
         self._is_silent = False
-        found = {}
-        for address, worker in self._are_ours(info["workers"]).items():
-            resource = next(name for name in worker["resources"] if name.startswith(PLACE))
-            found[resource] = address, worker
-        for resource in self._places.keys() - found.keys():
+        workers = {}
+        for address, worker in self._select_usable(info["workers"]).items():
+            resource = next(name for name in worker["resources"] if name.startswith(PLACE_PREFIX))
+            workers[resource] = address, worker
+        for resource in self._places.keys() - workers.keys():
             self._lose(self._places.pop(resource), "ended")
-        for resource, (address, worker) in found.items():
-            self._see(resource, address, worker)
+        for resource, (address, worker) in workers.items():
+            self._update_place(resource, address, worker)
         if self._waiting and not self._places and not self._waits_for_workers:
             print("cluster: waiting for workers", file=sys.stderr)
         self._waits_for_workers = not self._places
-        self._hand_out()
+        self._assign()
         return None
 
-    def _see(self, resource: str, address: str, worker: dict[str, Any]) -> None:
+    def _update_place(self, resource: str, address: str, worker: dict[str, Any]) -> None:
         place = self._places.get(resource)
         if place is None:
             lost = asyncio.get_running_loop().create_future()
@@ -179,20 +179,20 @@ class Dispatch:
         if worker["last_seen"] != place.last_seen:
             place.last_seen, place.heard_s = worker["last_seen"], time.monotonic()
             if place.lost.done():
-                # It was frozen, and goes on.
+                # It was frozen, and continues.
                 place.lost = asyncio.get_running_loop().create_future()
         elif time.monotonic() - place.heard_s > _SILENT_S and not place.lost.done():
             self._lose(place, f"has been silent for {_SILENT_S:.0f} s (frozen, or cut off)")
 
-    def _lose(self, place: _Place, words: str) -> None:
+    def _lose(self, place: _Place, reason: str) -> None:
         if not place.lost.done():
             for batch in place.batches:
                 batch.has_begun = not batch.is_alone or all(other.is_alone for other in place.batches)
-            place.lost.set_result(words)
+            place.lost.set_result(reason)
             n = sum(len(batch.calls) - batch.answered for batch in place.batches)
-            _warn(f"worker {place.address} {words}; its tasks ({n}) go to others")
+            _warn(f"worker {place.address} {reason}; its tasks ({n}) go to others")
 
-    def _hand_out(self) -> None:
+    def _assign(self) -> None:
         while self._waiting and not self._has_ended:
             ready = [place for place in self._places.values() if place.free > 0 and not place.lost.done()]
             if not ready:
@@ -201,31 +201,31 @@ class Dispatch:
             if calls:
                 place = max(ready, key=lambda place: place.free)
                 place.batches.append(_Batch(calls, calls[0].deaths > 0, place))
-                task = asyncio.create_task(self._carry(place.batches[-1]))
-                self._carried.add(task)
-                task.add_done_callback(self._carried.discard)
+                task = asyncio.create_task(self._run(place.batches[-1]))
+                self._running.add(task)
+                task.add_done_callback(self._running.discard)
 
     def _next_calls(self) -> list[Call]:
-        """The first call that waits; if it is small, with others, of which enough are left for all."""
+        """The first waiting call; if it is small, further small ones, leaving enough for the other workers."""
         most_s = self._share_s()
         calls: list[Call] = []
-        together_s = 0.0
+        total_s = 0.0
         while self._waiting:
             call = self._waiting[0]
-            small = self._expect_s(call) < _SMALL_S and not call.deaths
-            if calls and not (small and together_s + self._expect_s(call) <= most_s):
+            is_small = self._expect_s(call) < _SMALL_S and not call.deaths
+            if calls and not (is_small and total_s + self._expect_s(call) <= most_s):
                 break
             self._waiting.popleft()
             if call.future.cancelled():
                 continue
             calls.append(call)
-            together_s += self._expect_s(call)
-            if not small:
+            total_s += self._expect_s(call)
+            if not is_small:
                 break
         return calls
 
     def _share_s(self) -> float:
-        """How long a batch is to take: less where little waits, that all cores end at about the same time."""
+        """The duration of the next batch: shorter if little is waiting, so that all cores finish together."""
         threads = sum(place.threads for place in self._places.values())
         waiting_s = 0.0
         for call in self._waiting:
@@ -235,43 +235,43 @@ class Dispatch:
         return min(self._longest_s, waiting_s / (2 * threads))
 
     def _expect_s(self, call: Call) -> float:
-        """How long a call takes, by what others took of what was expected of them."""
+        """The expected duration of a call, by the ratio of actual to expected durations so far."""
         return _SMALL_S if call.cost_s is None else call.cost_s * self._took_s / self._expected_s
 
-    async def _carry(self, batch: _Batch) -> None:
-        """Have a batch done at its place, and see what came of it."""
+    async def _run(self, batch: _Batch) -> None:
+        """Run a batch at its place, and handle the outcome."""
         try:
-            await self._have_done(batch)
+            await self._send(batch)
         except Exception as error:
-            # Whatever it is, somebody waits.
+            # Any error is passed on, as somebody is waiting.
             for call in batch.calls:
                 _settle(call, error=error)
         batch.place.batches.remove(batch)
-        self._hand_out()
+        self._assign()
 
-    async def _have_done(self, batch: _Batch) -> None:
+    async def _send(self, batch: _Batch) -> None:
         place = batch.place
-        needed = {stored: path for call in batch.calls for stored, path in call.reads.items()}
+        needed = {digest: path for call in batch.calls for digest, path in call.reads.items()}
         with warnings.catch_warnings():
-            # Of much that is sent.
+            # Dask warns of large messages.
             warnings.simplefilter("ignore", UserWarning)
             future = self._client.submit(
                 work,
                 [call.pickled(place.folder) for call in batch.calls],
                 self._client.id,
                 self._longest_s,
-                {stored: path.read_bytes() for stored, path in needed.items() if stored not in place.stored},
+                {digest: path.read_bytes() for digest, path in needed.items() if digest not in place.stored},
                 resources={place.resource: place.threads if batch.is_alone else 1},
                 pure=False,
             )
         self._batches[future.key] = batch
 
-        def let_go(_: object) -> None:
+        def cancel_if_unwanted(_: object) -> None:
             if all(call.future.cancelled() for call in batch.calls[batch.answered :]):
                 self._client.loop.add_callback(future.cancel)
 
         for call in batch.calls:
-            call.future.add_done_callback(let_go)
+            call.future.add_done_callback(cancel_if_unwanted)
         answers = asyncio.ensure_future(future)
         await asyncio.wait({answers, place.lost}, return_when=asyncio.FIRST_COMPLETED)
         del self._batches[future.key]
@@ -282,15 +282,15 @@ class Dispatch:
             if batch.has_begun:
                 self._blame(left, f"worker {place.address} {place.lost.result()}", batch.done - batch.answered)
         elif answers.cancelled() or answers.exception() is not None:
-            self._see_why(left, answers)
+            self._handle_failure(left, answers)
         else:
             place.stored |= needed.keys()
             for answer in answers.result()[batch.answered :]:
                 self._answer(left.popleft(), pickle.loads(answer))
         self._waiting.extendleft(reversed(left))
 
-    def _see_why(self, left: deque[Call], answers: asyncio.Future[Any]) -> None:
-        """Why a batch was not done: the scheduler ended, the worker did, or it could not be sent."""
+    def _handle_failure(self, left: deque[Call], answers: asyncio.Future[Any]) -> None:
+        """Handle a batch that was not done: the scheduler or the worker ended, or it could not be sent."""
         error = None if answers.cancelled() else answers.exception()
         if type(error).__name__ == "KilledWorker":
             self._blame(left, "its worker ended")
@@ -303,26 +303,26 @@ class Dispatch:
             while left:
                 _settle(left.popleft(), error=error)
 
-    def _blame(self, left: deque[Call], words: str, running: int = 0) -> None:
-        """The one that ran when its process or worker ended is tried again, or reported."""
+    def _blame(self, left: deque[Call], reason: str, running: int = 0) -> None:
+        """Retry or report the call that was running when its process or worker ended."""
         call = left[running]
         call.deaths += 1
         if call.deaths == ATTEMPTS:
-            _settle(call, error=BrokenExecutor(f"what it ran on ended {ATTEMPTS} times, at last: {words}"))
+            _settle(call, error=BrokenExecutor(f"its process or worker ended {ATTEMPTS} times, last: {reason}"))
             del left[running]
 
-    async def _hear(self, event: tuple[float, dict[str, Any]]) -> None:
-        """A call of a batch was done."""
-        _, words = event
-        batch = self._batches.get(words["batch"])
+    async def _on_call_done(self, event: tuple[float, dict[str, Any]]) -> None:
+        """Handle the event that a call of a batch is done."""
+        _, message = event
+        batch = self._batches.get(message["batch"])
         if batch is None:
             return
-        batch.done = words["number"] + 1
+        batch.done = message["number"] + 1
         batch.place.stored.update(*(call.reads for call in batch.calls))
-        # Of a large one the answer comes with the batch's.
-        if words["number"] == batch.answered and words["answer"] is not None:
+        # A large answer arrives only with the whole batch.
+        if message["number"] == batch.answered and message["answer"] is not None:
             batch.answered += 1
-            self._answer(batch.calls[words["number"]], pickle.loads(words["answer"]))
+            self._answer(batch.calls[message["number"]], pickle.loads(message["answer"]))
 
     def _answer(self, call: Call, answer: Answer) -> None:
         if call.cost_s is not None:
@@ -332,7 +332,7 @@ class Dispatch:
         if answer.ended is not None:
             self._blame(left, answer.ended)
             if left:
-                _warn(f"{call.name}: {answer.ended}; it is tried again")
+                _warn(f"{call.name}: {answer.ended}; trying again")
         elif answer.error is not None and call.failures + 1 < ATTEMPTS:
             call.failures += 1
         else:
@@ -345,7 +345,7 @@ class Dispatch:
         self._waiting.extendleft(left)
 
     def _end(self, error: Exception | None = None) -> None:
-        """Nothing more comes of anything: the scheduler has ended, or something that nobody foresaw."""
+        """Give up all calls: the scheduler has ended, or an unexpected error occurred."""
         self._has_ended = True
         for call in (*self._waiting, *(call for batch in self._batches.values() for call in batch.calls)):
             if error is None:
@@ -357,12 +357,12 @@ class Dispatch:
 
 def _cancel(call: Call) -> None:
     if not call.future.done() and call.future.cancel():
-        # Only then does whoever waits for it hear of it.
+        # Only this wakes those who wait for it.
         call.future.set_running_or_notify_cancel()
 
 
 def _settle(call: Call, value: Any = None, error: BaseException | None = None) -> None:
-    # It may have been cancelled meanwhile.
+    # It may have been cancelled in the meantime.
     with contextlib.suppress(InvalidStateError):
         if error is None:
             call.future.set_result(value)
@@ -370,5 +370,5 @@ def _settle(call: Call, value: Any = None, error: BaseException | None = None) -
             call.future.set_exception(error)
 
 
-def _warn(words: str) -> None:
-    print(f"warning: cluster: {words}", file=sys.stderr)
+def _warn(message: str) -> None:
+    print(f"warning: cluster: {message}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The GPU of this machine: all policies of many trainings at once, in a process of its own, beside those on cores."""
+"""The GPU of this machine: one process trains all policies of many trainings at once, alongside work on cores."""
 
 from __future__ import annotations
 
@@ -11,44 +11,43 @@ from typing import Any
 from animat import devices
 from animat.errors import first_line
 from animat.execution.pinned import PinnedProcesses
-from animat.execution.task import Done, Task, carry_out_alone
+from animat.execution.task import Task, TaskResult, carry_out_alone
 
 _CONDITIONS = 5
-"""Any number: in one folder it is the same for all that have neurons."""
+"""An arbitrary number: it is the same for all trainings with neurons in a folder."""
 
 
 def find_gpu() -> str | None:
-    """The kind of GPU that policies are trained on; None: on cores, which is told where JAX has a plugin for GPUs."""
+    """The kind of GPU for training; None: train on cores, with a message if JAX has a plugin for GPUs."""
     if not devices.GPU_IS_ALLOWED:
         return None
     try:
-        with PinnedProcesses([None]) as apart:
-            found = apart.submit(devices.gpu_here).result()
+        with PinnedProcesses([None]) as process:
+            kind = process.submit(devices.gpu_here).result()
     except Exception as error:
         print(f"gpu: none can be used ({first_line(error)}); policies are trained on cores", file=sys.stderr)
         return None
-    if found is None:
+    if kind is None:
         print("gpu: JAX finds none; policies are trained on cores", file=sys.stderr)
-    return found
+    return kind
 
 
-def programs_among(tasks: Sequence[Task]) -> list[list[int]]:
-    """Tasks that one program does, by their numbers: of each program; those that are in none stay on cores.
+def group_by_program(tasks: Sequence[Task]) -> list[list[int]]:
+    """The indices of the tasks of each program; tasks in no program stay on cores.
 
-    A program trains all policies of the same environment, settings and length; with lessons or a cost of pulses, of
-    the same training.
-    Bodies that are stepped outside JAX stay on cores.
+    A program trains all policies with the same environment, settings and length; with lessons or a cost of pulses, only
+    those of the same training. Bodies that are stepped outside JAX stay on cores.
     """
-    from animat.execution.trains import Trains
+    from animat.execution.training_task import TrainingTask
     from animat.robots.host import HostRobot
 
     programs: list[tuple[Any, list[int]]] = []
     for number, task in enumerate(tasks):
-        training = task.training if isinstance(task, Trains) else None
+        training = task.training if isinstance(task, TrainingTask) else None
         if training is None or isinstance(training.robot, HostRobot):
             continue
-        of_its_own = training if training.is_varied or training.pulse_cost else None
-        program = (training.environment(_CONDITIONS), training.algorithm, training.rounds, of_its_own)
+        only_this = training if training.is_varied or training.pulse_cost else None
+        program = (training.environment(_CONDITIONS), training.algorithm, training.rounds, only_this)
         same = next((numbers for other, numbers in programs if other == program), None)
         if same is None:
             programs.append((program, same := []))
@@ -57,30 +56,29 @@ def programs_among(tasks: Sequence[Task]) -> list[list[int]]:
 
 
 class WithGpu:
-    """The cores of this machine, and a process with its GPU, to which goes what trains policies."""
+    """The cores of this machine, and a process with its GPU, which gets the tasks that train policies."""
 
     def __init__(self, cores: Executor, process: Executor) -> None:
         self._cores, self._process = cores, process
 
-    def hand_in(self, tasks: Sequence[Task], folder: Path, notices: Sequence[Path]) -> list[Future[Done]]:
-        """Have tasks carried out (`animat.execution.task.carry_out_alone`), of which those at once that can be."""
-        from animat.execution.trains import Trains, train_at_once
+    def submit_tasks(self, tasks: Sequence[Task], folder: Path, notices: Sequence[Path]) -> list[Future[TaskResult]]:
+        """Submit tasks (`animat.execution.task.carry_out_alone`); those of one program run at once on the GPU."""
+        from animat.execution.training_task import TrainingTask, train_together
 
-        futures: dict[int, Future[Done]] = {}
-        for numbers in programs_among(tasks):
-            told = [notices[number] for number in numbers]
-            at_once = [task for number in numbers if isinstance(task := tasks[number], Trains)]
-            done = self._process.submit(train_at_once, at_once, folder, told)
-            futures |= dict(zip(numbers, _each_of(done, len(numbers)), strict=True))
+        futures: dict[int, Future[TaskResult]] = {}
+        for numbers in group_by_program(tasks):
+            at_once = [task for number in numbers if isinstance(task := tasks[number], TrainingTask)]
+            together = self._process.submit(train_together, at_once, folder, [notices[number] for number in numbers])
+            futures |= dict(zip(numbers, _split(together, len(numbers)), strict=True))
         for number in range(len(tasks)):
             if number not in futures:
                 futures[number] = self._cores.submit(carry_out_alone, tasks[number], folder, notices[number])
         return [futures[number] for number in range(len(tasks))]
 
 
-def _each_of(together: Future[list[Done]], n: int) -> list[Future[Done]]:
-    """A future for each of what comes together."""
-    futures: list[Future[Done]] = [Future() for _ in range(n)]
+def _split(together: Future[list[TaskResult]], n: int) -> list[Future[TaskResult]]:
+    """A future for each of the results that arrive together."""
+    futures: list[Future[TaskResult]] = [Future() for _ in range(n)]
 
     def settle(_: object) -> None:
         error = None if together.cancelled() else together.exception()

@@ -1,4 +1,4 @@
-"""A Dask cluster on this machine, for a try: a scheduler and workers as processes, over TCP on loopback."""
+"""A Dask cluster on this machine, to try it out: a scheduler and workers as processes, over TCP on loopback."""
 
 from __future__ import annotations
 
@@ -22,35 +22,37 @@ from animat.process import end_with_parent
 end_with_parent()
 runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 """
-"""A module that ends with this process; nothing runs between fork and exec, which JAX's threads would not stand."""
+"""Runs a module that ends with this process; nothing runs between fork and exec, which is unsafe with JAX's threads."""
 
 
 @contextmanager
 def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """A scheduler, and so many workers, until the block ends. A worker that dies is replaced.
+    """A scheduler and workers until the block ends; a worker that dies is replaced.
 
-    The file, in which the scheduler writes its address, is gone at the end. Yields the processes of the scheduler and
-    of what looks after the workers.
+    The scheduler writes its address to the file, which is removed at the end. Yields the processes of the scheduler and
+    of the workers' nanny.
 
     Raises:
         AnimatError: if Dask is not installed, or the scheduler does not start.
-        InvalidFile: if the file is there already.
+        InvalidFile: if the file already exists.
     """
     expect_distributed()
     if file.exists():
-        raise InvalidFile(f"{file}: expected no file, got one; another cluster may be at work: stop it, or remove it")
+        raise InvalidFile(
+            f"{file}: expected no file, got one; another cluster may be running: stop it, or remove the file"
+        )
     scheduler = _start("scheduler", file, "--host", "127.0.0.1", "--port", "0")
-    looks_after = None
+    nanny = None
     try:
         while not file.exists():
             if scheduler.poll() is not None:
-                raise AnimatError(f"{file}: the scheduler ended before it wrote its address there; see what it said")
+                raise AnimatError(f"{file}: the scheduler ended before it wrote its address there; see its output")
             time.sleep(0.1)
         counts = ("--nworkers", str(workers), "--nthreads", str(threads))
-        looks_after = _start("worker", file, *counts, "--preload", work.__module__)
-        yield [scheduler, looks_after]
+        nanny = _start("worker", file, *counts, "--preload", work.__module__)
+        yield [scheduler, nanny]
     finally:
-        for process in (looks_after, scheduler):
+        for process in (nanny, scheduler):
             if process is not None:
                 _stop(process)
         file.unlink(missing_ok=True)
@@ -61,26 +63,18 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     try:
         process.wait(_PATIENCE_S)
     except subprocess.TimeoutExpired:
-        # Workers whose scheduler died as they began wait for it for ever.
+        # Workers whose scheduler died as they started wait for it forever.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
 
 def _start(part: str, file: Path, *options: str) -> subprocess.Popen[bytes]:
     quiet = {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    module = f"distributed.cli.dask_{part}"
     return subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            _RUN,
-            f"distributed.cli.dask_{part}",
-            "--no-dashboard",
-            "--scheduler-file",
-            file,
-            *options,
-        ],
-        # As for pinned processes: robots may lie beside a script.
+        [sys.executable, "-c", _RUN, module, "--no-dashboard", "--scheduler-file", file, *options],
+        # As for pinned processes: robots may be defined next to a script.
         env={**os.environ, **quiet, "PYTHONPATH": os.pathsep.join(sys.path)},
-        # Ctrl-C reaches this process alone, which then ends the others.
+        # Ctrl-C reaches only this process, which then ends the others.
         process_group=0,
     )

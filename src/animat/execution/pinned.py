@@ -18,35 +18,35 @@ T = TypeVar("T")
 
 @final
 class PinnedProcesses(ThreadPoolExecutor):
-    """Threads of which each hands its work to a process of its own, on a core of its own.
+    """Threads that each pass their work to their own process, pinned to its own core.
 
-    A process stays for more work until it has grown large, and ends when the one that made it ends. Left by an error,
-    as a context manager, the executor ends what still runs. Work whose process ends raises a `BrokenExecutor`.
+    A process is reused until it has grown large, and ends with the process that started it. If a `with` block is left
+    by an error, running work is ended. Work whose process ends raises a `BrokenExecutor`.
 
     Args:
-        cores: one process for each, which is started when there is work for it; a core named twice gets two. None: a
-            process that is pinned to no core and may use the GPU.
+        cores: one process per entry, started when there is work for it; a core named twice gets two. None: a process
+            that is not pinned and may use the GPU.
     """
 
     def __init__(self, cores: Sequence[int | None]) -> None:
-        super().__init__(len(cores), initializer=self._settle)
+        super().__init__(len(cores), initializer=self._init_thread)
         self._cores = list(reversed(cores))
-        self._mine = threading.local()
+        self._local = threading.local()
         self._processes: list[Process] = []
         self._lock, self._is_killed = threading.Lock(), False
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """As any executor's; what is called, and with what, is pickled at once."""
-        return super().submit(self._hand_over, pickle.dumps((fn, args, kwargs)))
+        """Submit a call, which is pickled immediately."""
+        return super().submit(self._run, pickle.dumps((fn, args, kwargs)))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """As any executor's."""
+        """Shut the executor down and end its processes."""
         super().shutdown(wait, cancel_futures=cancel_futures)
         for process in self._processes if wait else ():
             process.end()
 
     def kill_workers(self) -> None:
-        """End everything at once, also what runs; as in the executors of Python 3.14."""
+        """Kill all processes immediately, including running ones; as in the executors of Python 3.14."""
         with self._lock:
             self._is_killed = True
             for process in self._processes:
@@ -61,24 +61,24 @@ class PinnedProcesses(ThreadPoolExecutor):
         else:
             self.kill_workers()
 
-    def _settle(self) -> None:
-        self._mine.core, self._mine.process = self._cores.pop(), None
+    def _init_thread(self) -> None:
+        self._local.core, self._local.process = self._cores.pop(), None
 
-    def _hand_over(self, call: bytes) -> Any:
-        process: Process | None = self._mine.process
+    def _run(self, call: bytes) -> Any:
+        process: Process | None = self._local.process
         if process is None or process.is_spent:
             with self._lock:
                 if self._is_killed:
                     raise BrokenExecutor("its process was ended before it began")
                 if process is not None:
                     self._processes.remove(process)
-                    self._mine.process = None
+                    self._local.process = None
                     process.end()
-                process = self._mine.process = Process("gpu" if self._mine.core is None else self._mine.core)
+                process = self._local.process = Process("gpu" if self._local.core is None else self._local.core)
                 self._processes.append(process)
         return process.answer(call)
 
 
 def own_cores(most: int | None = None) -> list[int]:
-    """The cores that this process may use, or so many of them at most."""
+    """The cores that this process may use, at most `most` of them."""
     return sorted(os.sched_getaffinity(0))[:most]

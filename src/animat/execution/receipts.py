@@ -1,4 +1,4 @@
-"""Receipts: that a job is done, on which inputs, and which files it left."""
+"""Receipts, which record that a job is done, on which inputs, and which files it wrote."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from animat.writing import write_whole
 
 @dataclass(frozen=True)
 class Receipt:
-    """That a job is done: of which study, from which receipts, and which files it left.
+    """The record that a job is done.
 
     Attributes:
-        job: its name.
-        study: fingerprint of the study or training that it is part of.
+        job: name of the job.
+        study: fingerprint of the study or training to which it belongs.
         inputs: digest of the receipt of each job it needed.
-        outputs: of each file by its place in the folder, `digest_of` it.
+        outputs: `digest_of` each file that it wrote, by its place in the folder.
     """
 
     job: str
@@ -36,49 +36,48 @@ class Receipt:
 
     @property
     def digest(self) -> str:
-        """Stands for all of it."""
+        """SHA-256 of the receipt."""
         return hashlib.sha256(self._text().encode()).hexdigest()
 
     def _text(self) -> str:
-        words: dict[str, Any] = {"job": self.job, "study": self.study, "inputs": self.inputs, "outputs": self.outputs}
-        return json.dumps(words, indent=1, sort_keys=True) + "\n"
+        data: dict[str, Any] = {"job": self.job, "study": self.study, "inputs": self.inputs, "outputs": self.outputs}
+        return json.dumps(data, indent=1, sort_keys=True) + "\n"
 
     def save(self, receipts: Path) -> None:
-        """Write it into a folder of receipts, after all files are there."""
+        """Write it into a folder of receipts, once all files are written."""
         write_whole(receipt_path(receipts, self.job), self._text())
 
     def changed(self, folder: Path) -> list[str]:
-        """The files that are not in the folder any more as they were left."""
-        return [name for name, sum_ in self.outputs.items() if not _is_file_of(folder / name, sum_)]
+        """The files that are missing from the folder or differ from those that were written."""
+        return [name for name, digest in self.outputs.items() if not _has_digest(folder / name, digest)]
 
     @staticmethod
     def load(receipts: Path, job: str) -> Receipt | None:
-        """The receipt of a job; None where there is none. Raises InvalidFile if it cannot be read."""
+        """The receipt of a job; None if there is none. Raises InvalidFile if it cannot be read."""
         path = receipt_path(receipts, job)
         if not path.exists():
             return None
         try:
-            words = json.loads(path.read_text())
-            return Receipt(words["job"], words["study"], dict(words["inputs"]), dict(words["outputs"]))
+            data = json.loads(path.read_text())
+            return Receipt(data["job"], data["study"], dict(data["inputs"]), dict(data["outputs"]))
         except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
             raise InvalidFile(f"{path}: expected a job's receipt, got a file that cannot be read; remove it") from error
 
 
 def receipt_path(receipts: Path, job: str) -> Path:
-    """Where a job's receipt lies."""
-    # A sign that no name holds: of two jobs none may have the other's.
+    """Path of a job's receipt."""
+    # No job's name has a "+", so two jobs never share a path.
     return receipts / f"{job.replace('/', '+')}.json"
 
 
 def sha256(path: Path) -> str:
-    """Of a file's contents."""
+    """SHA-256 of a file's contents."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of what a file tells: of the recording in one of NWB, which has identifiers and a date of its own each
-    time that it is written; else of its bytes.
+    """SHA-256 of a file's bytes; of an NWB file that of its recording, as its identifiers and date differ each time.
 
     Raises:
         OSError, InvalidFile: if it cannot be read.
@@ -91,7 +90,7 @@ def digest_of(path: Path) -> str:
 
 
 def _packed(recording: Recording) -> bytes:
-    """All of a recording as bytes, the same for recordings that are equal."""
+    """A recording as bytes, which are the same for equal recordings."""
     arrays = {name: getattr(recording, name) for name in ("spike_times_s", "spike_channels")}
     for name, table in (("channels", recording.channels), ("stimuli", recording.stimuli)):
         arrays |= {f"{name}_{field.name}": getattr(table, field.name) for field in fields(table)}
@@ -106,8 +105,8 @@ def _packed(recording: Recording) -> bytes:
     return buffer.getvalue()
 
 
-def _is_file_of(path: Path, sum_: str) -> bool:
+def _has_digest(path: Path, digest: str) -> bool:
     try:
-        return digest_of(path) == sum_
+        return digest_of(path) == digest
     except (OSError, AnimatError):
         return False

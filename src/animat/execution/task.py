@@ -1,4 +1,4 @@
-"""Tasks: picklable pieces of work in a folder, and what becomes of one wherever it is carried out."""
+"""Tasks, picklable pieces of work in a folder, and how they are carried out and report progress."""
 
 from __future__ import annotations
 
@@ -21,87 +21,87 @@ from animat.execution.receipts import digest_of
 from animat.progress import Progress
 
 SILENT_S = 60.0
-"""After which a process is taken for frozen."""
+"""Silence after which a process is considered frozen."""
 UNFINISHED = ".unfinished"
-"""Of a folder: checkpoints, and what tasks report while they run; gone when everything is done."""
+"""Subfolder for checkpoints and the progress of running tasks; removed when everything is done."""
 PLANNED = ".planned.json"
-"""In there, of all jobs what they cost, by name, for whoever looks how far it is."""
+"""File in it with the cost of each job by name, from which others compute the progress."""
 
 
 class Task(abc.ABC):
-    """A piece of work: a picklable value without any state, which is carried out in any process."""
+    """A piece of work: a picklable value without state, which can be carried out in any process."""
 
     @property
     @abc.abstractmethod
     def grows_with(self) -> Mapping[str, object]:
-        """The settings that its memory grows with, and what they are."""
+        """The settings with which its memory grows, and their values."""
 
     @property
     def reads_elsewhere(self) -> bool:
-        """Whether it reads files that are not in the folder."""
+        """Whether it reads files outside the folder."""
         return False
 
     @abc.abstractmethod
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        """Do it and return the files that it left, each written whole; done again, they are the same
+        """Run the task, and return the files it wrote, each atomically and reproducibly
         (`animat.execution.receipts.digest_of`).
 
         Args:
-            folder: in which all its files are.
-            progress: told how far it is.
+            folder: the folder of all its files.
+            progress: updated while it runs.
         """
 
 
 @dataclass(frozen=True)
-class Done:
-    """What came of a task: the digest of each file that it left, by its place in the folder; processor seconds."""
+class TaskResult:
+    """The result of a task: the digest of each file that it wrote, by its place in the folder, and CPU seconds."""
 
     files: dict[str, str]
     cpu_s: float
 
 
-def carry_out_alone(task: Task, folder: Path, notice: Path) -> Done:
-    """`carry_out`, when no other process does: one whose client or scheduler was killed may not have heard of it.
+def carry_out_alone(task: Task, folder: Path, notice: Path) -> TaskResult:
+    """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed.
 
     Raises:
-        InvalidFile: if the folder of the notice, which is in that of all files, is not seen here.
-        AnimatError: if it fails.
+        InvalidFile: if the folder of the notice, which is inside `folder`, is not visible here.
+        AnimatError: if the task fails.
     """
     if not notice.parent.is_dir():
         raise InvalidFile(
             f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it"
         )
-    with notice.with_suffix(".lock").open("a") as lock, _shown_to_live(lock):
+    with notice.with_suffix(".lock").open("a") as lock, _holding(lock):
         return carry_out(task, folder, notice)
 
 
 @contextmanager
-def _shown_to_live(lock: IO[str]) -> Iterator[None]:
-    """Hold a lock, whose file shows all the while that this process lives: nobody waits for one that is frozen.
+def _holding(lock: IO[str]) -> Iterator[None]:
+    """Hold a lock and keep its file's time current, so that nobody waits for a frozen process.
 
-    Where the file system has no locks, or such a one goes on, two may do the same: each file is whole, and of the same
-    bytes.
+    If the file system has no locks, or a frozen process continues, two processes may do the same work: each file is
+    then written atomically, with the same bytes.
     """
-    seen, seen_s = 0.0, time.monotonic()
+    last_mtime, since_s = 0.0, time.monotonic()
     while not _has_locked(lock):
-        if (changed := os.fstat(lock.fileno()).st_mtime) != seen:
-            seen, seen_s = changed, time.monotonic()
-        elif time.monotonic() - seen_s > SILENT_S:
+        if (mtime := os.fstat(lock.fileno()).st_mtime) != last_mtime:
+            last_mtime, since_s = mtime, time.monotonic()
+        elif time.monotonic() - since_s > SILENT_S:
             break
         time.sleep(0.2)
     ended = threading.Event()
 
-    def show() -> None:
+    def touch() -> None:
         while not ended.wait(SILENT_S / 12):
             os.utime(lock.fileno())
 
-    shows = threading.Thread(target=show, daemon=True)
-    shows.start()
+    thread = threading.Thread(target=touch, daemon=True)
+    thread.start()
     try:
         yield
     finally:
         ended.set()
-        shows.join()
+        thread.join()
 
 
 def _has_locked(lock: IO[str]) -> bool:
@@ -114,57 +114,57 @@ def _has_locked(lock: IO[str]) -> bool:
     return True
 
 
-def carry_out(task: Task, folder: Path, notice: Path) -> Done:
-    """Run a task, which tells in a file how far it is (`told`): what an executor is handed, in whatever process.
+def carry_out(task: Task, folder: Path, notice: Path) -> TaskResult:
+    """Run a task, which reports its progress in the file `notice` (`reported`).
 
     Raises:
-        AnimatError: if it fails; in one line, also where nobody foresaw it.
+        AnimatError: if the task fails; in one line, even for unexpected errors.
     """
-    return carried_out([task], folder, [notice], lambda progress: [task.run(folder, progress)])[0]
+    return carry_out_together([task], folder, [notice], lambda progress: [task.run(folder, progress)])[0]
 
 
-def carried_out(
+def carry_out_together(
     tasks: Sequence[Task], folder: Path, notices: Sequence[Path], run: Callable[[Progress], list[list[Path]]]
-) -> list[Done]:
-    """Have tasks done together, with arguments and errors as of `carry_out`; `run` returns the files that each left."""
+) -> list[TaskResult]:
+    """`carry_out` for tasks that `run` does together; it returns the files that each task wrote."""
     progress = _Notice(notices)
     progress.update(0, 1)
     began_s = time.process_time()
     try:
-        left = run(progress)
+        written = run(progress)
     except AnimatError:
         raise
     except Exception as error:
         memory = out_of_memory(error)
-        raise AnimatError(_unforeseen(error) if memory is None else f"{memory}: {memory_of(tasks[0])}") from error
-    sums = [{file.relative_to(folder).as_posix(): digest_of(file) for file in sorted(files)} for files in left]
+        raise AnimatError(_unexpected(error) if memory is None else f"{memory}: {memory_of(tasks[0])}") from error
+    digests = [{file.relative_to(folder).as_posix(): digest_of(file) for file in sorted(files)} for files in written]
     cpu_s = (time.process_time() - began_s) / len(tasks)
-    return [Done(each, cpu_s) for each in sums]
+    return [TaskResult(files, cpu_s) for files in digests]
 
 
 class _Notice:
-    """A progress in files, each of which is whole whenever it is read; words only in the first of several."""
+    """A progress that writes to files, each atomically; only the first of several gets the note."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = paths
 
     def update(self, done: float, total: float, note: str = "") -> None:
         for path in self._paths:
-            # Where it cannot be written, no work is lost.
+            # Losing a notice loses no work.
             with suppress(OSError):
                 report(path, (done / total, note if path == self._paths[0] else None))
 
 
-def report(path: Path, words: Any) -> None:
-    """Put something into a file for other processes to see (`reported`); OSError where it cannot be written."""
+def report(path: Path, data: Any) -> None:
+    """Write data to a file for other processes (`reported`); raises OSError if it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".new")
-    beside.write_text(json.dumps(words))
-    beside.replace(path)
+    new = path.with_suffix(".new")
+    new.write_text(json.dumps(data))
+    new.replace(path)
 
 
 def reported(path: Path) -> Any:
-    """What was reported last (`report`); None if nothing was."""
+    """The data last written by `report`; None if there is none."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
@@ -172,11 +172,11 @@ def reported(path: Path) -> Any:
 
 
 def memory_of(task: Task) -> str:
-    """What memory is needed for, as a sentence's end."""
+    """The settings that determine a task's memory, as the end of a sentence."""
     settings = ", ".join(f"{name} ({value!r})" for name, value in task.grows_with.items())
-    return f"it grows with {settings}: ask for less, or use a machine with more memory"
+    return f"it grows with {settings}: reduce these, or use a machine with more memory"
 
 
-def _unforeseen(error: Exception) -> str:
+def _unexpected(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{first_line(error)} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"

@@ -1,4 +1,4 @@
-"""Training of several policies: groups of them as tasks, into a folder that can be gone on with."""
+"""Training of several policies: groups of them as tasks, into a folder in which training can be resumed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from animat.execution.curves import CurveFile, Curves
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
-from animat.execution.trains import Trains, Work
+from animat.execution.training_task import TrainingTask, TrainingWork
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
 from animat.robots.host import HostRobot
@@ -53,47 +53,45 @@ def train(
     random_return: float | None = None,
     callbacks: Sequence[TrainingCallback] = (),
 ) -> dict[str, Policy]:
-    """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which says what they are.
+    """Train policies into a folder: `p0.safetensors`, ..., and `training.json`, which describes them.
 
-    Stopped at any moment, also by SIGKILL, and called again, it goes on from the last chunk and ends in the same bits
-    as if it had not been stopped, with any number of workers. On a finished folder it reads the policies and returns.
-    Where there is a GPU, it trains all policies at once (`animat.execution.gpu`). Killed there while it writes the
-    finished ones, it trains the others together again, and their last bits are others.
+    If stopped at any moment, even by SIGKILL, and called again, it resumes from the last checkpoint and ends in the
+    same bits as if it had not been stopped, with any number of workers. For a finished folder it reads the policies.
+    On a GPU it trains all policies at once (`animat.execution.gpu`). If killed there while it writes the finished ones,
+    it trains the others together again, and their last bits differ.
 
     Args:
-        training: what is trained.
+        training: the training.
         timeline: the culture's simulators; None for a training without neurons.
-        folder: where the policies go; made where it is missing. None: nowhere; they are trained in this process, and
-            a training that is stopped begins anew. So can robots and mappings that are not registered,
-            which no file can name.
-        workers: processes to use, each pinned to a core of its own; None: as many as there are cores. Not with an
-            executor.
-        executor: where groups of policies are trained, in view of the folder; it stays open. None: processes on this
-            machine.
-        progress: told how far it is.
-        checkpoint_s: seconds between checkpoints; what a kill may cost, never the result.
+        folder: folder for the policies, created if missing. None: train in this process and write nothing; if stopped,
+            training starts again. This also allows robots and mappings that are not registered.
+        workers: processes, each pinned to its own core; None: one per core. Not with an executor.
+        executor: executor for the groups of policies, which must see the folder; it stays open. None: processes on
+            this machine.
+        progress: updated during training.
+        checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
         sources: names of the recordings, for the manifest.
-        random_return: mean return of random actions, for the manifest: a line of the live page's learning curves.
-        callbacks: each called with every row of the learning curves as it comes; no bit of what is learned depends on
-            them.
+        random_return: mean return of random actions, for the manifest: a line in the live page's learning curves.
+        callbacks: functions called with every row of the learning curves as it is produced; no bit of what is learned
+            depends on them.
 
     Returns:
-        The policies by name, `p0` first. Those that were assessed have what they were at their best beside them, and in
-        the folder `best/`, and all assessments in `assessments.csv`.
+        The policies by name, `p0` first. Assessed policies carry their best version, which the folder has in `best/`,
+        with all assessments in `assessments.csv`.
 
     Raises:
-        InvalidArgument: if neurons are missing for a mapping or given without one, for readouts that are not as many as
-            the robot's commands, for fewer workers than one or any beside an executor, or as `expect_trainable` does.
-        Mismatch: if the folder holds another training or work of another kind, or another run is at work in it.
+        InvalidArgument: if neurons are missing for a mapping or given without one, if there are not as many readouts as
+            the robot has commands, for fewer than one worker or any with an executor, or as in `expect_trainable`.
+        Mismatch: if the folder holds another training or other work, or another run is active in it.
         InvalidFile: if a file cannot be read or written.
-        UnusableData: if what was learned is no longer a finite number; nothing of it is left in the folder.
-        AnimatError: if a process that trains ends before its time.
+        UnusableData: if what was learned is no longer finite; none of it is left in the folder.
+        AnimatError: if a training process ends unexpectedly.
     """
     expect_kind("training", training, Training, "a Training, such as animat.Training('cartpole', '9-thresholds')")
-    expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators, as animat.fit_timeline makes, or None")
+    expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators from animat.fit_timeline, or None")
     expect_kind("folder", folder, str | os.PathLike | None, "a path, or None")
     callbacks = expect_several(
-        "callbacks", callbacks or (), Callable, "a list of functions, each of a row of a learning curve"
+        "callbacks", callbacks or (), Callable, "a list of functions that take a row of a learning curve"
     )
     if (timeline is None) != (training.mapping is None):
         raise InvalidArgument(
@@ -104,7 +102,7 @@ def train(
     expect_trainable(training, is_saved=folder is not None)
     if timeline is not None:
         expect_fit(training.robot.name, training.robot.n_commands, len(timeline.readouts))
-    training = training.over(timeline)
+    training = training.with_duration_of(timeline)
     rows_of(training, timeline)
     on_cores = folder is None or executor is not None or isinstance(training.robot, HostRobot)
     gpu = None if on_cores else find_gpu()
@@ -112,9 +110,9 @@ def train(
     manifest = describe(training, timeline, sources, random_return, device=device)
     groups = groups_of(training, timeline, manifest, fewest=2)
     if folder is None:
-        return _in_memory(groups, _phase_of(groups, progress), callbacks)
+        return _train_in_memory(groups, _phase_of(groups, progress), callbacks)
     folder = Path(folder).absolute()
-    # Seen before it is touched: somebody else's folder stays as it is.
+    # Checked before the lock, so that another training's folder stays untouched.
     is_ours(folder, manifest)
     with exclusive_lock(folder):
         if not is_ours(folder, manifest):
@@ -122,8 +120,8 @@ def train(
         missing = [group for group in groups if not _is_trained(group, folder)]
         left = [
             Job(
-                in_words(group.members),
-                TrainGroup(group, checkpoint_s, tells_rows=bool(callbacks)),
+                as_range(group.members),
+                TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)),
                 cost_s=CHUNKS * len(group.members),
             )
             for group in missing
@@ -134,7 +132,7 @@ def train(
             try:
                 jobs.run(workers=workers, executor=executor, progress=curves, has_gpu=gpu is not None)
             except UnusableData:
-                # What the robot gave was no number: whoever corrects it begins anew.
+                # The robot returned numbers that are not finite: after its correction, training must start again.
                 shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
                 if not any(folder.glob("p*.safetensors")):
                     (folder / MANIFEST).unlink()
@@ -155,18 +153,18 @@ def train(
 
 @final
 @dataclass(frozen=True, eq=False)
-class TrainGroup(Trains):
-    """Train a group of policies, going on from its checkpoint.
+class TrainGroup(TrainingTask):
+    """Train a group of policies, resuming from its checkpoint.
 
     Attributes:
-        group: what is trained.
+        group: the group.
         checkpoint_s: seconds between checkpoints.
-        tells_rows: whether it writes the rows of the learning curves, for callbacks, as they come.
+        writes_rows: whether it writes the rows of the learning curves to a file for callbacks.
     """
 
     group: Group
     checkpoint_s: float
-    tells_rows: bool = False
+    writes_rows: bool = False
 
     @property
     def grows_with(self) -> dict[str, object]:
@@ -176,21 +174,21 @@ class TrainGroup(Trains):
     def training(self) -> Training:
         return self.group.training
 
-    def prepare(self, folder: Path) -> Work:
+    def prepare(self, folder: Path) -> TrainingWork:
         self.training.register()
         checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
-        add_part = CurveFile(folder, self.group.members[0]).add if self.tells_rows else None
-        return Work(self.group, folder, checkpoint, self.checkpoint_s, add_part)
+        add_part = CurveFile(folder, self.group.members[0]).add if self.writes_rows else None
+        return TrainingWork(self.group, folder, checkpoint, self.checkpoint_s, add_part)
 
 
 def _phase_of(groups: Sequence[Group], progress: Progress | None) -> Progress:
-    """The progress of training some groups, which counts the iterations of all their policies."""
+    """The progress of training groups, which counts the iterations of all their policies."""
     iterations = sum(group.training.iterations * len(group.members) for group in groups)
     return in_phase(progress, "training", iterations, "iterations")
 
 
-def in_words(members: Sequence[int]) -> str:
-    """Policies that follow each other, such as `p0 to p4`."""
+def as_range(members: Sequence[int]) -> str:
+    """Consecutive policies as text, such as `p0 to p4`."""
     first, last = members[0], members[-1]
     return f"p{first}" if first == last else f"p{first} to p{last}"
 
@@ -203,7 +201,9 @@ def _is_trained(group: Group, folder: Path) -> bool:
     return True
 
 
-def _in_memory(groups: Sequence[Group], progress: Progress, callbacks: Sequence[TrainingCallback]) -> dict[str, Policy]:
+def _train_in_memory(
+    groups: Sequence[Group], progress: Progress, callbacks: Sequence[TrainingCallback]
+) -> dict[str, Policy]:
     """Train the groups in this process, one after the other."""
     trained: dict[str, Policy] = {}
     curves = Curves(None, [group.members for group in groups], callbacks, progress)

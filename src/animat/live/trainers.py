@@ -13,7 +13,7 @@ from typing import Any, final
 
 from animat.errors import AnimatError
 from animat.execution.pinned import PinnedProcesses
-from animat.execution.task import Done, Task, carry_out, report, reported
+from animat.execution.task import Task, TaskResult, carry_out, report, reported
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
 from animat.training.group import Group, SideBySide, save_policies
@@ -114,7 +114,7 @@ class Trainers:
     def __init__(self, groups: Sequence[Group], exchange: Exchange, folder: Path) -> None:
         self._exchange, self._folder = exchange, folder
         self._groups = {group.members[0]: group for group in groups}
-        self._futures: dict[Future[Done], Group] = {}
+        self._futures: dict[Future[TaskResult], Group] = {}
         self._reports: dict[int, dict[str, Any]] = {}
 
     def __enter__(self) -> Trainers:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.task import UNFINISHED, Task
-from animat.execution.trains import train_alone
+from animat.execution.training_task import train_alone
 from animat.progress import EqualPhases, Progress
 from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.readouts import DEFAULT_READOUTS
@@ -168,7 +168,7 @@ class TrainPolicies(RobotTask):
             iterations=int(self.study.iterations_share * robot.paper_iterations),
             seed=self.seed_for("context"),
             shadowing=True,
-        ).over(timeline)
+        ).with_duration_of(timeline)
         checkpoint = folder / UNFINISHED / f"culture-{self.culture}" / f"{self.robot}.npz"
         members = tuple(range(training.policies))
         return train_alone(work_on(training, members, timeline, self.path(folder, POLICIES), checkpoint), progress)

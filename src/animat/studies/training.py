@@ -9,7 +9,7 @@ from typing import final
 from animat.coding.mapping import mapping_named
 from animat.devices import gpu_here
 from animat.execution.task import UNFINISHED
-from animat.execution.trains import Trains, Work, train_alone
+from animat.execution.training_task import TrainingTask, TrainingWork, train_alone
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.studies.places import TIMELINE, policies_folder
@@ -24,7 +24,7 @@ from animat.training.specification import Training
 
 @final
 @dataclass(frozen=True)
-class TrainGroup(StudyTask, Trains):
+class TrainGroup(StudyTask, TrainingTask):
     """Train some policies of an arm on a robot, resuming where a killed run stopped."""
 
     sizes = ("algorithm",)
@@ -37,7 +37,7 @@ class TrainGroup(StudyTask, Trains):
     def training(self) -> Training | None:
         return training_of(self.study, self.spec, self.arm) if self.arm.trained else None
 
-    def prepare(self, folder: Path) -> Work:
+    def prepare(self, folder: Path) -> TrainingWork:
         timeline = load_timeline(folder / TIMELINE) if self.arm.through_neurons else None
         training = training_of(self.study, self.spec, self.arm)
         checkpoint = folder / UNFINISHED / self.spec.name / self.arm.slug / f"p{self.members[0]}.npz"
@@ -45,16 +45,16 @@ class TrainGroup(StudyTask, Trains):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         work = self.prepare(folder)
-        return train_alone(work, progress) if self.arm.trained else work.leave(untrained_policies(work.group))
+        return train_alone(work, progress) if self.arm.trained else work.save(untrained_policies(work.group))
 
 
 def work_on(
     training: Training, members: tuple[int, ...], timeline: SimulatorTimeline | None, place: Path, checkpoint: Path
-) -> Work:
+) -> TrainingWork:
     """The work of training some policies, with a description for the policies' folder."""
     manifest = describe(training, timeline, device=gpu_here())
     group = Group(training, members, timeline, manifest["fingerprint"], provenance_of(manifest))
-    return Work(group, place, checkpoint, description=manifest)
+    return TrainingWork(group, place, checkpoint, description=manifest)
 
 
 def training_of(study: Study, spec: RobotSpec, arm: Arm) -> Training:

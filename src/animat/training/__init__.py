@@ -1,1 +1,1 @@
-"""Soft Actor-Critic, several policies at once on pinned workers, and the policies that come of it."""
+"""Soft Actor-Critic, for several policies at once on pinned workers, and the resulting policies."""

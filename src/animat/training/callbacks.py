@@ -1,4 +1,4 @@
-"""What follows a training while it goes on: a function that is called with the learning curve's rows as they come."""
+"""Callbacks that follow a training: functions called with each row of the learning curves as it is produced."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Protocol
 
 @dataclass(frozen=True)
 class CurveRow:
-    """A row of a policy's learning curve, as it will be in its file: one part of the training.
+    """A row of a policy's learning curve, as in the policy's file: one chunk of the training.
 
     Attributes:
-        policy: its name, such as `p0`.
-        iterations: done at the end of the part.
-        episodes: that ended in the part.
-        mean_return: of these; NaN for none.
-        entropy: of its actions at the end of the part, nats, over transitions drawn from its replay.
-        alpha: the weight of the entropy bonus then.
-        critic_loss: then, over the same transitions. These three are NaN where no file has them, as of policies that
-            were trained before they were kept.
+        policy: name of the policy, such as `p0`.
+        iterations: iterations done at the end of the chunk.
+        episodes: number of episodes that ended in the chunk.
+        mean_return: their mean return; NaN if none ended.
+        entropy: entropy of the actions at the end of the chunk, nats, over transitions drawn from the replay.
+        alpha: weight of the entropy bonus at that time.
+        critic_loss: critics' loss at that time, over the same transitions. These three are NaN for policies whose files
+            do not have them, as they were trained before the values were stored.
     """
 
     policy: str
@@ -31,12 +31,12 @@ class CurveRow:
 
 
 class TrainingCallback(Protocol):
-    """What `train` calls with each row, in the process that called it.
+    """A function that `train` calls with each row, in the process that called `train`.
 
-    The rows of a policy come in their order, each once a call of `train`, those from before it was gone on with too.
-    Nothing that a callback does changes what is learned. What it raises ends the training, as Ctrl-C does: called
-    again, it goes on.
+    The rows of a policy arrive in order, each once per call of `train`, including those from before a continuation.
+    Nothing that a callback does changes what is learned. An exception that it raises ends the training, as Ctrl-C does;
+    call `train` again to continue.
     """
 
     def __call__(self, row: CurveRow) -> None:
-        """Take in a row."""
+        """Process a row."""

@@ -1,4 +1,4 @@
-"""Where each policy of a group stands in its lessons, and the best of it so far, by assessments at chunks' borders."""
+"""The progress of a group's policies through the lessons, and each policy's best version, assessed after each chunk."""
 
 from __future__ import annotations
 
@@ -25,52 +25,52 @@ from animat.training.varied import Ranges, Varied, Varying, ranges_of, varying_i
 from animat.wrappers import EpisodeLimit
 
 ASSESSED = ("iterations", "minute", "lesson", "success", "mean_return")
-"""The columns of a policy's assessments: the minute is that of the simulators, lessons count from 1; NaN: not known."""
+"""The columns of a policy's assessments: the minute is that of the simulators, lessons count from 1; NaN: unknown."""
 
 
 def assess(
     environment: Varied[Any], episodes: int, actor: Network, simulator: NeuronSimulator | None, key: PRNGKeyArray
 ) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
-    """Run a policy's most probable actions on the configurations that `key` decides.
+    """Run a policy's most probable actions in the episodes that `key` determines.
 
     Args:
-        environment: what is varied, and between what.
-        episodes: how many (static).
+        environment: an environment with what varies in it, and the ranges.
+        episodes: number of episodes (static).
         actor: the policy's network.
-        simulator: the neurons; None without.
-        key: the same in each assessment of a training, so that policies and minutes compare.
+        simulator: the neurons; None for a policy without neurons.
+        key: the same in each assessment of a training, so that policies and minutes are comparable.
 
     Returns:
-        of each episode the return, and whether it succeeded.
+        The return of each episode, and whether it succeeded.
     """
     limited = EpisodeLimit(environment)
-    of_starts, of_iterations = jax.random.split(key)
-    started = jax.vmap(limited.reset)(jax.random.split(of_starts, episodes)).carried
-    none = jnp.zeros(episodes)
+    start_key, iteration_key = jax.random.split(key)
+    started = jax.vmap(limited.reset)(jax.random.split(start_key, episodes)).carried
+    zeros = jnp.zeros(episodes)
 
-    def iteration(at: tuple[Any, ...]) -> tuple[Any, ...]:
-        index, state, going, returns, succeeded = at
-        uniforms = jax.random.uniform(jax.random.fold_in(of_iterations, index), (episodes, limited.noise_size))
+    def iteration(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        index, state, running, returns, succeeded = carry
+        uniforms = jax.random.uniform(jax.random.fold_in(iteration_key, index), (episodes, limited.noise_size))
         action = likeliest_action(limited, actor, jax.vmap(limited.observe)(state) / limited.scales)
         after = jax.vmap(limited.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
-        ends = going & jnp.logical_or(*after.ended)
+        ends = running & jnp.logical_or(*after.ended)
         succeeded |= ends & jax.vmap(environment.succeeded)(after)
-        return index + 1, after.carried, going & ~ends, returns + jnp.where(going, after.reward, 0.0), succeeded
+        return index + 1, after.carried, running & ~ends, returns + jnp.where(running, after.reward, 0.0), succeeded
 
-    first = (jnp.int32(0), started, none == 0, none, none > 0)
-    *_, returns, succeeded = jax.lax.while_loop(lambda at: jnp.any(at[2]), iteration, first)
+    first = (jnp.int32(0), started, zeros == 0, zeros, zeros > 0)
+    *_, returns, succeeded = jax.lax.while_loop(lambda carry: jnp.any(carry[2]), iteration, first)
     return returns, succeeded
 
 
-class Standing(NamedTuple):
-    """How far the policies of a group are; of one shape from the start, as a checkpoint has it.
+class CourseState(NamedTuple):
+    """The progress of a group's policies. Its shapes are fixed from the start, as it is part of a checkpoint.
 
     Attributes:
-        lesson: of each policy, from 0.
-        table: their assessments, a row a chunk, NaN for those to come; columns as `ASSESSED`.
-        best: the network of each at its best assessment.
-        best_at: the row of that assessment.
-        score: the share of successes and the mean return of `best`, on the simulator in use.
+        lesson: each policy's lesson, counted from 0.
+        table: assessments, one row per chunk, NaN for those still to come; columns as `ASSESSED`.
+        best: each policy's network at its best assessment.
+        best_at: row of that assessment.
+        score: share of successes and mean return of `best`, on the simulator in use.
     """
 
     lesson: Int64[np.ndarray, " policies"]
@@ -81,10 +81,10 @@ class Standing(NamedTuple):
 
 
 def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tuple[int, int]]:
-    """The first and the last recording that each lesson's episodes draw: of those that shadowing would have used.
+    """The first and the last recording that each lesson's episodes draw from, among those that shadowing would use.
 
     Raises:
-        InvalidArgument: for a lesson that none is left for.
+        InvalidArgument: for a lesson without any recording.
     """
     stages = stages_of(training.lessons)
     if timeline is None or training.shadowing != "drawn":
@@ -96,9 +96,9 @@ def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tupl
         low, high = lesson.recordings_min or (-np.inf, np.inf)
         drawn = np.flatnonzero((timeline.start_min >= low) & (timeline.start_min <= min(high, until_min)))
         if not len(drawn):
-            told = ", ".join(f"{minute:g}" for minute in timeline.start_min if minute <= until_min)
+            known = ", ".join(f"{minute:g}" for minute in timeline.start_min if minute <= until_min)
             raise InvalidArgument(
-                f"lesson {number}: recordings_min: expected minutes with a recording ({told}), got [{low:g}, {high:g}]"
+                f"lesson {number}: recordings_min: expected minutes with a recording ({known}), got [{low:g}, {high:g}]"
             )
         rows.append((int(drawn[0]), int(drawn[-1])))
     return rows
@@ -108,7 +108,7 @@ def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tupl
 def programs_with_ranges(
     environment: Environment[Any], varying: Varying, algorithm: SAC, episodes: int
 ) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """`begin`, `train_chunk` and `assess` for several policies side by side, each with the ranges of its lesson."""
+    """`begin`, `train_chunk` and `assess` for several policies, each with the ranges of its lesson."""
 
     def varied(ranges: Ranges) -> Varied[Any]:
         return Varied(environment, varying, ranges)
@@ -130,13 +130,13 @@ def programs_with_ranges(
 
 
 class Course:
-    """The lessons of a group's policies while they are trained.
+    """The lessons of a group's policies during training.
 
     Args:
-        training: what is trained.
-        environment: what its policies act in.
+        training: the training.
+        environment: the environment that its policies act in.
         timeline: the culture's simulators; None without neurons.
-        policies: how many.
+        policies: number of policies.
     """
 
     def __init__(
@@ -145,23 +145,23 @@ class Course:
         self._training, self._timeline = training, timeline
         self._stages = stages_of(training.lessons)
         varying = varying_in(self._stages, recordings=training.shadowing == "drawn")
-        of_each = zip(self._stages, rows_of(training, timeline), strict=True)
-        ranges = [ranges_of(stage, varying, training.robot, rows) for stage, rows in of_each]
+        stages = zip(self._stages, rows_of(training, timeline), strict=True)
+        ranges = [ranges_of(stage, varying, training.robot, rows) for stage, rows in stages]
         self._ranges = jax.tree.map(lambda *ends: np.stack(ends), *ranges)
         self._programs = programs_with_ranges(environment, varying, training.algorithm, training.episodes_assessed)
-        none = np.zeros(policies, np.int64)
-        to_come = np.full((CHUNKS, policies, len(ASSESSED)), np.nan)
-        self.standing = Standing(none, to_come, None, none, np.full((policies, 2), -np.inf))
+        zeros = np.zeros(policies, np.int64)
+        table = np.full((CHUNKS, policies, len(ASSESSED)), np.nan)
+        self.state = CourseState(zeros, table, None, zeros, np.full((policies, 2), -np.inf))
 
     @property
     def ranges(self) -> Ranges:
-        """Each policy's, by its lesson."""
-        return jax.tree.map(lambda stages: stages[self.standing.lesson], self._ranges)  # type: ignore[no-any-return]
+        """The ranges of each policy's current lesson."""
+        return jax.tree.map(lambda stages: stages[self.state.lesson], self._ranges)  # type: ignore[no-any-return]
 
     def begin(self, keys: Any) -> Learner:
         """As `animat.training.sac.begin`, for all policies."""
         learners: Learner = self._programs[0](self.ranges, keys)
-        self.standing = self.standing._replace(best=jax.tree.map(np.zeros_like, jax.device_get(learners.deployed)))
+        self.state = self.state._replace(best=jax.tree.map(np.zeros_like, jax.device_get(learners.deployed)))
         return learners
 
     def train(self, learners: Learner, *arguments: Any) -> Any:
@@ -169,42 +169,42 @@ class Course:
         return self._programs[1](self.ranges, learners, *arguments)
 
     def assess(self, index: int, deployed: Network, simulator: NeuronSimulator | None) -> None:
-        """At the end of a chunk: assess the policies, keep those that are the best so far, and let them go on."""
-        training, (lesson, table, best, best_at, score) = self._training, self.standing
+        """At the end of a chunk: assess the policies, keep the best so far, and move them on to the next lesson."""
+        training, (lesson, table, best, best_at, score) = self._training, self.state
         if not training.episodes_assessed:
             return
         minute = self._minute(index)
         if index and self._row(minute) != self._row(self._minute(index - 1)):
-            # A culture is not as easy to control at all minutes: the best so far has to be the better one now.
-            score = self._assessed(best, simulator)
-        now = self._assessed(deployed, simulator)
+            # A culture is easier to control at some minutes than at others: compare on the simulator now in use.
+            score = self._scores(best, simulator)
+        new_score = self._scores(deployed, simulator)
         iterations = training.chunk(index)[1] * training.algorithm.environments
-        table[index] = [(iterations, minute, stage + 1, *each) for stage, each in zip(lesson, now, strict=True)]
+        table[index] = [(iterations, minute, stage + 1, *row) for stage, row in zip(lesson, new_score, strict=True)]
         policies = np.arange(len(lesson))
-        before = np.column_stack([table[best_at, policies, 2], np.nan_to_num(score)]).tolist()
-        today = np.column_stack([lesson + 1, np.nan_to_num(now)]).tolist()
-        # Of equals the last, as a policy learns on.
-        is_best = np.array([new >= old for new, old in zip(today, before, strict=True)]) | (index == 0)
+        old_rank = np.column_stack([table[best_at, policies, 2], np.nan_to_num(score)]).tolist()
+        new_rank = np.column_stack([lesson + 1, np.nan_to_num(new_score)]).tolist()
+        # Among equals the last, as a policy keeps learning.
+        is_best = np.array([new >= old for new, old in zip(new_rank, old_rank, strict=True)]) | (index == 0)
         for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(deployed), strict=True):
             kept[is_best] = np.asarray(new)[is_best]
-        on = [_passes(self._stages[stage], *each) for stage, each in zip(lesson, now, strict=True)]
-        self.standing = Standing(
-            np.minimum(lesson + on, len(self._stages) - 1),
+        passed = [_passes(self._stages[stage], *row) for stage, row in zip(lesson, new_score, strict=True)]
+        self.state = CourseState(
+            np.minimum(lesson + passed, len(self._stages) - 1),
             table,
             best,
             np.where(is_best, index, best_at),
-            np.where(is_best[:, None], now, score),
+            np.where(is_best[:, None], new_score, score),
         )
 
-    def _assessed(self, networks: Network, simulator: NeuronSimulator | None) -> Float64[np.ndarray, "policies 2"]:
-        """Each policy's share of successes, NaN for a robot that does not tell, and mean return."""
+    def _scores(self, networks: Network, simulator: NeuronSimulator | None) -> Float64[np.ndarray, "policies 2"]:
+        """Each policy's share of successes (NaN for a robot that does not report success) and mean return."""
         key = jax.random.fold_in(jax.random.key(self._training.seed), MOST_POLICIES)
         returns, succeeded = map(np.asarray, self._programs[2](self.ranges, networks, simulator, key))
         success = np.where(hasattr(self._training.robot, "succeeded"), succeeded.mean(axis=1), np.nan)
         return np.column_stack([success, returns.mean(axis=1, dtype=np.float64)])
 
     def _minute(self, index: int) -> float:
-        """Of the culture's clock at a chunk, whose newest simulator is in use; NaN without one of them."""
+        """The culture's clock at a chunk; NaN without neurons, or if each episode draws its simulator."""
         if self._timeline is None or self._training.shadowing == "drawn":
             return np.nan
         return float(self._timeline.start_min[0]) + self._training.minute(index)
@@ -213,10 +213,10 @@ class Course:
         return 0 if self._timeline is None or np.isnan(minute) else self._timeline.row_at(minute)
 
     def note(self) -> str:
-        """Which lesson each policy is at, for whoever waits; nothing where there is one only."""
+        """The lesson of each policy, for the progress line; empty if there is only one."""
         if len(self._stages) == 1:
             return ""
-        return f"lessons {' '.join(str(stage + 1) for stage in self.standing.lesson)} of {len(self._stages)}"
+        return f"lessons {' '.join(str(stage + 1) for stage in self.state.lesson)} of {len(self._stages)}"
 
 
 def _passes(lesson: Lesson, success: float, mean_return: float) -> bool:

@@ -1,9 +1,9 @@
-"""Exploration in time: random actions that are held for a while, as long as the policy alone does no better.
+"""Temporally extended exploration: random actions are held for a while, as long as the policy alone does no better.
 
-A policy that has learned nothing draws its actions one by one, and a body averages them: a pendulum that is to be swung
-up stays where it hangs, and where reward is rare none is ever seen. Held for a time, random actions get far (Dabney,
-Ostrovski and Barreto 2021, arXiv:2006.01782). In half of the environments random actions are held now and then, until
-the policy's own episodes pay more. On the paper's tasks they soon do.
+An untrained policy draws each action independently, and a body averages them: a pendulum to be swung up stays where it
+hangs, and a rare reward is never seen. Random actions that are held get far (Dabney, Ostrovski and Barreto 2021,
+arXiv:2006.01782). In half of the environments random actions are occasionally held, until the policy's own episodes
+return more. On the paper's tasks they soon do.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from jaxtyping import Array, Bool, Float
 
 from animat.environment import Environment
 
-BEGINNING = 0.2
-"""Chance of an iteration in which nothing is held that something is from then on."""
-LONGEST = 0.25
-"""Of an episode at most that an action is held; lengths of every order below it are equally likely."""
-REMEMBERED = 0.98
-"""Weight of an episode in its kind's mean return beside the one after it: about the last fifty count."""
+HOLD_PROBABILITY = 0.2
+"""Probability that an action begins to be held in an iteration in which none is held."""
+LONGEST_SHARE = 0.25
+"""Largest share of an episode for which an action is held; the logarithm of the duration is uniform below it."""
+DECAY = 0.98
+"""Weight of an episode in the mean return relative to the next one of its kind: about the last fifty count."""
 
 
 class Exploration(NamedTuple):
-    """What is held in each environment of a policy, and what has come of it.
+    """The held action of each environment of a policy, and the returns with and without held actions.
 
     Attributes:
-        action: the one that is held, or was last.
-        left: iterations that it is still held for; 0 or less for none.
-        was_held: whether any action of the episode under way was.
-        episodes: how many of late, of the policy alone and of those with actions held; the older, the less they count.
-        returns: the sums of their returns.
+        action: the action that is held, or was held last.
+        left: iterations for which it is still held; 0 or less: none is held.
+        was_held: whether any action of the current episode was held.
+        episodes: number of episodes of the policy alone and with held actions; older ones count less.
+        returns: sums of their returns, weighted likewise.
     """
 
     action: Float[Array, "environments drawn"]
@@ -42,14 +42,14 @@ class Exploration(NamedTuple):
 
 
 def n_uniforms(environment: Environment[Any]) -> int:
-    """How many uniforms one environment's exploration takes in an iteration."""
+    """Number of uniforms that one environment's exploration uses per iteration."""
     return 2 + environment.n_drawn
 
 
 def nothing_held(environments: int, n_drawn: int) -> Exploration:
-    """At the start of a training."""
-    none = jnp.zeros(environments)
-    return Exploration(jnp.zeros((environments, n_drawn)), none, none > 0, jnp.zeros(2), jnp.zeros(2))
+    """The exploration at the start of a training."""
+    zeros = jnp.zeros(environments)
+    return Exploration(jnp.zeros((environments, n_drawn)), zeros, zeros > 0, jnp.zeros(2), jnp.zeros(2))
 
 
 def explore(
@@ -58,20 +58,20 @@ def explore(
     action: Array,
     uniforms: Float[Array, "environments uniforms"],
 ) -> tuple[Array, Exploration]:
-    """The actions that are taken: the policy's, or one that is held.
+    """The actions to take: the policy's own, or a held one.
 
-    A held action is drawn uniformly. It is held for k iterations or more with a chance of 1 - ln k / ln L, for k up to
-    L, a quarter of the episode limit. Only the second half of the environments hold any; a single one never does.
+    A held action is drawn uniformly. It is held for k iterations or more with probability 1 - ln k / ln L, for k up to
+    L, a quarter of the episode limit. Only the second half of the environments hold actions; a single one never does.
 
     Args:
-        environment: what is acted in.
-        exploration: so far.
-        action: what the policy drew, as `animat.training.sac.draw_action` gives it.
-        uniforms: in [0, 1), `n_uniforms` for each environment.
+        environment: the environment that the policy acts in.
+        exploration: the exploration so far.
+        action: the actions that the policy drew (`animat.training.networks.draw_action`).
+        uniforms: uniforms in [0, 1), `n_uniforms` for each environment.
     """
     n, n_drawn = exploration.action.shape
-    longest = max(environment.robot.episode_limit * LONGEST, 1.0)
-    begins = (uniforms[:, 0] < BEGINNING) & (exploration.left <= 0) & is_worth_it(exploration)
+    longest = max(environment.robot.episode_limit * LONGEST_SHARE, 1.0)
+    begins = (uniforms[:, 0] < HOLD_PROBABILITY) & (exploration.left <= 0) & is_useful(exploration)
     begins &= jnp.arange(n) >= (n + 1) // 2
     if environment.n_actions is None:
         drawn = 2.0 * uniforms[:, 2:] - 1.0
@@ -84,13 +84,13 @@ def explore(
     return taken, exploration._replace(action=held, left=left - 1.0, was_held=exploration.was_held | is_held)
 
 
-def ended_episodes(
+def count_ended(
     exploration: Exploration, ended: Bool[Array, " environments"], returns: Float[Array, " environments"]
 ) -> Exploration:
-    """After an iteration: episodes that ended are counted by their kind, and nothing is held in the next ones."""
+    """After an iteration: count the episodes that ended, by their kind, and release what they held."""
     kinds = jnp.stack([~exploration.was_held, exploration.was_held]) & ended
     episodes = kinds.sum(axis=1, dtype=jnp.float32)
-    kept = REMEMBERED**episodes
+    kept = DECAY**episodes
     return exploration._replace(
         left=jnp.where(ended, 0.0, exploration.left),
         was_held=exploration.was_held & ~ended,
@@ -99,21 +99,21 @@ def ended_episodes(
     )
 
 
-def is_worth_it(exploration: Exploration) -> Bool[Array, ""]:
-    """Whether the policy alone does no better, as far as is known: of no episodes the mean is NaN.
+def is_useful(exploration: Exploration) -> Bool[Array, ""]:
+    """Whether holding actions is still useful: not once the policy alone is known to do better.
 
-    Never of a single environment, in which nothing is ever held.
+    Always False for a single environment, which never holds actions.
     """
     if len(exploration.left) < 2:
         return jnp.array(False)
     alone, with_held = exploration.returns / exploration.episodes
-    is_better: Bool[Array, ""] = alone > with_held
-    return ~is_better
+    # The mean over no episodes is NaN, and not better.
+    return ~(alone > with_held)  # type: ignore[no-any-return]
 
 
-def paid_for_entropy(exploration: Exploration) -> Float[Array, ""]:
-    """1 where the critics' target has entropy in it, 0 as long as nothing is known to pay.
+def entropy_factor(exploration: Exploration) -> Float[Array, ""]:
+    """The factor k of the entropy term in the critics' targets: 0 while held actions are useful, otherwise 1.
 
-    Values would be of entropy alone then, and hide the first rewards for long.
+    With 1 from the start, values would consist of entropy alone, and hide the first rewards for a long time.
     """
-    return jnp.where(is_worth_it(exploration), 0.0, 1.0)
+    return jnp.where(is_useful(exploration), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""A training's folder: whose it is, by a description of all that decides how its policies come out."""
+"""A training's folder, identified by a description of everything that determines its policies."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from animat.training.policy import Policy
 from animat.training.settings import LEARNER
 from animat.training.specification import CHUNKS, Training
 from animat.training.varied import expect_varied, varying_in
-from animat.writing import atomic_write
+from animat.writing import write_whole
 
 MANIFEST = "training.json"
 TABLE = "assessments.csv"
-_BESIDE = ("sources", "random_return")
-"""What a description tells beside what decides how policies come out."""
-_NOT_TOLD = ("fingerprint", *_BESIDE, "burst_thresholds")
-"""Where a folder is another training's: they differ with the responses."""
+_INFORMATIVE = ("sources", "random_return")
+"""Entries of a description that do not determine the policies."""
+_NOT_REPORTED = ("fingerprint", *_INFORMATIVE, "burst_thresholds")
+"""Entries not reported as the difference between two trainings: they differ with the responses."""
 
 
 def expect_trainable(training: Training, *, is_saved: bool) -> None:
-    """Refuse, before the first iteration, what cannot be trained, or could not be loaded once it is.
+    """Refuse, before the first iteration, what cannot be trained, or could not be loaded afterwards.
 
     Args:
-        training: what is to be trained.
-        is_saved: whether its policies go to files.
+        training: the training.
+        is_saved: whether its policies are written to files.
 
     Raises:
-        InvalidArgument: naming what of the robot or the mapping was expected, what came, and what can be done.
+        InvalidArgument: naming what was expected of the robot or the mapping, what came, and what to do.
     """
     check_robot(training.robot)
     _expect_whole_episodes(training)
@@ -65,13 +65,13 @@ def expect_trainable(training: Training, *, is_saved: bool) -> None:
 
 
 def _expect_whole_episodes(training: Training) -> None:
-    """Refuse a body whose episodes begin anew at each checkpoint, and never come to their end before."""
+    """Refuse a body whose episodes restart at each chunk, and are too long to end within one."""
     robot, rounds = training.robot, training.iterations // (CHUNKS * training.algorithm.environments)
     if isinstance(robot, HostRobot) and not robot.keeps_episodes and robot.episode_limit > rounds:
         needed = robot.episode_limit * CHUNKS * training.algorithm.environments
         raise InvalidArgument(
             f"iterations: expected {needed:,} or more, or an episode_limit of {rounds} or less, as the episodes of "
-            f"{robot.name} cannot be kept in a checkpoint and begin anew at each sixtieth of the training, got "
+            f"{robot.name} cannot be kept in a checkpoint and restart at each sixtieth of the training, got "
             f"{training.iterations:,} iterations and episodes of {robot.episode_limit:,}"
         )
 
@@ -84,13 +84,13 @@ def describe(
     *,
     device: str | None = None,
 ) -> dict[str, Any]:
-    """What decides how policies come out, as plain data, with a fingerprint over all of it; and what is told beside.
+    """Everything that determines the policies, as plain data, with its fingerprint; and what is informative only.
 
     Args:
-        training, timeline: what is trained, and on what.
-        sources: names of the recordings; told beside.
-        random_return: mean return of random actions; told beside, where it is known.
-        device: the kind of GPU that trains, which rounds otherwise; None for cores, which are not told.
+        training, timeline: the training, and the simulators it uses.
+        sources: names of the recordings; informative only.
+        random_return: mean return of random actions, if known; informative only.
+        device: the kind of GPU used, which affects rounding; None for cores, which are not recorded.
     """
     versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
     if isinstance(training.robot, HostRobot):
@@ -99,20 +99,20 @@ def describe(
         versions["device"] = device
     manifest: dict[str, Any] = {
         "training": training.to_dict(),
-        "simulators": None if timeline is None else _described(timeline),
+        "simulators": None if timeline is None else _describe_simulators(timeline),
         "versions": {**versions, "learner": f"revision {LEARNER}"},
     }
-    # By way of JSON, in which a tuple and a list are the same.
+    # Through JSON, in which a tuple and a list are the same.
     manifest = json.loads(json.dumps(manifest))
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
     fingerprint = fingerprint_of(manifest, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
-    # Names of files are told but do not decide: the same recordings in another place are the same.
-    beside = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
-    return manifest | beside | {"fingerprint": fingerprint}
+    # File names do not count: the same recordings in another place are the same.
+    informative = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
+    return manifest | informative | {"fingerprint": fingerprint}
 
 
-def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
-    """Where the simulators came from, as far as it is not the responses themselves."""
+def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
+    """How the simulators were made, without the responses themselves."""
     return {
         **timeline.fitted,
         "conditions": [condition.label for condition in timeline.conditions],
@@ -124,63 +124,60 @@ def _described(timeline: SimulatorTimeline) -> dict[str, Any]:
 
 
 def expect_folder_for(training: Training, folder: Path) -> None:
-    """Refuse a folder of another training by its settings, which are known before any recording is read.
+    """Refuse a folder of another training by its settings, before any recording is read.
 
     Raises:
         Mismatch, InvalidFile: as `train` does.
     """
-    if (found := _description_in(folder)) is not None:
+    if (stored := _stored_description(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
-        unknown = ("simulators", *_BESIDE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
-        if difference := _first_difference(found, describe(training, None), unknown):
+        unknown = ("simulators", *_INFORMATIVE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
+        if difference := _first_difference(stored, describe(training, None), unknown):
             raise folder_mismatch(folder, "training", difference)
 
 
 def is_finished(training: Training, folder: Path) -> bool:
-    """Whether a training's folder has all of its policies."""
+    """Whether a training's folder holds all of its policies."""
     return (folder / MANIFEST).exists() and all(
         (folder / f"p{i}.safetensors").exists() for i in range(training.policies)
     )
 
 
 def write_description(folder: Path, manifest: dict[str, Any]) -> Path:
-    """Make a folder this training's."""
-    with atomic_write(folder / MANIFEST) as beside:
-        beside.write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
-    return folder / MANIFEST
+    """Write a training's description into its folder."""
+    return write_whole(folder / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
 
 
 def write_assessments(folder: Path, policies: Mapping[str, Policy]) -> Path:
-    """Write the table of all assessments, and which of them was each policy's best."""
+    """Write the table of all assessments, with each policy's best one marked."""
     rows = ["policy," + ",".join(ASSESSED) + ",best"]
     for name, policy in policies.items():
         best = -1 if policy.best is None else len(policy.best.assessments) - 1
         for row, (iterations, minute, lesson, success, mean_return) in enumerate(policy.assessments.tolist()):
-            told = ("" if math.isnan(number) else f"{number:.6g}" for number in (minute, lesson, success, mean_return))
-            rows.append(",".join([name, f"{iterations:.0f}", *told, str(int(row == best))]))
-    with atomic_write(folder / TABLE) as beside:
-        beside.write_text("\n".join(rows) + "\n")
-    return folder / TABLE
+            numbers = (minute, lesson, success, mean_return)
+            cells = ("" if math.isnan(number) else f"{number:.6g}" for number in numbers)
+            rows.append(",".join([name, f"{iterations:.0f}", *cells, str(int(row == best))]))
+    return write_whole(folder / TABLE, "\n".join(rows) + "\n")
 
 
 def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
-    """Whether the training is already in the folder; not if it is free for it.
+    """Whether the folder already holds this training; False if it is free.
 
     Raises:
-        Mismatch: if it is another training's, holds policies that no description tells of, or work of another kind.
+        Mismatch: if it holds another training, policies without a description, or work of another kind.
         InvalidFile: if its description cannot be read, or it is a file.
     """
-    found = _description_in(folder)
-    if found is not None and found["fingerprint"] != manifest["fingerprint"]:
-        difference = _first_difference(found, manifest, _NOT_TOLD) or "other responses"
+    stored = _stored_description(folder)
+    if stored is not None and stored["fingerprint"] != manifest["fingerprint"]:
+        difference = _first_difference(stored, manifest, _NOT_REPORTED) or "other responses"
         raise folder_mismatch(folder, "training", difference)
-    return found is not None
+    return stored is not None
 
 
-def _description_in(folder: Path) -> dict[str, Any] | None:
-    """What a folder says it holds; None if it is free."""
-    if (found := read_description(folder / MANIFEST, "training")) is not None:
-        return found
+def _stored_description(folder: Path) -> dict[str, Any] | None:
+    """The training's description in a folder; None if the folder is free."""
+    if (stored := read_description(folder / MANIFEST, "training")) is not None:
+        return stored
     expect_no_file(folder, "the policies")
     if folder.is_dir() and any(not file.name.startswith(".") for file in folder.glob("*.safetensors")):
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
@@ -188,14 +185,16 @@ def _description_in(folder: Path) -> dict[str, Any] | None:
     return None
 
 
-def _first_difference(found: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
-    # What follows from the robot, such as the usual iterations, is not what differs.
-    there, now = map(_robot_in, (found, manifest))
-    return first_difference(there, now, "training.robot.name") or first_difference(found, manifest, ignoring=ignoring)
+def _first_difference(stored: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
+    # The robot first: differences that follow from it, such as the default iterations, are not the cause.
+    theirs, ours = _robot_in(stored), _robot_in(manifest)
+    return first_difference(theirs, ours, "training.robot.name") or first_difference(
+        stored, manifest, ignoring=ignoring
+    )
 
 
 def _robot_in(manifest: dict[str, Any]) -> Any:
-    """The robot's name; None where a description that somebody edited has none."""
+    """The robot's name; None if an edited description lacks it."""
     try:
         return manifest["training"]["robot"]["name"]
     except (KeyError, TypeError):
@@ -203,15 +202,15 @@ def _robot_in(manifest: dict[str, Any]) -> Any:
 
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
-    """What of a training's description its policies carry: all that decides how they come out."""
-    return {key: value for key, value in manifest.items() if key not in _BESIDE}
+    """The part of a training's description that is stored in its policies: everything that determines them."""
+    return {key: value for key, value in manifest.items() if key not in _INFORMATIVE}
 
 
 def groups_of(
     training: Training, timeline: SimulatorTimeline | None, manifest: dict[str, Any], *, fewest: int = 1
 ) -> list[Group]:
-    """All policies of a training in groups, `fewest` at least, that can go to other processes."""
-    # Where trials cost something and it is not known what, before any process begins.
+    """All policies of a training in at least `fewest` groups, which can be sent to other processes."""
+    # Refuses a cost of pulses without known electrodes before any process begins.
     training.environment_on(timeline)
     if timeline is not None:
         timeline = replace(timeline, simulators=jax.device_get(timeline.simulators))

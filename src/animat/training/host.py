@@ -1,7 +1,7 @@
-"""Soft Actor-Critic with bodies that are stepped on the host: acting and learning compiled, the bodies in between.
+"""Soft Actor-Critic for bodies that are stepped on the host: acting and learning are compiled, the bodies are not.
 
-A round is the one of `animat.training.sac`: every body does one iteration, which is remembered, then come the gradient
-steps. It is cut where the bodies move: one compiled program takes what they did, learns, and acts for the next round.
+A round is that of `animat.training.sac`: every body does one iteration, which is stored, then come the gradient steps.
+It is divided where the bodies move: one compiled program takes what they did, learns, and acts for the next round.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from animat.environment import Environment
 from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot, Snapshot
-from animat.training.exploration import ended_episodes
-from animat.training.replay import remember, transitions
+from animat.training.exploration import count_ended
+from animat.training.replay import pack_transitions, remember
 from animat.training.sac import (
     Finished,
     Learner,
     average,
     begin,
-    choose,
-    finished_alone,
+    choose_actions,
+    count_finished,
+    critic_state,
     learn,
-    state_of,
-    uniforms_of,
+    uniform_shapes,
 )
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit, TrialCosts, add_cost, net_return
 
 
-class Acted(NamedTuple):
-    """What a policy did in a round, in each of its environments.
+class Actions(NamedTuple):
+    """A policy's actions in a round, one per environment.
 
     Attributes:
-        action: as drawn.
-        command: that the body is to be moved by.
-        neurons: what they remember after their answer.
-        cost: of the trial; None where trials cost nothing.
+        action: the action drawn.
+        command: the command for the body.
+        neurons: history state of the neurons after their response.
+        cost: cost of the trial; None if trials are free.
     """
 
     action: Array
@@ -54,8 +54,8 @@ class Acted(NamedTuple):
     cost: Float[Array, " environments"] | None = None
 
 
-class Moved(NamedTuple):
-    """A step of the bodies (`animat.robots.host.StepResult`), and what is observed where ended episodes began anew."""
+class Movement(NamedTuple):
+    """The bodies' steps (`animat.robots.host.StepResult`); `begun` has the first observation of a new episode."""
 
     observation: Float[Array, "environments observations"]
     reward: Float[Array, " environments"]
@@ -66,30 +66,30 @@ class Moved(NamedTuple):
 
 def act(
     environment: Environment[Any], settings: SAC, learner: Learner, simulator: NeuronSimulator | None
-) -> tuple[Learner, Acted]:
+) -> tuple[Learner, Actions]:
     """The actions of a round; arguments as in `animat.training.sac.train_chunk`."""
     key, use = jax.random.split(learner.key)
-    acting, _ = uniforms_of(environment, settings)
-    return _acted(environment, learner._replace(key=key), simulator, jax.random.uniform(use, acting))
+    acting, _ = uniform_shapes(environment, settings)
+    return _act(environment, learner._replace(key=key), simulator, jax.random.uniform(use, acting))
 
 
 def learn_and_act(
     environment: Environment[Any],
     settings: SAC,
     learner: Learner,
-    acted: Acted,
-    moved: Moved,
+    acted: Actions,
+    moved: Movement,
     simulator: NeuronSimulator | None,
     index: Int[Array, ""],
-) -> tuple[Learner, Acted, Finished]:
-    """Remember and learn from a round, and act in the next one.
+) -> tuple[Learner, Actions, Finished]:
+    """Store a round, learn from the replay, and act in the next round.
 
     Args:
         environment, settings, learner, simulator: as in `animat.training.sac.train_chunk`.
         acted, moved: the round.
-        index: its number.
+        index: number of the round.
     """
-    acting, learning = uniforms_of(environment, settings)
+    acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
     key, use = jax.random.split(learner.key)
     uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
@@ -100,12 +100,12 @@ def learn_and_act(
     net = reward
     if acted.cost is not None:
         after, net = add_cost(after, acted.cost), reward - acted.cost
-    state, next_state = state_of(environment, before), state_of(environment, after)
-    # Critics see the time left: at the limit the return ends. Where a body cut an episode off before, it goes on.
+    state, next_state = critic_state(environment, before), critic_state(environment, after)
+    # Critics see the time left: the return ends at the limit. Where the body truncates an episode earlier, it does not.
     is_last = terminated | (after.iteration >= environment.robot.episode_limit)
-    rows = transitions(settings, state, next_state, acted.action, net, is_last)
+    rows = pack_transitions(settings, state, next_state, acted.action, net, is_last)
     returns = learner.returns + reward
-    finished = finished_alone(learner.exploration, ended, returns)
+    finished = count_finished(learner.exploration, ended, returns)
     learner = learner._replace(
         replay=remember(learner.replay, rows, written % settings.replay),
         episodes=after._replace(
@@ -115,22 +115,22 @@ def learn_and_act(
             info=jax.tree.map(lambda cost: jnp.where(ended, 0.0, cost), after.info),
         ),
         returns=jnp.where(ended, 0.0, returns),
-        exploration=ended_episodes(learner.exploration, ended, net_return(returns, after)),
+        exploration=count_ended(learner.exploration, ended, net_return(returns, after)),
         key=key,
     )
     available = jnp.minimum(written + settings.environments, settings.replay)
     learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
     learner = learner._replace(deployed=average(settings, learner.deployed, learner.trained.actor, index))
-    return *_acted(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
+    return *_act(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
 
 
-def _acted(
+def _act(
     environment: Environment[Any], learner: Learner, simulator: NeuronSimulator | None, uniforms: Array
-) -> tuple[Learner, Acted]:
+) -> tuple[Learner, Actions]:
     observation = jax.vmap(environment.observe)(learner.episodes) / environment.scales
-    action, exploration, noise = choose(environment, learner, observation, uniforms)
+    action, exploration, noise = choose_actions(environment, learner, observation, uniforms)
     responded = jax.vmap(environment.respond, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
-    return learner._replace(exploration=exploration), Acted(
+    return learner._replace(exploration=exploration), Actions(
         action,
         responded.command,
         jnp.broadcast_to(responded.answer.history, (len(observation), 2)),
@@ -140,7 +140,7 @@ def _acted(
 
 @lru_cache(maxsize=8)
 def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], ...]:
-    """`begin`, `act` and `learn_and_act` for several policies side by side."""
+    """`begin`, `act` and `learn_and_act` for several policies."""
     beginning = jax.vmap(partial(begin, EpisodeLimit(environment), algorithm))
     acting = jax.vmap(partial(act, environment, algorithm), in_axes=(0, None))
     learning = jax.vmap(partial(learn_and_act, environment, algorithm), in_axes=(0, 0, 0, None, None))
@@ -152,10 +152,10 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
 
 
 def programs_on_host(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """What `animat.training.group.programs` gives, for a robot that is stepped on the host.
+    """The counterpart of `animat.training.group.programs` for a robot that is stepped on the host.
 
-    In the learners between chunks, bodies are data (`Snapshot`), so that checkpoints are as those of other robots. The
-    bodies themselves are made when the first chunk is trained.
+    Between chunks the learners hold the bodies as data (`Snapshot`), so checkpoints are like those of other robots. The
+    bodies themselves are created when the first chunk is trained.
     """
     chunks = _Chunks(environment, algorithm)
     return chunks.begin, chunks
@@ -169,13 +169,12 @@ class _Chunks:
         self._bodies: Bodies | None = None
 
     def begin(self, keys: PRNGKeyArray) -> Learner:
-        """Policies that have learned nothing yet."""
-        members = len(keys)
-        # Of each policy its own, as its other draws are.
-        words = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
-        self._seeds = [(*word, body) for word in words for body in range(self._n)]
+        """Untrained policies."""
+        # Seeds follow from each policy's key, like its other draws.
+        policy_seeds = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
+        self._seeds = [(*seed, body) for seed in policy_seeds for body in range(self._n)]
         learners: Learner = self._beginning(keys)
-        none = Snapshot.initial(self._robot, members * self._n)
+        none = Snapshot.initial(self._robot, len(keys) * self._n)
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
     def __call__(
@@ -194,7 +193,7 @@ class _Chunks:
             ended = np.flatnonzero(stepped.ended)
             begun = bodies.begin(ended.tolist()) if len(ended) else stepped.observation
             reward = stepped.reward.astype(np.float32)
-            moved = Moved(stepped.observation, reward, stepped.terminated, stepped.ended, begun)  # type: ignore[arg-type]
+            moved = Movement(stepped.observation, reward, stepped.terminated, stepped.ended, begun)  # type: ignore[arg-type]
             learners, acted, of_round = self._learn_and_act(
                 learners, acted, self._by_policy(moved), simulator, np.int32(index)
             )
@@ -204,24 +203,24 @@ class _Chunks:
         return learners._replace(episodes=learners.episodes._replace(robot=standing)), finished
 
     def _standing(self, learners: Learner) -> tuple[Learner, Bodies]:
-        """The bodies where the learners have them, and learners that see of them the observation alone."""
+        """The bodies, placed as the learners have them, and learners that hold only their observations."""
         flat = Snapshot(
             *(np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
         )
-        is_there = True
+        is_restored = True
         if self._bodies is None or not flat.commands.shape[1]:
             self._bodies = Bodies(self._robot, self._seeds)
-            is_there = self._bodies.restore(flat)
+            is_restored = self._bodies.restore(flat)
         episodes = learners.episodes._replace(robot=self._by_policy(self._bodies.observation))
-        if is_there:
+        if is_restored:
             return learners._replace(episodes=episodes), self._bodies
-        anew = episodes._replace(
+        restarted = episodes._replace(
             iteration=jnp.zeros_like(episodes.iteration),
             info=jax.tree.map(jnp.zeros_like, episodes.info),
             neurons=jnp.broadcast_to(jnp.array(INITIAL_HISTORY, jnp.float32), episodes.neurons.shape),
         )
-        return learners._replace(episodes=anew, returns=jnp.zeros_like(learners.returns)), self._bodies
+        return learners._replace(episodes=restarted, returns=jnp.zeros_like(learners.returns)), self._bodies
 
     def _by_policy(self, flat: Any) -> Any:
-        """Arrays of all bodies as those of each policy."""
+        """Arrays of all bodies with a leading axis of policies."""
         return jax.tree.map(lambda part: np.reshape(part, (len(part) // self._n, self._n, *part.shape[1:])), flat)

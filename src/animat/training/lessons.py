@@ -1,4 +1,4 @@
-"""Lessons as data: from which ranges episodes are drawn, and when a policy goes on to the next one."""
+"""Lessons as data: the ranges from which episodes are drawn, and when a policy moves on to the next lesson."""
 
 from __future__ import annotations
 
@@ -20,32 +20,33 @@ from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 
 EPISODES = 20
-"""Of an assessment, where lessons ask for one and nobody says how many."""
+"""Default number of episodes in an assessment that lessons need."""
 MOST_EPISODES = 10_000
 MOST_VARIED = 10
-"""Parameters that vary at once at most: a robot is made of every combination of their ends, to see that it can be."""
+"""Largest number of parameters that vary: a robot is built for every combination of their ends as a check."""
 _MOST_BYTES = 2**20
 
 Range = tuple[Number, Number]
-"""The lowest and the highest value; each between them is equally likely."""
+"""The lowest and the highest value; every value in between is equally likely."""
 
 
 @record
 class Lesson:
-    """Ranges that each episode is drawn from anew; whatever is not named is as the robot and its start have it.
+    """Ranges from which each episode is drawn; whatever is not named keeps the value of the robot and its reset.
 
     Attributes:
         name: for people.
         parameters: ranges of the robot's parameters, by name.
         starts: ranges of numbers of the robot's state at the start of an episode, by name.
-        recordings_min: the recordings that an episode's simulator is drawn from, by the minutes on the culture's clock
-            between which they started, both included; None: all. Only where simulators are drawn at all
+        recordings_min: the recordings from which an episode's simulator is drawn, by the minutes on the culture's clock
+            between which they started, inclusive; None: all. Only if simulators are drawn at all
             (`Training.shadowing`).
-        success: the share of an assessment's episodes that must succeed for the policy to go on.
-        until_return: or the mean return that they must have, in the task's units.
+        success: the share of an assessment's episodes that must succeed for the policy to move on.
+        until_return: alternatively, the mean return that they must reach, in the task's units.
 
     Raises:
-        InvalidArgument: for a range whose low end is above the high one, or two ways to go on.
+        InvalidArgument: for a range whose low end is above its high end, or if both `success` and `until_return` are
+            set.
     """
 
     name: Annotated[str, Field(max_length=200)] = ""
@@ -65,11 +66,11 @@ class Lesson:
             if low > high:
                 raise InvalidArgument(f"{name}: expected the low end first, got [{low:g}, {high:g}]")
         if self.success is not None and self.until_return is not None:
-            raise InvalidArgument("until_return: expected one way to go on, got success too")
+            raise InvalidArgument("until_return: expected either success or until_return, got both")
 
     @property
-    def goes_on(self) -> bool:
-        """Whether it says when a policy goes on."""
+    def has_threshold(self) -> bool:
+        """Whether it says when a policy moves on."""
         return self.success is not None or self.until_return is not None
 
 
@@ -79,7 +80,7 @@ class _File:
 
 
 def read_lessons(path: str | os.PathLike[str]) -> tuple[Lesson, ...]:
-    """Lessons of a TOML file, a table `[[lessons]]` each, whose keys are the attributes of `Lesson`.
+    """Read lessons from a TOML file, one table `[[lessons]]` each, whose keys are the attributes of `Lesson`.
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -90,17 +91,17 @@ def read_lessons(path: str | os.PathLike[str]) -> tuple[Lesson, ...]:
     except InvalidArgument as error:
         raise InvalidFile(f"{path}: {error}") from error
     if not lessons:
-        raise InvalidFile(f"{path}: expected a table [[lessons]] for each, got none")
+        raise InvalidFile(f"{path}: expected a table [[lessons]] for each lesson, got none")
     return lessons
 
 
 def stages_of(lessons: Sequence[Lesson]) -> tuple[Lesson, ...]:
-    """The lessons in turn; after a last one that goes on comes the task itself."""
-    return (*lessons, *[Lesson(name="the task itself")] * (not lessons or lessons[-1].goes_on))
+    """The lessons in turn; a last one with a threshold is followed by the task itself."""
+    return (*lessons, *[Lesson(name="the task itself")] * (not lessons or lessons[-1].has_threshold))
 
 
 def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_recordings: bool) -> None:
-    """Refuse lessons that this robot cannot be taught.
+    """Refuse lessons that do not fit this robot.
 
     Raises:
         InvalidArgument: naming the lesson, what was expected and what came.
@@ -111,19 +112,19 @@ def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_record
         )
     for number, lesson in enumerate(lessons, 1):
         where = f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"
-        if number < len(lessons) and not lesson.goes_on:
+        if number < len(lessons) and not lesson.has_threshold:
             raise InvalidArgument(
-                f"{where}: expected success or until_return, which say when to go on to the next one, got neither"
+                f"{where}: expected success or until_return, which say when to move on to the next lesson, got neither"
             )
         if lesson.success is not None and not hasattr(robot, "succeeded"):
             raise InvalidArgument(
-                f"{where}: success: expected a robot that tells whether an episode succeeded, got {robot.name}, which "
-                "has no method `succeeded`; go on by until_return"
+                f"{where}: success: expected a robot that reports whether an episode succeeded, got {robot.name}, "
+                "which has no method `succeeded`; use until_return"
             )
         if lesson.recordings_min is not None and not draws_recordings:
             raise InvalidArgument(
-                f"{where}: recordings_min: expected only where shadowing is 'drawn' (--shadowing drawn), got it where "
-                "each episode has the same recordings"
+                f"{where}: recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it with all "
+                "episodes on the same recordings"
             )
         try:
             _expect_parameters(lesson, robot)
@@ -144,9 +145,9 @@ def _expect_parameters(lesson: Lesson, robot: Robot[Any]) -> None:
         if not isinstance(numbers[name], float):
             raise InvalidArgument(
                 f"parameters.{name}: expected a parameter that is a real number, got one that is {numbers[name]!r}: it "
-                "is part of the program that is compiled, and cannot vary"
+                "is part of the compiled program, and cannot vary"
             )
-    # What several of them mean together is wrong at a corner, if anywhere.
+    # If a combination is invalid anywhere, it is invalid at a corner.
     most = -math.inf
     for corner in itertools.product(*lesson.parameters.values()):
         values = dict(zip(lesson.parameters, corner, strict=True))
@@ -154,8 +155,8 @@ def _expect_parameters(lesson: Lesson, robot: Robot[Any]) -> None:
             varied: Robot[Any] = dataclasses.replace(body, **values)
             most = max(most, (varied if body is robot else robot).return_range[1])
         except InvalidArgument as error:
-            told = ", ".join(f"{name} = {value:g}" for name, value in values.items())
-            raise InvalidArgument(f"parameters: {robot.name} cannot have {told}: {error}") from error
+            corner_text = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+            raise InvalidArgument(f"parameters: {robot.name} cannot have {corner_text}: {error}") from error
     if lesson.until_return is not None and lesson.until_return > most:
         raise InvalidArgument(
             f"until_return: expected at most {most:g}, the highest return of {robot.name}, got {lesson.until_return:g}"

@@ -1,4 +1,4 @@
-"""How much memory training takes on a device, and how many groups of policies fit into it at once."""
+"""How much memory training needs on a device, and how many groups of policies fit into it at once."""
 
 from __future__ import annotations
 
@@ -13,21 +13,17 @@ import numpy as np
 from animat.training.group import Group, programs
 
 _SHARE = 0.9
-"""Of the device's memory, for what is compiled; programs and what is being cut into pieces take the rest."""
+"""Share of the device's memory for arrays; programs and copies in progress take the rest."""
 
 
 def device_memory_bytes() -> float:
-    """What JAX may have of the memory of the device that it uses; infinite for a processor, which does not tell."""
+    """The memory that JAX may use on its device; infinite for a CPU, which does not report it."""
     stats = jax.devices()[0].memory_stats()
     return math.inf if stats is None else float(stats["bytes_limit"])
 
 
 def bytes_at_once(groups: Sequence[Group]) -> int:
-    """What the program that trains some groups at once has in memory: policies, replays, simulators, its own work.
-
-    Args:
-        groups: that can be trained at once.
-    """
+    """The memory of the program that trains these groups at once: policies, replays, simulators, temporaries."""
     training, timeline = groups[0].training, groups[0].timeline
     environment = training.environment_on(timeline)
     own_simulators = len({group.fingerprint for group in groups}) > 1
@@ -44,9 +40,9 @@ def bytes_at_once(groups: Sequence[Group]) -> int:
 
 
 def parts_that_fit(groups: Sequence[Group]) -> list[list[int]]:
-    """Groups cut into parts, each of which fits into the device's memory; their numbers, parts as even as possible.
+    """Divide groups into parts, as even as possible, that each fit into the device's memory; returns their indices.
 
-    One group is a part of its own, however large.
+    A part has at least one group, however large.
     """
     available = _SHARE * device_memory_bytes()
     parts = 1 if math.isinf(available) else math.ceil(bytes_at_once(groups) / available)

@@ -25,12 +25,12 @@ Network = tuple[Layer, ...]
 
 
 def initial_networks(key: PRNGKeyArray, *shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> list[Network]:
-    """New networks of the given sizes (inputs, hidden, ..., outputs) and stacks (how many of them side by side).
+    """New networks with the given sizes (inputs, hidden, ..., outputs) and stacks (number of networks).
 
     Weights are uniform in +-1/sqrt(inputs), a hundred times smaller in the last layer: a policy starts undecided.
     """
     counts = [math.prod(stack) * sum(i * o for i, o in itertools.pairwise(sizes)) for sizes, stack in shapes]
-    # Drawn at once and cut up: a random generator in the program costs more to compile than to run.
+    # Drawn together and divided: a random generator in the program costs more to compile than to run.
     draws = jax.random.uniform(key, (sum(counts),), minval=-1.0, maxval=1.0)
     networks = []
     for sizes, stack in shapes:
@@ -45,7 +45,7 @@ def initial_networks(key: PRNGKeyArray, *shapes: tuple[tuple[int, ...], tuple[in
 
 
 def forward(network: Network, inputs: Float[Array, "*_ batch inputs"]) -> Float[Array, "*_ batch outputs"]:
-    """Hidden layers of rectified units, then a linear one."""
+    """Hidden layers of rectified units, then a linear layer."""
     hidden = inputs
     for layer in network[:-1]:
         hidden = jax.nn.relu(hidden @ layer.weight + layer.bias)
@@ -55,16 +55,16 @@ def forward(network: Network, inputs: Float[Array, "*_ batch inputs"]) -> Float[
 def squashed_normal(
     outputs: Float[Array, "batch means_and_deviations"], uniforms: Float[Array, "batch commands"]
 ) -> tuple[Float[Array, "batch commands"], Float[Array, " batch"]]:
-    """A continuous action a = tanh(z) and log p(a), the z of its commands independent normal numbers.
+    """A continuous action a = tanh(z) and log p(a), where the z of its commands are independent normal numbers.
 
-    Their means stand in the first half of the actor's outputs, their log deviations in the second.
+    The first half of the actor's outputs are their means, the second half their log standard deviations.
     """
     mean, log_std = jnp.split(outputs, 2, axis=-1)
     log_std = jnp.clip(log_std, -5.0, 2.0)
     standard = ndtri(jnp.clip(uniforms, 1e-6, 1.0 - 1e-6))
     z = mean + jnp.exp(log_std) * standard
     log_normal = -0.5 * standard**2 - log_std - 0.5 * math.log(2.0 * math.pi)
-    # log(1 - tanh(z)^2), in the form that does not lose its digits for large |z|
+    # log(1 - tanh(z)^2), in the form that keeps its precision for large |z|
     log_slope = 2.0 * (math.log(2.0) - z - jax.nn.softplus(-2.0 * z))
     return jnp.tanh(z), jnp.sum(log_normal - log_slope, axis=-1)
 
@@ -75,9 +75,9 @@ def draw_action(
     observation: Float[Array, "batch observations"],
     uniforms: Float[Array, "batch drawn"],
 ) -> Array:
-    """Draw an action from the policy for each scaled observation, by the inverse of its cumulative distribution.
+    """Draw an action from the policy for each scaled observation, by inverse transform sampling.
 
-    Of shape (batch,); of several continuous commands (batch, commands).
+    Returns shape (batch,), or (batch, commands) for several continuous commands.
     """
     outputs = forward(actor, observation)
     if environment.n_actions is None:
@@ -89,7 +89,7 @@ def draw_action(
 def likeliest_action(
     environment: Environment[Any], actor: Network, observation: Float[Array, "batch observations"]
 ) -> Array:
-    """The most probable action for each scaled observation; of continuous commands the middle of the distribution."""
+    """The most probable action for each scaled observation; for continuous commands tanh of the mean."""
     outputs = forward(actor, observation)
     if environment.n_actions is not None:
         return jnp.argmax(outputs, axis=-1)
@@ -99,5 +99,5 @@ def likeliest_action(
 def as_commands(
     environment: Environment[Any], actions: Float[Array, "batch commands"]
 ) -> Float[Array, "batch *commands"]:
-    """Continuous actions as the robot takes them: one command is a number."""
+    """Continuous actions as the robot takes them: a single command is a number."""
     return actions[:, 0] if environment.robot.n_commands == 1 else actions

@@ -1,4 +1,4 @@
-"""What training yields and a closed loop runs: a small network with everything that is needed to use it."""
+"""Policies, which training produces and closed loops run: a small network with everything needed to use it."""
 
 from __future__ import annotations
 
@@ -37,46 +37,46 @@ from animat.writing import write_whole
 
 FORMAT = "animat-policy-1"
 HIDDEN_ACTIVATION = "relu"
-"""Of both hidden layers, max(0, x); said in every file, for whoever runs the network without this package."""
+"""Activation of both hidden layers, max(0, x); stored in every file for users without this package."""
 CURVE = ("iterations", "episodes", "mean_return", "entropy", "alpha", "critic_loss")
-"""The columns of a learning curve, a row a part of the training: what was done at its end, the episodes that ended in
-it and their mean return, and how the learner stood then (`animat.training.diagnosis`); NaN: not known."""
+"""The columns of a learning curve, one row per chunk: iterations done at its end, the episodes that ended in it, their
+mean return, and the learner's diagnosis at its end (`animat.training.diagnosis`); NaN: unknown."""
 _LAYERS = 3
 _ARRAYS = ("scales", "learning_curve", *(f"layer{i}.{part}" for i in range(_LAYERS) for part in ("weight", "bias")))
 _MOST_BYTES = 2**28
 _LARGEST = 1e6
-"""Trained weights are of order one; with larger ones than this the outputs overflow, and the actions mean nothing."""
+"""Trained weights are of order one; with weights larger than this the outputs overflow."""
 
 Command = Annotated[Number, Field(ge=-1, le=1)]
 
 FITTED = ("kind", "bins", "range_hz", "by", "burst_threshold")
-"""What of `SimulatorTimeline.fitted` decides what a simulator of a recording is."""
+"""The entries of `SimulatorTimeline.fitted` that determine a recording's simulator."""
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained controller, run in numpy: nothing of JAX is imported to load it or to act.
+    """A trained controller that runs in numpy: neither loading it nor acting imports JAX.
 
-    The network has two hidden layers of rectified units; its outputs are the logits of the actions, or the means and
-    then the log deviations of continuous commands, which tanh takes into [-1, 1].
+    The network has two hidden layers of rectified units. Its outputs are the logits of the actions, or the means and
+    then the log standard deviations of continuous commands, which tanh maps to [-1, 1].
 
     Attributes:
-        weights, biases: of the three layers, shapes (inputs, outputs) and (outputs,).
-        scales: what observations are divided by first, shape (observations,).
-        robot: the robot it was trained on, with its goal where it had one.
+        weights, biases: those of the three layers, shapes (inputs, outputs) and (outputs,).
+        scales: divisors of the observations, shape (observations,).
+        robot: the robot it was trained on, with its goal if it had one.
         mapping: from a response to a command; None for a policy without neurons.
-        conditions: what the actions are, for a policy that acts through neurons.
-        commands: what the actions are, for one without neurons; None there means continuous commands.
+        conditions: the conditions that its actions select, for a policy that acts through neurons.
+        commands: the commands that its actions select, for a policy without neurons; None: continuous commands.
         window_ms: the response window, for a policy that acts through neurons.
-        presentation: how stimuli were presented when the neurons were recorded; None where it is not known.
+        presentation: how stimuli were presented when the neurons were recorded; None if unknown.
         provenance: what it was trained on and how, as plain data.
-        learning_curve: how it went, a row a chunk of training, columns as `CURVE`, shape (chunks, 6).
-        readouts: what is read of the neurons, by the electrodes of each command.
-        neural_observation: whether it sees what the neurons remember, too (`animat.wrappers.NeuralObservation`).
-        pulse_cost: what an electrode pulse cost while it was trained, in the units of the reward.
-        assessments: iterations, minute of the simulators, lesson (from 1), share of successes (NaN where the robot does
-            not tell) and mean return, a row each, shape (assessments, 5); none where it was not assessed.
-        best: what it was at its best assessment, from the training; its own file has none, and lies in `best/`.
+        learning_curve: one row per chunk of training, columns as `CURVE`, shape (chunks, 6).
+        readouts: the electrodes from which each command is read.
+        neural_observation: whether it also sees the neurons' history state (`animat.wrappers.NeuralObservation`).
+        pulse_cost: cost of an electrode pulse in training, in the units of the reward.
+        assessments: iterations, minute of the simulators, lesson (from 1), share of successes (NaN if the robot does
+            not report success) and mean return, one row each, shape (assessments, 5); empty if it was not assessed.
+        best: the policy at its best assessment, after training; stored in a separate file in `best/`.
     """
 
     __repr__ = briefly
@@ -115,14 +115,14 @@ class Policy:
             expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
 
     def _expect_network(self) -> None:
-        """Refuse weights of which no action can be made, or one that means nothing."""
+        """Refuse weights from which no meaningful action can be computed."""
         if not isinstance(self.neural_observation, bool):
             raise InvalidArgument(f"neural_observation: expected True or False, got {shown(self.neural_observation)}")
         if self.neural_observation and self.mapping is None:
-            raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
+            raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
-        seen = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation
-        widths = [seen, *(bias.size for bias in self.biases)]
+        n_inputs = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation
+        widths = [n_inputs, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) != 4 or widths[-1] != n_outputs or min(widths) < 1 or shapes != list(itertools.pairwise(widths)):
             raise InvalidArgument(
@@ -150,30 +150,30 @@ class Policy:
 
     @property
     def n_actions(self) -> int | None:
-        """How many discrete actions there are; None: continuous commands in [-1, 1], as many as the robot takes."""
+        """Number of discrete actions; None: continuous commands in [-1, 1], as many as the robot takes."""
         if self.mapping is not None:
             return len(self.conditions)
         return None if self.commands is None else len(self.commands)
 
     @property
     def percentiles(self) -> str:
-        """In training, the mapping's percentiles were `"moving"` with the simulator, or fixed by the `"first"` one."""
+        """Whether the mapping's percentiles were `"moving"` with the simulator or fixed by the `"first"` one."""
         return str(self._trained.get("percentiles", "moving"))
 
     @property
     def delivery(self) -> str:
-        """`"shuffled"` for the paper's control, trained with conditions drawn at random whatever it chose."""
+        """`"shuffled"` for the paper's control, trained with conditions drawn at random regardless of its choice."""
         return str(self._trained.get("delivery", "chosen"))
 
     @property
     def fitted(self) -> Dict[str, Any]:
-        """How the simulators it was trained on were made: `FITTED` of a timeline; empty where that is not known."""
-        told = self.provenance.get("simulators") or {}
-        return {name: told[name] for name in FITTED if name in told} if "kind" in told else {}
+        """How its simulators were made: the `FITTED` entries of a timeline; empty if unknown."""
+        simulators = self.provenance.get("simulators") or {}
+        return {name: simulators[name] for name in FITTED if name in simulators} if "kind" in simulators else {}
 
     @property
     def recorded_at_min(self) -> tuple[float, ...]:
-        """The recordings that those simulators were made of; none where that is not known."""
+        """The minutes of the recordings from which those simulators were made; empty if unknown."""
         return tuple((self.provenance.get("simulators") or {}).get("recorded_at_min", ()))
 
     @property
@@ -181,10 +181,7 @@ class Policy:
         return self.provenance.get("training") or {}
 
     def trained_until_min(self, first_min: float) -> float | None:
-        """The minute of the culture's clock that its training came to, where the first recording is of `first_min`.
-
-        None where that is not known.
-        """
+        """The minute of the culture's clock at which training ended if it began at `first_min`; None if unknown."""
         trained = self._trained
         if not trained:
             return None
@@ -193,13 +190,13 @@ class Policy:
         return first_min + float(trained["duration_min"] * (trained["chunks"] - 1) / trained["chunks"])
 
     def outputs(self, observation: Float[np.ndarray, " observations"]) -> Float32[np.ndarray, " outputs"]:
-        """The network's outputs for an observation in its own units.
+        """The network's outputs for an observation in physical units.
 
         Raises:
-            InvalidArgument: for an observation of another shape; NaN is not looked for.
+            InvalidArgument: for an observation of the wrong shape; NaN is not checked.
         """
         shape = self.scales.shape
-        # An array is looked at first: that takes a hundredth of a decision.
+        # An array's attribute comes first, as reading it takes only a hundredth of a decision's time.
         if getattr(observation, "shape", None) != shape and np.shape(observation) != shape:
             raise InvalidArgument(
                 f"observation: expected one of {self.robot.name}, shape {shape}, got shape {np.shape(observation)}"
@@ -220,33 +217,33 @@ class Policy:
     def act(
         self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator
     ) -> int | float | Float[np.ndarray, " commands"]:
-        """Draw an action from the policy: the index of a condition (or command), or what is commanded.
+        """Draw an action from the policy: the index of a condition (or command), or a continuous command.
 
         Args:
-            observation: in its own units, shape (observations,).
-            rng: source of the draw.
+            observation: the observation in physical units, shape (observations,).
+            rng: source of random numbers.
         """
         if self.n_actions is None:
             mean, log_std = np.split(self.outputs(observation).astype(np.float64), 2)
-            return _commanded(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
+            return _squash(mean + np.exp(np.clip(log_std, -5.0, 2.0)) * rng.standard_normal(len(mean)))
         below = np.cumsum(self.probabilities(observation))
         return min(int(np.searchsorted(below, rng.random() * below[-1], side="right")), len(below) - 1)
 
     def act_greedily(
         self, observation: Float[np.ndarray, " observations"]
     ) -> int | float | Float[np.ndarray, " commands"]:
-        """The most probable action (the middle of the distribution, for continuous commands)."""
+        """The most probable action; for continuous commands tanh of the mean."""
         outputs = self.outputs(observation)
         if self.n_actions is not None:
             return int(outputs.argmax())
-        return _commanded(outputs[: len(outputs) // 2].astype(np.float64))
+        return _squash(outputs[: len(outputs) // 2].astype(np.float64))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy as safetensors, with everything that is not an array as JSON in its metadata.
 
         Raises:
-            InvalidFile: if it cannot be written; what stood there before is unchanged.
-            InvalidArgument: for a robot or a mapping that is not registered: the file could not be loaded.
+            InvalidFile: if it cannot be written; an existing file is left unchanged.
+            InvalidArgument: for a robot or a mapping that is not registered, as the file could not be loaded.
         """
         from safetensors.numpy import save
 
@@ -259,7 +256,7 @@ class Policy:
             arrays["assessments"] = self.assessments
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"layer{i}.weight": weight, f"layer{i}.bias": bias}
-        described = {
+        description = {
             "format": FORMAT,
             "hidden_activation": HIDDEN_ACTIVATION,
             **body_and_goal(self.robot),
@@ -273,8 +270,8 @@ class Policy:
             "neural_observation": self.neural_observation,
             "pulse_cost": self.pulse_cost,
         }
-        # One entry only: safetensors writes several in random order, and a policy's file has one form.
-        metadata = {"animat": json.dumps(described, sort_keys=True)}
+        # A single entry, as safetensors writes several in random order, and equal policies must give equal files.
+        metadata = {"animat": json.dumps(description, sort_keys=True)}
         write_whole(Path(path), save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata))
 
     @staticmethod
@@ -282,61 +279,61 @@ class Policy:
         """Read a policy that `save` wrote.
 
         Raises:
-            InvalidFile: if the file is missing, damaged, or not a policy of this format; for one of a robot or
-                a mapping that is not registered here, with what to import.
+            InvalidFile: if the file is missing, damaged, or not a policy in this format; or if its robot or mapping is
+                not registered here, with what to import.
         """
         path = expect_plain_file(path, _MOST_BYTES)
-        arrays, described = _read(path)
+        arrays, description = _read(path)
         try:
             return Policy(
                 weights=tuple(arrays[f"layer{i}.weight"] for i in range(_LAYERS)),
                 biases=tuple(arrays[f"layer{i}.bias"] for i in range(_LAYERS)),
                 scales=arrays["scales"],
-                robot=robot_of(described),
-                mapping=None if described["mapping"] is None else mapping_from_data(described["mapping"]),
-                conditions=abbreviated(read_record(tuple[Condition, ...], described["conditions"], "conditions")),
-                commands=None if described["commands"] is None else tuple(described["commands"]),
-                window_ms=None if described["window_ms"] is None else tuple(described["window_ms"]),
-                presentation=None if described["presentation"] is None else Presentation(**described["presentation"]),
-                provenance=described["provenance"],
+                robot=robot_of(description),
+                mapping=None if description["mapping"] is None else mapping_from_data(description["mapping"]),
+                conditions=abbreviated(read_record(tuple[Condition, ...], description["conditions"], "conditions")),
+                commands=None if description["commands"] is None else tuple(description["commands"]),
+                window_ms=None if description["window_ms"] is None else tuple(description["window_ms"]),
+                presentation=None if (how := description["presentation"]) is None else Presentation(**how),
+                provenance=description["provenance"],
                 learning_curve=whole_curve(arrays["learning_curve"]),
                 assessments=arrays.get("assessments", np.zeros((0, 5))),
-                # Files of before read all channels as one, and their policies saw the robot alone.
-                readouts=Readouts.from_dict(described.get("readouts")),
-                neural_observation=described.get("neural_observation", False),
-                pulse_cost=described.get("pulse_cost", 0.0),
+                # Policies in older files read all channels as one, and saw only the robot.
+                readouts=Readouts.from_dict(description.get("readouts")),
+                neural_observation=description.get("neural_observation", False),
+                pulse_cost=description.get("pulse_cost", 0.0),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AnimatError) as error:
-            said = f"nothing called {error}" if isinstance(error, KeyError) else error
-            raise InvalidFile(f"{path}: expected a whole policy, got one that does not fit together: {said}") from error
+            reason = f"no entry {error}" if isinstance(error, KeyError) else error
+            raise InvalidFile(f"{path}: expected a complete, consistent policy, got a faulty one: {reason}") from error
 
 
 def whole_curve(curve: Float[np.ndarray, "*_ columns"]) -> Float[np.ndarray, "*_ columns"]:
-    """Learning curves with all columns: those that were kept before had the first three."""
+    """Learning curves with all columns; older files have the first three."""
     if curve.shape[-1:] != (3,):
         return curve
     return np.concatenate([curve, np.full((*curve.shape[:-1], len(CURVE) - 3), np.nan, curve.dtype)], axis=-1)
 
 
-def _commanded(z: Float64[np.ndarray, " commands"]) -> float | Float64[np.ndarray, " commands"]:
-    """Continuous commands; a single one as a number."""
+def _squash(z: Float64[np.ndarray, " commands"]) -> float | Float64[np.ndarray, " commands"]:
+    """Continuous commands, tanh(z); a single one as a number."""
     return math.tanh(z[0]) if len(z) == 1 else np.tanh(z)
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
-    """A policy's arrays and its description; nothing is read of a file with other arrays."""
+    """A policy's arrays and its description; a file with other arrays is refused unread."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             if "animat" not in metadata:
-                raise InvalidFile(f"{path}: expected a policy of animat, got a safetensors file of other origin")
+                raise InvalidFile(f"{path}: expected a policy of animat, got another kind of safetensors file")
             kinds = {name: file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
             if set(kinds) - {"assessments"} != set(_ARRAYS) or not set(kinds.values()) <= {"F32", "F64"}:
-                told = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
+                listing = ", ".join(f"{name} {kind}" for name, kind in kinds.items())
                 raise InvalidFile(
-                    f"{path}: expected a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64, got {told[:400]}"
+                    f"{path}: expected a policy's arrays ({', '.join(_ARRAYS)}) of F32 or F64, got {listing[:400]}"
                 )
             arrays = {name: file.get_tensor(name) for name in kinds}
     except (SafetensorError, OSError, ValueError) as error:
@@ -344,25 +341,25 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
             f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one: {error}"
         ) from error
     try:
-        described = json.loads(metadata["animat"])
+        description = json.loads(metadata["animat"])
     except (ValueError, RecursionError) as error:
         raise InvalidFile(f"{path}: metadata: expected JSON, got something else ({error})") from error
-    found = described.get("format") if isinstance(described, dict) else described
-    if found != FORMAT:
-        raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {shown(found)}")
-    # Files written before it was said have none, and are of this one.
-    activation = described.get("hidden_activation", HIDDEN_ACTIVATION)
+    file_format = description.get("format") if isinstance(description, dict) else description
+    if file_format != FORMAT:
+        raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {shown(file_format)}")
+    # Older files lack this entry, and use this activation.
+    activation = description.get("hidden_activation", HIDDEN_ACTIVATION)
     if activation != HIDDEN_ACTIVATION:
         raise InvalidFile(f"{path}: expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
-    return arrays, described
+    return arrays, description
 
 
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
-    """The first of several policies, which stands for all.
+    """The first of several policies, which represents all of them.
 
     Raises:
-        InvalidArgument: for none.
-        Mismatch: if they differ in one of the attributes, or in what they see, with the advice.
+        InvalidArgument: if there are none.
+        Mismatch: if they differ in one of the attributes or in what they observe; ends with the advice.
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
@@ -370,12 +367,12 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
     for name, policy in policies.items():
         for attribute in (*attributes, "neural_observation"):
             if getattr(policy, attribute) != getattr(first, attribute):
-                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got another; {advice}")
+                raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got a different one; {advice}")
     return first
 
 
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Read one policy file, or all of a folder, by name, in the order of their numbers (p2 before p10).
+    """Read one policy file, or all in a folder, by name, in the order of their numbers (p2 before p10).
 
     Raises:
         InvalidFile: if there is none, or one cannot be read.
@@ -385,7 +382,7 @@ def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
         if is_absent(path):
             raise InvalidFile(f"{path}: expected a policy file or a folder of them, got no such file; train them first")
         return {path.stem: Policy.load(path)}
-    # Hidden files are unfinished ones: a process was killed while it wrote them.
+    # Hidden files are unfinished: a process was killed while writing them.
     whole = [file for file in path.glob("*.safetensors") if not file.name.startswith(".")]
     files = sorted(whole, key=lambda file: (len(file.name), file.name))
     if not files:

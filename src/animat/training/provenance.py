@@ -1,6 +1,6 @@
-"""What a policy's provenance may say, where anything reads it: how it was trained, and on which simulators.
+"""The entries of a policy's provenance that code reads: how it was trained, and on which simulators.
 
-The rest of it is for people and is kept as it is. JAX is not imported here: policies are loaded without it.
+The other entries are for people and are kept unchanged. JAX is not imported here: policies are loaded without it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from animat.records import Flag, Number, Positive, Share, Whole, read_record
 Count = Annotated[Whole, Field(ge=1, le=10**9)]
 
 
-class Trained(TypedDict, total=False):
-    """How it was trained; what is left out is not known."""
+class TrainingProvenance(TypedDict, total=False):
+    """How the policy was trained; missing entries are unknown."""
 
     shadowing: Flag | Literal["drawn"]
     duration_min: Positive | None
@@ -26,8 +26,8 @@ class Trained(TypedDict, total=False):
     delivery: Literal["chosen", "shuffled"]
 
 
-class Simulated(TypedDict, total=False):
-    """The simulators that it was trained on; what is left out is not known."""
+class SimulatorProvenance(TypedDict, total=False):
+    """The simulators it was trained on; missing entries are unknown."""
 
     kind: Literal["histogram", "empirical", "memory"]
     bins: Count | None
@@ -38,19 +38,19 @@ class Simulated(TypedDict, total=False):
 
 
 class Provenance(TypedDict, total=False):
-    """All that is read of a provenance."""
+    """The entries of a provenance that are read."""
 
-    training: Trained | None
-    simulators: Simulated | None
+    training: TrainingProvenance | None
+    simulators: SimulatorProvenance | None
 
 
 def expect_provenance(provenance: Any) -> None:
-    """Refuse a provenance in which something that is read cannot be.
+    """Refuse a provenance with an invalid entry among those that are read.
 
     Raises:
-        InvalidArgument: naming it, what was expected and what came.
+        InvalidArgument: naming the entry, what was expected and what came.
     """
     trained = read_record(Provenance, provenance, "provenance").get("training") or {}
-    # From when on a simulator was the last one in training takes both.
+    # `Policy.trained_until_min` needs both.
     if trained.get("duration_min") is not None and "chunks" not in trained:
-        raise InvalidArgument("provenance.training: expected chunks beside duration_min, got none")
+        raise InvalidArgument("provenance.training: expected chunks with duration_min, got none")

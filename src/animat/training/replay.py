@@ -1,4 +1,4 @@
-"""The replay of a policy: transitions that it remembers, a packed row each, the oldest forgotten first."""
+"""The replay of a policy: stored transitions, one packed row each, the oldest overwritten first."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from animat.training.settings import SAC
 
 
 class Batch(NamedTuple):
-    """Transitions; observations and rewards are scaled, actions and endings are floats.
+    """A batch of transitions; observations and rewards are scaled, actions and `ended` are floats.
 
     The last number of a state is the time left, from 1 at the start of an episode to -1 at its limit; the actor sees
-    the others, `observation`.
+    only the other numbers, `observation`.
     """
 
     state: Float[Array, "batch state"]
@@ -37,7 +37,7 @@ class Batch(NamedTuple):
         return self.next_state[:, :-1]
 
 
-def transitions(
+def pack_transitions(
     settings: SAC,
     state: Float[Array, "environments state"],
     next_state: Float[Array, "environments state"],
@@ -45,7 +45,7 @@ def transitions(
     reward: Float[Array, " environments"],
     ended: Bool[Array, " environments"],
 ) -> Float[Array, "environments row"]:
-    """Rows of the replay: what `Batch` is unpacked from."""
+    """Rows of the replay, from which `draw_batch` unpacks a `Batch`."""
     of_action = action.reshape(len(state), -1).astype(jnp.float32)
     row = jnp.stack([settings.reward_scale * reward, ended], axis=1, dtype=jnp.float32)
     return jnp.concatenate([state, next_state, of_action, row], axis=1)
@@ -57,27 +57,27 @@ def remember(
     rows: Float[Array, "*policies environments row"],
     at: Int[Array, ""],
 ) -> Float[Array, "*policies transitions row"]:
-    """A replay with rows in it from row `at` on, which is the same for all policies that are trained side by side.
+    """Write rows into a replay from row `at` on, which is the same for all policies that are trained side by side.
 
-    `jax.vmap` by itself would scatter them, for which XLA lays out a GPU's replays anew, all of them, in each round.
+    `jax.vmap` by itself would scatter them, for which XLA rewrites all replays on a GPU in each round.
     """
     return jax.lax.dynamic_update_slice(replay, rows, (*[jnp.int32(0)] * (replay.ndim - 2), at, jnp.int32(0)))
 
 
 @remember.def_vmap
-def _remember_each(size: int, is_batched: Sequence[bool], *given: Array) -> tuple[Array, bool]:
+def _remember_each(size: int, is_batched: Sequence[bool], *arguments: Array) -> tuple[Array, bool]:
     if tuple(is_batched) != (True, True, False):
-        raise ValueError("remember: expected a replay and rows of each policy, and one place for all")
-    return remember(*given), True
+        raise ValueError("remember: expected a replay and rows of each policy, and one position for all")
+    return remember(*arguments), True
 
 
-def batch_of(
+def draw_batch(
     environment: Environment[Any],
     replay: Float[Array, "transitions row"],
     available: Int[Array, ""],
     uniforms: Float[Array, " batch"],
 ) -> Batch:
-    """Transitions drawn from the first `available` ones of a replay."""
+    """Draw transitions from the first `available` ones of a replay."""
     n, n_drawn = len(environment.observation_spec) + 1, environment.n_drawn
     rows = replay[(uniforms * available).astype(jnp.int32)]
     action = rows[:, 2 * n : 2 * n + n_drawn] if environment.n_actions is None else rows[:, 2 * n]

@@ -1,17 +1,17 @@
-"""Soft Actor-Critic, whole: networks, replay, losses, and the loop of acting and learning, as one jittable chunk.
+"""The whole of Soft Actor-Critic: networks, replay, losses, and the loop of acting and learning, as one jittable chunk.
 
 Discrete actions after Christodoulou (2019, arXiv:1910.07207), continuous ones after Haarnoja et al. (2018,
-arXiv:1812.05905), with two critics, target critics that follow slowly, and an entropy bonus whose weight alpha is
-learned so that the policy keeps a wanted entropy.
+arXiv:1812.05905), with two critics, slowly moving target critics, and an entropy bonus whose weight alpha is learned so
+that the policy holds a target entropy.
 
-An episode is judged by its whole return up to a fixed length, and what pays depends on how much of it is left: near its
-end a cart may roll where it would be lost later. So the critics see the time left and the return ends with the episode
-(Pardo et al. 2018, arXiv:1712.00378); the actor, which is what is deployed, does not see it, and learns what is best on
-average over the times at which a state comes up (critics that see more than the actor: Pinto et al. 2018,
+An episode is judged by its whole return up to a fixed length, and the best action depends on how much of it is left:
+near the end a cart may roll to where it would be lost later. The critics therefore see the time left, and the return
+ends with the episode (Pardo et al. 2018, arXiv:1712.00378). The actor, which is deployed, does not see it, and learns
+what is best on average over the times at which a state occurs (critics that see more than the actor: Pinto et al. 2018,
 arXiv:1710.06542).
 
-Made for many small policies: everything of one policy is one pytree (`Learner`), so `jax.vmap` trains several side by
-side; a transition is one packed row; the random numbers of an iteration are one block.
+Designed for many small policies: one policy is one pytree (`Learner`), so `jax.vmap` trains several side by side; a
+transition is one packed row; the random numbers of a round are one block.
 """
 
 from __future__ import annotations
@@ -27,15 +27,22 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Robot
-from animat.training.exploration import Exploration, ended_episodes, explore, n_uniforms, nothing_held, paid_for_entropy
+from animat.training.exploration import (
+    Exploration,
+    count_ended,
+    entropy_factor,
+    explore,
+    n_uniforms,
+    nothing_held,
+)
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
-from animat.training.replay import Batch, batch_of, remember, transitions
+from animat.training.replay import Batch, draw_batch, pack_transitions, remember
 from animat.training.settings import SAC
 from animat.wrappers import EpisodeLimit, net_return, net_reward
 
 
-class Trained(NamedTuple):
-    """What gradients change: the actor, two critics stacked, and the entropy bonus's weight."""
+class Parameters(NamedTuple):
+    """The trained parameters: the actor, two stacked critics, and the log of the entropy bonus's weight."""
 
     actor: Network
     critics: Network
@@ -43,9 +50,9 @@ class Trained(NamedTuple):
 
 
 class Learner(NamedTuple):
-    """One policy while it is trained: everything that the next iteration depends on, and the actor to be deployed."""
+    """One policy during training: everything that the next iteration depends on, and the actor to be deployed."""
 
-    trained: Trained
+    trained: Parameters
     deployed: Network
     targets: Network
     optimiser: Any
@@ -57,10 +64,10 @@ class Learner(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """The policy's episodes that ended in a chunk of training: how many, and the sum of their returns, in task's units.
+    """The number of the policy's episodes that ended in a chunk, and the sum of their returns, in the task's units.
 
-    What trials cost (`animat.wrappers.TrialCosts`) is learned from, and not taken off here.
-    Those in which actions were held (`animat.training.exploration`) are not among them.
+    The costs of trials (`animat.wrappers.TrialCosts`) are not subtracted. Episodes in which actions were held
+    (`animat.training.exploration`) are excluded.
     """
 
     episodes: Float[Array, ""]
@@ -71,18 +78,18 @@ class Finished(NamedTuple):
 
 
 def discrete_losses(
-    trained: Trained, targets: Network, batch: Batch, settings: SAC, paid: Float[Array, ""] | float = 1.0
+    trained: Parameters, targets: Network, batch: Batch, settings: SAC, paid: Float[Array, ""] | float = 1.0
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The losses of critics, actor and alpha; each has a gradient for its own parameters only.
+    """The losses of critics, actor and alpha; each has gradients only with respect to its own parameters.
 
-    With Q the smaller of the two critics (of the two target critics where it says Q_target), d for ended, s a state
-    with its time left and o the observation in it:
+    With Q the smaller of the two critics (Q_target: of the two target critics), d for ended, s a state including the
+    time left and o the observation in it:
 
     critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) sum_a' pi(a'|o') (Q_target(s', a') - k alpha log pi(a'|o')))^2/2
     actor:   mean sum_a pi(a|o) (alpha log pi(a|o) - Q(s, a))
-    alpha:   mean log alpha (H(pi(.|o)) - H_wanted)
+    alpha:   mean log alpha (H(pi(.|o)) - H_target)
 
-    with k = `paid`: 1, or 0 while entropy is not paid for (`learn`).
+    with k = `paid`: 0 while held actions are useful, else 1 (`animat.training.exploration.entropy_factor`).
     """
     fixed = jax.lax.stop_gradient
     alpha = jnp.exp(fixed(trained.log_alpha))
@@ -105,7 +112,7 @@ def discrete_losses(
 
 
 def continuous_losses(
-    trained: Trained,
+    trained: Parameters,
     targets: Network,
     batch: Batch,
     uniforms: Float[Array, "2 batch commands"],
@@ -116,7 +123,7 @@ def continuous_losses(
 
     critics: sum_i mean (Q_i(s, a) - r - gamma (1 - d) (Q_target(s', a') - k alpha log pi(a'|o')))^2 / 2
     actor:   mean alpha log pi(a_new|o) - Q(s, a_new)
-    alpha:   mean log alpha (-log pi(a_new|o) - H_wanted)
+    alpha:   mean log alpha (-log pi(a_new|o) - H_target)
     """
     fixed = jax.lax.stop_gradient
     alpha = jnp.exp(fixed(trained.log_alpha))
@@ -142,7 +149,7 @@ def continuous_losses(
 
 
 def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> Learner:
-    """A new policy that has learned nothing yet; every random draw of its training follows from `key`."""
+    """A new, untrained policy; every random draw of its training follows from `key`."""
     weight_key, reset_key, key = jax.random.split(key, 3)
     n, n_actions, hidden = len(environment.observation_spec), environment.n_actions, settings.hidden
     n_drawn = environment.n_drawn
@@ -150,7 +157,7 @@ def begin(environment: EpisodeLimit[Any], settings: SAC, key: PRNGKeyArray) -> L
     actor, critics = initial_networks(
         weight_key, ((n, hidden, hidden, outputs), ()), ((inputs, hidden, hidden, values), (2,))
     )
-    trained = Trained(actor, critics, jnp.float32(math.log(settings.initial_alpha)))
+    trained = Parameters(actor, critics, jnp.float32(math.log(settings.initial_alpha)))
     return Learner(
         trained=trained,
         deployed=actor,
@@ -175,18 +182,17 @@ def train_chunk(
     """Act and learn for some rounds with one simulator; in a round every environment does one iteration.
 
     Args:
-        environment: what the policy acts in (static).
-        settings: of the algorithm (static).
+        environment: the environment that the policy acts in (static).
+        settings: settings of the algorithm (static).
         learner: the policy under training.
-        simulator: the neurons' answers during this chunk; None without neurons.
-        first_round, last_round: the chunk is the rounds from the first up to, not including, the last; the same for
-            all policies that are trained side by side.
+        simulator: the simulator of the neurons during this chunk; None without neurons.
+        first_round, last_round: the rounds of the chunk, from the first up to but excluding the last; the same for all
+            policies that are trained side by side.
 
     Returns:
         The learner after the chunk, and the episodes that ended in it.
     """
-    # The uniforms that a round acts with and learns with: one block, drawn at once.
-    acting, learning = uniforms_of(environment, settings)
+    acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
 
     def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
@@ -207,8 +213,8 @@ def train_chunk(
     return trained
 
 
-def uniforms_of(environment: Environment[Any], settings: SAC) -> tuple[tuple[int, int], tuple[int, int, int]]:
-    """The shapes of the uniforms that a round acts with, and learns with."""
+def uniform_shapes(environment: Environment[Any], settings: SAC) -> tuple[tuple[int, int], tuple[int, int, int]]:
+    """The shapes of a round's uniforms for acting and for learning, which are drawn as one block."""
     blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
     acting = (settings.environments, environment.n_drawn + n_uniforms(environment) + environment.noise_size)
     return acting, (settings.gradient_steps, blocks, settings.batch)
@@ -223,14 +229,14 @@ def _act(
     uniforms: Float[Array, "environments noise"],
     reset_key: PRNGKeyArray,
 ) -> tuple[Learner, Finished]:
-    """One step of every environment, remembered in the replay; ended episodes start anew."""
-    state = state_of(environment, learner.episodes)
-    action, exploration, noise = choose(environment, learner, state[:, :-1], uniforms)
+    """One iteration of every environment, stored in the replay; ended episodes restart."""
+    state = critic_state(environment, learner.episodes)
+    action, exploration, noise = choose_actions(environment, learner, state[:, :-1], uniforms)
     after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
     ended = jnp.logical_or(*after.ended)
     reward = net_reward(learner.episodes, after)
     reward = shaped(environment.robot, settings, learner.episodes.robot, after.robot, reward, ended)
-    rows = transitions(settings, state, state_of(environment, after), action, reward, ended)
+    rows = pack_transitions(settings, state, critic_state(environment, after), action, reward, ended)
 
     returns = learner.returns + after.reward
     started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
@@ -238,9 +244,9 @@ def _act(
         replay=remember(learner.replay, rows, written % settings.replay),
         episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried),
         returns=jnp.where(ended, 0.0, returns),
-        exploration=ended_episodes(exploration, ended, net_return(returns, after)),
+        exploration=count_ended(exploration, ended, net_return(returns, after)),
     )
-    return learner, finished_alone(exploration, ended, returns)
+    return learner, count_finished(exploration, ended, returns)
 
 
 def shaped(
@@ -251,15 +257,15 @@ def shaped(
     reward: Float[Array, " environments"],
     ended: Bool[Array, " environments"],
 ) -> Float[Array, " environments"]:
-    """Rewards as they are learned from, where the robot has a `potential`; the best policy is that of the rewards.
+    """Shaped rewards for learning, if the robot has a `potential`; they leave the optimal policy unchanged.
 
         r + gamma (1 - d) potential(s') - potential(s)
 
-    with d for ended, in either way, as the losses have it. Along any episode the discounted terms add up to
-    -potential(s_0), whatever is done (Ng, Harada & Russell 1999). No return that is reported has them.
+    with d for ended (terminated or truncated), as in the losses. Over any episode the discounted terms add up to
+    -potential(s_0), regardless of the actions (Ng, Harada & Russell 1999). Reported returns do not include them.
 
     Args:
-        before, after: states of the robot, each number with an axis of environments.
+        before, after: states of the robot, with an axis of environments.
     """
     if not hasattr(robot, "potential"):
         return reward
@@ -268,13 +274,13 @@ def shaped(
     return reward + shaping
 
 
-def choose(
+def choose_actions(
     environment: Environment[Any],
     learner: Learner,
     observation: Float[Array, "environments observations"],
     uniforms: Float[Array, "environments uniforms"],
 ) -> tuple[Array, Exploration, Float[Array, "environments noise"]]:
-    """The actions of an iteration, what is held after them, and the uniforms that are left for the environments."""
+    """The actions of an iteration, the exploration after them, and the remaining uniforms for the environments."""
     n_drawn = environment.n_drawn
     n_before = n_drawn + n_uniforms(environment)
     action = draw_action(environment, learner.trained.actor, observation, uniforms[:, :n_drawn])
@@ -282,16 +288,16 @@ def choose(
     return action, exploration, uniforms[:, n_before:]
 
 
-def finished_alone(
+def count_finished(
     exploration: Exploration, ended: Bool[Array, " environments"], returns: Float[Array, " environments"]
 ) -> Finished:
-    """The episodes that the policy ended in an iteration, those apart in which actions were held."""
+    """The episodes that ended in an iteration, without those in which actions were held."""
     alone = ended & ~exploration.was_held
     return Finished(jnp.sum(alone, dtype=jnp.float32), jnp.sum(jnp.where(alone, returns, 0.0)))
 
 
-def state_of(environment: Environment[Any], episodes: State) -> Float[Array, "environments state"]:
-    """What the critics see of episodes: scaled observations, and the time left."""
+def critic_state(environment: Environment[Any], episodes: State) -> Float[Array, "environments state"]:
+    """The critics' inputs: scaled observations, and the time left."""
     left = 1.0 - 2.0 * episodes.iteration[:, None] / environment.robot.episode_limit
     return jnp.concatenate([jax.vmap(environment.observe)(episodes) / environment.scales, left], axis=1)
 
@@ -303,19 +309,19 @@ def learn(
     available: Int[Array, ""],
     uniforms: Float[Array, "gradient_steps blocks batch"],
 ) -> Learner:
-    """`settings.gradient_steps` gradient steps on transitions drawn from the replay."""
+    """Take `settings.gradient_steps` gradient steps on transitions drawn from the replay."""
     adam = _adam(settings)
     n_drawn, is_continuous = environment.n_drawn, environment.n_actions is None
-    paid = paid_for_entropy(learner.exploration)
+    paid = entropy_factor(learner.exploration)
 
-    def losses(trained: Trained, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
+    def losses(trained: Parameters, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
         if is_continuous:
             return sum(continuous_losses(trained, targets, batch, noise, settings, paid), jnp.float32(0.0))
         return sum(discrete_losses(trained, targets, batch, settings, paid), jnp.float32(0.0))
 
-    def update(carry: tuple[Trained, Network, Any], uniforms: Float[Array, "blocks batch"]) -> tuple[Any, None]:
+    def update(carry: tuple[Parameters, Network, Any], uniforms: Float[Array, "blocks batch"]) -> tuple[Any, None]:
         trained, targets, optimiser = carry
-        batch = batch_of(environment, learner.replay, available, uniforms[0])
+        batch = draw_batch(environment, learner.replay, available, uniforms[0])
         noise = uniforms[1:].reshape(-1, n_drawn, settings.batch).swapaxes(1, 2)
         gradient = jax.grad(losses)(trained, targets, batch, noise)
         steps, optimiser = adam.update(gradient, optimiser)
@@ -330,10 +336,11 @@ def learn(
 
 
 def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
-    """Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824): it forgets in proportion to its age.
+    """Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824), whose window grows with the training.
 
-    The last actor of a training is as good as its last few updates were lucky; the average is not. With k the
-    averaging and t the rounds done: average += (k + 1) / (t + k) (actor - average), so that the first is taken whole.
+    The quality of the last actor depends on luck in its last few updates; that of the average does not. With k the
+    averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average); the first actor is taken
+    whole.
     """
     rate = (settings.averaging_exponent + 1.0) / (index + 1.0 + settings.averaging_exponent)
     moved: Network = jax.tree.map(lambda average, new: average + rate * (new - average), deployed, actor)
@@ -341,7 +348,7 @@ def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, 
 
 
 def _adam(settings: SAC) -> optax.GradientTransformation:
-    # Flat, as one long vector compiles faster than nineteen arrays and runs as fast.
-    # Gradients of a policy that has found nothing yet are all but 0; with a smaller epsilon Adam makes whole steps of
-    # their noise, and in one navigation policy of twenty these put out every unit of the second layer, for good.
+    # Flattened, as one long vector compiles faster than nineteen arrays and runs as fast.
+    # Before any reward is found, gradients are almost 0. With a smaller epsilon Adam turns their noise into full steps,
+    # which in one navigation policy of twenty permanently switched off every unit of the second layer.
     return optax.flatten(optax.adam(settings.learning_rate, eps=1e-5))

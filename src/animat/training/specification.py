@@ -1,4 +1,4 @@
-"""What is trained: robot, mapping, how many policies and for how long, from which seed."""
+"""The specification of a training: robot, mapping, number of policies, duration, seed."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ Percentiles = Literal["moving", "first"]
 Shadowing = bool | Literal["drawn"]
 
 CHUNKS = 60
-"""Parts that training is cut into: the units of progress, refresh and checkpoint; a culture minute each by default."""
+"""Number of chunks in a training: the units of progress, refresh and checkpoint; a culture minute each by default."""
 
 
 T = TypeVar("T")
 
 
 class _Named(Generic[T]):
-    """A field that is given a thing or its name, and holds the thing."""
+    """A field that takes an object or its name, and holds the object."""
 
     def __init__(self, named: Callable[[str], T]) -> None:
         self._named = named
@@ -47,7 +47,7 @@ class _Named(Generic[T]):
 
     def __get__(self, training: object, owner: type) -> T:
         if training is None:
-            # So a dataclass learns that the field has no default.
+            # This is how a dataclass finds that the field has no default.
             raise AttributeError(self._name)
         value: T = vars(training)[self._name]
         return value
@@ -66,7 +66,7 @@ _EXPECTED: dict[str, Any] = {
     "duration_min": Positive | None,
     "commands": Annotated[
         tuple[Annotated[Number, Field(ge=-1, le=1)], ...],
-        BeforeValidator(lambda given: given.tolist() if isinstance(given, np.ndarray) else given),
+        BeforeValidator(lambda commands: commands.tolist() if isinstance(commands, np.ndarray) else commands),
     ]
     | None,
     "algorithm": InstanceOf[SAC],
@@ -74,35 +74,36 @@ _EXPECTED: dict[str, Any] = {
     "assess": Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None,
     "pulse_cost": PulseCost,
 }
-"""What fields are expected to hold."""
+"""The types expected of some fields."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """Everything that decides how policies come out, but for the recordings.
+    """Everything that determines the policies, except for the recordings.
 
     Attributes:
-        robot: the robot to be driven, or its name; with a goal or without (`animat.goals.robot.with_goal`).
+        robot: the robot, or its name; with or without a goal (`animat.goals.robot.with_goal`).
         mapping: from responses to commands, or its name; None trains the baseline without neurons, which moves the
             robot directly.
-        policies: how many are trained, each from its own random numbers.
-        iterations: of the robot, for each policy; rounded up to whole rounds of `algorithm.environments`.
+        policies: number of policies, each with its own random numbers.
+        iterations: iterations of the robot per policy; rounded up to whole rounds of `algorithm.environments`.
         seed: decides every random draw.
         shadowing: whether simulators are refreshed during training; if not, the first one is used throughout.
-            `"drawn"`: each episode draws one of all those that refreshing would have used (`animat.training.lessons`).
-        duration_min: minutes of the culture's clock that the whole training stands for (the paper: 60); None: as long
+            `"drawn"`: each episode draws one of those that refreshing would have used (`animat.training.lessons`).
+        duration_min: minutes of the culture's clock that the whole training represents (the paper: 60); None: as long
             as the recordings that it is trained on (`SimulatorTimeline.span_min`).
         percentiles: `"moving"` with the simulator in use, or fixed by the `"first"` recording.
-        delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random whatever it chose.
-        neural_observation: whether policies see what the neurons remember, too (`animat.wrappers.NeuralObservation`).
-            A closed loop makes it of the culture's responses and shows it to them; a live run refuses such policies.
-        commands: without neurons, the commands to pick from; None: any in [-1, 1], as many as the robot takes.
+        delivery: `"shuffled"` trains the paper's control, whose condition is drawn at random regardless of its choice.
+        neural_observation: whether policies also see the neurons' history state (`animat.wrappers.NeuralObservation`).
+            A closed loop computes it from the culture's responses; a live run refuses such policies.
+        commands: without neurons, the commands to choose from; None: any in [-1, 1], as many as the robot takes.
         algorithm: settings of Soft Actor-Critic.
-        lessons: ranges that episodes are drawn from, in turn; after a last one that goes on comes the task itself.
-        pulse_cost: what an electrode pulse costs, in the units of the reward: policies are trained on the rewards less
-            the costs of their trials (`animat.coding.electrode_pulses`). Returns that are reported are without.
+        lessons: lessons in turn, each with ranges from which episodes are drawn; a last one with a threshold is
+            followed by the task itself.
+        pulse_cost: cost of an electrode pulse, in the units of the reward: policies are trained on the rewards minus
+            the costs of their trials (`animat.coding.electrode_pulses`). Reported returns do not include the cost.
         assess: episodes of the assessment at the end of each chunk, by which the best policy so far is kept; None:
-            no assessments, but where lessons are gone on with 20.
+            no assessments, except that lessons with a threshold use 20.
 
     Raises:
         InvalidArgument: for counts or durations that are not positive.
@@ -136,7 +137,7 @@ class Training:
                 raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
             object.__setattr__(self, name, int(number))
         for name, expected in _EXPECTED.items():
-            # What was read: 60 and 60.0 are one training, and a number of numpy cannot be written to a file.
+            # The converted value: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
             object.__setattr__(self, name, read_record(expected, getattr(self, name), name))
         if self.commands is not None:
             if not self.commands:
@@ -145,18 +146,18 @@ class Training:
         if not isinstance(self.neural_observation, bool):
             raise InvalidArgument(f"neural_observation: expected True or False, got {shown(self.neural_observation)}")
         if self.neural_observation and self.mapping is None:
-            raise InvalidArgument("neural_observation: expected none without a mapping, which policies act through")
+            raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
         expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
         if self.pulse_cost and self.mapping is None:
             raise InvalidArgument(f"pulse_cost: expected 0 without neurons, got {self.pulse_cost:g}")
         if self.pulse_cost and self.episodes_assessed:
             raise InvalidArgument(
-                f"pulse_cost: expected 0 with assessments, which are by the task's own return, got {self.pulse_cost:g}"
+                f"pulse_cost: expected 0 with assessments, which use the task's own return, got {self.pulse_cost:g}"
             )
         if self.shadowing == "drawn" and self.mapping is None:
             raise InvalidArgument("shadowing: expected a mapping with 'drawn', got none")
         if self.is_varied and isinstance(self.robot, HostRobot):
-            raise InvalidArgument(f"robot: expected one that is stepped by JAX to be assessed, got {self.robot.name}")
+            raise InvalidArgument(f"robot: expected one stepped by JAX for assessments, got {self.robot.name}")
         for name, allowed in (
             ("shadowing", (True, False, "drawn")),
             ("percentiles", get_args(Percentiles)),
@@ -168,7 +169,7 @@ class Training:
                 )
 
     def register(self) -> None:
-        """Make its robot and its mapping known in a process that they came to, so that policies can be loaded there."""
+        """Register its robot and its mapping in this process, so that policies can be loaded here."""
         if isinstance(self.robot, HostRobot):
             self.robot.prepare()
         else:
@@ -178,37 +179,37 @@ class Training:
 
     @property
     def is_varied(self) -> bool:
-        """Whether episodes are drawn from ranges, or policies assessed."""
+        """Whether episodes are drawn from ranges, or policies are assessed."""
         return bool(self.lessons or self.assess or self.shadowing == "drawn")
 
     @property
     def episodes_assessed(self) -> int:
-        """Of each assessment; 0: there are none."""
-        return self.assess or EPISODES * any(lesson.goes_on for lesson in self.lessons)
+        """Number of episodes per assessment; 0: no assessments."""
+        return self.assess or EPISODES * any(lesson.has_threshold for lesson in self.lessons)
 
     @property
     def rounds(self) -> int:
-        """Rounds of training; in each, every one of `algorithm.environments` does one iteration."""
+        """Number of rounds; in each round all `algorithm.environments` do one iteration."""
         return math.ceil(self.iterations / self.algorithm.environments)
 
     def chunk(self, index: int) -> tuple[int, int]:
-        """The first round of a chunk, and the one after its last."""
+        """The first round of a chunk, and the one after its last round."""
         return index * self.rounds // CHUNKS, (index + 1) * self.rounds // CHUNKS
 
     def minute(self, index: int) -> float:
-        """The minute of the culture's clock, from the first recording on, that a chunk starts at."""
+        """The start of a chunk, in minutes of the culture's clock after the first recording."""
         if not self.shadowing or self.duration_min is None:
             return 0.0
         return self.duration_min * index / CHUNKS
 
-    def over(self, timeline: SimulatorTimeline | None) -> Training:
-        """The same with a duration: as long as the recordings, unless one was given."""
+    def with_duration_of(self, timeline: SimulatorTimeline | None) -> Training:
+        """This training with a duration: its own, or else as long as the recordings."""
         if self.duration_min is not None or timeline is None:
             return self
         return replace(self, duration_min=timeline.span_min)
 
     def environment(self, n_conditions: int) -> Environment[Any]:
-        """What the policies act in, but for the episode limit."""
+        """The environment that the policies act in, without the episode limit."""
         if self.mapping is None:
             return WithoutNeurons(self.robot, self.commands)
         environment: Environment[Any] = Animat(self.robot, self.mapping, n_conditions)
@@ -217,22 +218,21 @@ class Training:
         return NeuralObservation(environment) if self.neural_observation else environment
 
     def environment_on(self, timeline: SimulatorTimeline | None) -> Environment[Any]:
-        """The same on a culture's simulators, with what the trials cost, where they do.
+        """The environment for a culture's simulators, including the costs of trials, if any.
 
         Raises:
-            UnusableData: for a cost, and conditions that do not say their electrodes.
+            UnusableData: for a pulse cost with conditions whose electrodes are unknown.
         """
         environment = self.environment(0 if timeline is None else len(timeline.conditions))
         if timeline is None or not self.pulse_cost:
             return environment
         pulses = 1 if timeline.presentation is None else timeline.presentation.pulses
-        of_each = expect_electrode_pulses(timeline.conditions, pulses)
-        return TrialCosts(environment, tuple(self.pulse_cost * count for count in of_each))
+        counts = expect_electrode_pulses(timeline.conditions, pulses)
+        return TrialCosts(environment, tuple(self.pulse_cost * count for count in counts))
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as plain data, for a file."""
-        plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return plain | {
+        """This training as plain data, for a file."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__} | {
             **body_and_goal(self.robot),
             "mapping": None if self.mapping is None else mapping_to_data(self.mapping),
             "algorithm": asdict(self.algorithm),

@@ -1,6 +1,6 @@
-"""An environment whose episodes are drawn from ranges: of the robot's parameters, its starts, and the recordings.
+"""An environment whose episodes are drawn from ranges of the robot's parameters, its starts, and the recordings.
 
-The ranges are arrays, traced like the simulator. Another lesson changes data, not code: nothing is compiled again, and
+The ranges are arrays, traced like the simulator. A new lesson changes data, not code: nothing is recompiled, and
 policies that are trained side by side can be at different lessons.
 """
 
@@ -31,10 +31,10 @@ Kind = TypeVar("Kind", bound=Robot[Any])
 
 @dataclass(frozen=True)
 class Varying:
-    """What varies in any lesson of a training; static, as it decides what is compiled.
+    """What varies in any lesson of a training; static, as the compiled program depends on it.
 
     Attributes:
-        parameters: names of the robot's.
+        parameters: names of the robot's parameters.
         starts: names of numbers of its state.
         recordings: whether each episode draws its simulator.
     """
@@ -45,11 +45,11 @@ class Varying:
 
 
 class Ranges(NamedTuple):
-    """The low and the high end of what varies, in the order of `Varying`.
+    """The low and the high end of whatever varies, in the order of `Varying`.
 
     Attributes:
-        parameters: of a robot's.
-        starts: of its state; NaN: as the robot's reset has it.
+        parameters: ranges of the robot's parameters.
+        starts: ranges of numbers of its state; NaN: as the robot's reset sets them.
         recordings: the first and the last row of the simulators.
     """
 
@@ -59,45 +59,45 @@ class Ranges(NamedTuple):
 
 
 def varying_in(lessons: Sequence[Lesson], *, recordings: bool) -> Varying:
-    """What varies in any of the lessons."""
+    """Everything that varies in any of the lessons."""
     parameters = dict.fromkeys(name for lesson in lessons for name in lesson.parameters)
     starts = dict.fromkeys(name for lesson in lessons for name in lesson.starts)
     return Varying(tuple(parameters), tuple(starts), recordings)
 
 
 def ranges_of(lesson: Lesson, varying: Varying, robot: Robot[Any], rows: tuple[int, int]) -> Ranges:
-    """A lesson's ranges; a parameter that varies in other lessons only is as the robot has it."""
+    """A lesson's ranges; a parameter that varies only in other lessons keeps the robot's value."""
     body = without_goal(robot)
     parameters = [lesson.parameters.get(name, (getattr(body, name),) * 2) for name in varying.parameters]
     starts = [lesson.starts.get(name, (np.nan, np.nan)) for name in varying.starts]
-    of_parameters, of_starts = (np.array(ends, np.float32).reshape(-1, 2).T for ends in (parameters, starts))
-    return Ranges(of_parameters, of_starts, np.array(rows, np.int32))
+    low_high = [np.array(ends, np.float32).reshape(-1, 2).T for ends in (parameters, starts)]
+    return Ranges(low_high[0], low_high[1], np.array(rows, np.int32))
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Varied(Wrapper[RobotState]):
-    """Draws, at each reset, what varies; the episode keeps it to its end, whatever the ranges are then.
+    """Draws what varies at each reset; the episode keeps it until its end, even if the ranges change.
 
-    `simulator` is a stack of them, one a recording, where recordings vary. In `State.info`: the `parameters` that were
+    Where recordings vary, `simulator` is a stack of simulators, one per recording. `State.info` holds the `parameters`
     drawn, and the row of the `recording`.
 
     Attributes:
         varying: what varies.
-        ranges: between which numbers; may be traced.
+        ranges: the ranges; may be traced.
     """
 
     varying: Varying
     ranges: Ranges
 
     def reset(self, key: PRNGKeyArray) -> State:
-        of_parameters, of_starts, of_recording = jax.random.split(jax.random.fold_in(key, 1), 3)
-        parameters = _between(of_parameters, self.ranges.parameters)
+        parameter_key, start_key, recording_key = jax.random.split(jax.random.fold_in(key, 1), 3)
+        parameters = _between(parameter_key, self.ranges.parameters)
         environment = self._with(parameters)
         state = environment.reset(key)
-        drawn = dict(zip(self.varying.starts, _between(of_starts, self.ranges.starts), strict=True))
+        drawn = dict(zip(self.varying.starts, _between(start_key, self.ranges.starts), strict=True))
         first, last = self.ranges.recordings
-        recording = jax.random.randint(of_recording, (), first, last + 1)
+        recording = jax.random.randint(recording_key, (), first, last + 1)
         info = state.info | {"parameters": parameters, "recording": recording}
         return state._replace(robot=_started(environment.robot, state.robot, drawn), info=info)
 
@@ -113,9 +113,9 @@ class Varied(Wrapper[RobotState]):
         return after._replace(info=after.info | kept)
 
     def succeeded(self, state: State) -> Bool[Array, ""]:
-        """Whether an episode that ended in this state succeeded; never, for a robot that does not tell."""
-        told = getattr(self._in(state).robot, "succeeded", None)
-        return jnp.bool_(False) if told is None else told(state.robot)  # type: ignore[no-any-return]
+        """Whether an episode that ended in this state succeeded; False for a robot that does not report success."""
+        succeeded = getattr(self._in(state).robot, "succeeded", None)
+        return jnp.bool_(False) if succeeded is None else succeeded(state.robot)  # type: ignore[no-any-return]
 
     def _in(self, state: State) -> Environment[RobotState]:
         return self._with(state.info["parameters"])
@@ -135,25 +135,25 @@ class Varied(Wrapper[RobotState]):
 
 
 def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
-    """The robot with other parameters, which may be traced: made without its checks, which want numbers.
+    """The robot with changed parameters, which may be traced: created without its checks, which need numbers.
 
-    A goal stays as it is, in the units and scales of the robot as it was.
+    A goal stays unchanged, in the units and scales of the original robot.
     """
     if isinstance(robot, RobotWithGoal):
         with_goal = copy(robot)
         object.__setattr__(with_goal, "robot", with_parameters(robot.robot, values))
         return with_goal
     varied = object.__new__(type(robot))
-    for each in dataclasses.fields(robot):  # type: ignore[arg-type]
-        object.__setattr__(varied, each.name, values.get(each.name, getattr(robot, each.name)))
+    for field in dataclasses.fields(robot):  # type: ignore[arg-type]
+        object.__setattr__(varied, field.name, values.get(field.name, getattr(robot, field.name)))
     return varied
 
 
 def expect_varied(robot: Robot[Any], varying: Varying) -> None:
-    """Refuse what this robot cannot vary, seen on its shapes.
+    """Refuse what cannot vary in this robot, by tracing it.
 
     Raises:
-        InvalidArgument: for a parameter that something is compiled by, or a name that is none of the state's numbers.
+        InvalidArgument: for a parameter that must be known at compile time, or a name that the state does not have.
     """
     state = jax.eval_shape(without_goal(robot).reset, jax.random.key(0))
     known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
@@ -174,13 +174,13 @@ def expect_varied(robot: Robot[Any], varying: Varying) -> None:
             jax.eval_shape(lambda value, name=name: once(value, name), jnp.float32(getattr(without_goal(robot), name)))
         except (JAXTypeError, TypeError, ValueError, AttributeError) as error:
             raise InvalidArgument(
-                f"lessons: parameters.{name}: expected a parameter that {robot.name} only computes with, got one that "
-                f"cannot vary while it is compiled ({first_line(error)})"
+                f"lessons: parameters.{name}: expected a parameter that {robot.name} uses only in arithmetic, got one "
+                f"that must be known at compile time ({first_line(error)})"
             ) from error
 
 
 def _started(robot: Robot[Any], state: Any, drawn: Mapping[str, Array]) -> Any:
-    """The start of an episode with the numbers that were drawn; NaN: as it was."""
+    """The initial state with the numbers that were drawn; NaN: unchanged."""
     if not drawn:
         return state
     body = state.robot if isinstance(robot, RobotWithGoal) else state

@@ -1,1 +1,1 @@
-"""Tuning: a search for settings, with successive halving over trainings that go on."""
+"""Tuning: a search for settings, with successive halving of trainings that are continued from rung to rung."""

@@ -1,4 +1,4 @@
-"""The journal of a tuning: every trial with its settings and what it got, a line each in the order of their numbers."""
+"""The journal of a tuning: one line per trial, with its settings and returns, in the order of their numbers."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ JOURNAL = "journal.jsonl"
 
 
 @dataclass(frozen=True)
-class Told:
-    """A trial that is done.
+class TrialResult:
+    """The result of a trial.
 
     Attributes:
-        trial: its number.
-        settings: what was tried.
-        state: `"complete"`, `"stopped"` before the whole training, as others did better, or `"diverged"`: what it
-            learned was no finite number any more.
-        chunks: of the training, done at the end of each rung that it reached with finite numbers.
-        returns: the mean return of each policy then.
+        trial: number of the trial.
+        settings: the settings tried.
+        state: `"complete"`, `"stopped"` before the end of training, as others did better, or `"diverged"`: its
+            parameters were no longer finite.
+        chunks: chunks of training done at the end of each rung that it reached with finite parameters.
+        returns: the mean return of each policy at these ends.
     """
 
     trial: int
@@ -43,25 +43,25 @@ class Told:
         return [fmean(each) for each in self.returns]
 
 
-def write_journal(folder: Path, told: Sequence[Told]) -> None:
-    """Write all of it; no times of day, so that the same search leaves the same bytes."""
-    write_whole(folder / JOURNAL, "".join(json.dumps(asdict(each)) + "\n" for each in told))
+def write_journal(folder: Path, trials: Sequence[TrialResult]) -> None:
+    """Write the whole journal, without times of day, so that the same search writes the same bytes."""
+    write_whole(folder / JOURNAL, "".join(json.dumps(asdict(trial)) + "\n" for trial in trials))
 
 
-def read_journal(folder: Path) -> list[Told]:
-    """What is in the folder's journal, nothing where there is none; raises InvalidFile if it cannot be read."""
+def read_journal(folder: Path) -> list[TrialResult]:
+    """The trials in the folder's journal, none without a journal; raises InvalidFile if it cannot be read."""
     path = folder / JOURNAL
     if not path.exists():
         return []
     try:
-        told = [read_record(Told, json.loads(line)) for line in path.read_text().splitlines()]
-        if [each.trial for each in told] != list(range(len(told))):
+        trials = [read_record(TrialResult, json.loads(line)) for line in path.read_text().splitlines()]
+        if [trial.trial for trial in trials] != list(range(len(trials))):
             raise ValueError("trials are missing")
-        if not all(math.isfinite(x) for each in told for of in each.returns for x in of):
-            raise ValueError("a return is no finite number")
+        if not all(math.isfinite(number) for trial in trials for returns in trial.returns for number in returns):
+            raise ValueError("a return is not a finite number")
     except (OSError, ValueError, RecursionError, TypeError) as error:
         raise InvalidFile(
-            f"{path}: expected the journal of a tuning, got a file that cannot be read ({error}); remove it, and its "
-            "trials are made again"
+            f"{path}: expected the journal of a tuning, got a file that cannot be read ({error}); remove it to run its "
+            "trials again"
         ) from error
-    return told
+    return trials

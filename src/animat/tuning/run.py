@@ -1,4 +1,4 @@
-"""Running a tuning: generation after generation of trials, each told in order, and the best of them trained anew."""
+"""Running a tuning: batches of trials, reported to the search in order, and a final training of the best."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +27,19 @@ from animat.studies.run import check_custom
 from animat.studies.task import draw_seed
 from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
-from animat.tuning.journal import Told, read_journal, write_journal
-from animat.tuning.results import Final, Tuned, write_results
+from animat.tuning.journal import TrialResult, read_journal, write_journal
+from animat.tuning.results import Final, TuningResult, write_results
 from animat.tuning.search import Search, expect_optuna, importance_of
 from animat.tuning.space import first_settings, own_settings, with_settings
 from animat.tuning.specification import Tuning
-from animat.tuning.tasks import Fit, TrainTrials, Trial, returns_file, same_shapes, timeline_file
+from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
 
 MANIFEST = "tune.json"
 FINALS = "finals"
 
 
 def describe_tuning(tuning: Tuning, sources: dict[str, str]) -> dict[str, Any]:
-    """What decides how a tuning comes out, as of a study (`describe_study`), with a fingerprint over all of it."""
+    """Everything that determines a tuning's results, like `describe_study`, with a fingerprint over all of it."""
     versions = {**describe_study(tuning.study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
     return with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
 
@@ -51,49 +52,49 @@ def tune(
     workers: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Tuned:
-    """Search for settings into a folder, or go on with a search.
+) -> TuningResult:
+    """Search for settings, or continue a search, in a folder.
 
-    Killed at any moment and called again, it goes on; the journal and the results end the same, byte for byte, with any
-    number of workers. For that, trials are decided `together` at a time, and told in the order of their numbers.
+    If killed at any moment and called again, it continues; the journal and the results are the same, byte for byte,
+    with any number of workers. For this, trials are proposed `together` at a time, and reported in order.
 
     Args:
         tuning: the specification.
-        folder: where everything goes; made if it is missing.
-        base, workers, executor, progress: as of `animat.studies.run.run_study`.
+        folder: folder for all files; created if missing.
+        base, workers, executor, progress: as in `animat.studies.run.run_study`.
 
     Raises:
-        Mismatch: if the folder is another tuning's, its recordings have changed, or another run is at work in it.
+        Mismatch: if the folder holds another tuning, its recordings have changed, or another run is active in it.
         InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer workers than one, or any beside an executor.
-        UnusableData: if no trial learned anything finite.
-        AnimatError: if Optuna is not installed, or a task failed; its message names it.
+        InvalidArgument: for fewer than one worker, or any with an executor.
+        UnusableData: if no trial had finite returns.
+        AnimatError: if Optuna is not installed, or if a task failed, which the message names.
     """
     expect_optuna()
     expect_workers(workers, executor)
     folder, base, progress = Path(folder).absolute(), Path(base).absolute(), progress or Silent()
     study = tuning.study
-    # Looked at before there is a folder.
+    # Checked before the folder is created.
     check_custom(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
     manifest = describe_tuning(tuning, hash_files(source_files(study, base), base))
-    # Processes of ours stay from one part of the work to the next.
-    running_on: AbstractContextManager[Executor] = (
+    # Our own processes are reused from one part of the work to the next.
+    context: AbstractContextManager[Executor] = (
         PinnedProcesses(own_cores(workers)) if executor is None else nullcontext(executor)
     )
-    with claim_folder(folder, "tuning", manifest, MANIFEST, {}, (*OWN_FOLDERS, FINALS)), running_on as at:
-        run = _Run(tuning, folder, manifest["fingerprint"], at, progress)
+    with claim_folder(folder, "tuning", manifest, MANIFEST, {}, (*OWN_FOLDERS, FINALS)), context as chosen:
+        run = _Run(tuning, folder, manifest["fingerprint"], chosen, progress)
         run.fit(base)
-        told = run.search()
-        finals = run.finals(told)
+        trials = run.search()
+        finals = run.finals(trials)
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        return write_results(folder, tuning, told, finals, importance_of(tuning.space, told))
+        return write_results(folder, tuning, trials, finals, importance_of(tuning.space, trials))
 
 
 class _Run:
-    """A tuning while it runs: its jobs, part after part, on one executor."""
+    """A running tuning: its jobs, part by part, on one executor."""
 
-    def __init__(self, tuning: Tuning, folder: Path, fingerprint: str, at: Executor, progress: Progress) -> None:
-        self._tuning, self._folder, self._fingerprint, self._at = tuning, folder, fingerprint, at
+    def __init__(self, tuning: Tuning, folder: Path, fingerprint: str, executor: Executor, progress: Progress) -> None:
+        self._tuning, self._folder, self._fingerprint, self._executor = tuning, folder, fingerprint, executor
         tune = tuning.tune
         self._first = min(len(first_settings(tuning.study, tuning.space)), tune.trials)
         self._progress, self._done_s = progress, 0.0
@@ -101,47 +102,42 @@ class _Run:
         self._total_s += self._cost_s(tuning.study.policies * (tune.finalists + self._first), CHUNKS)
 
     def fit(self, base: Path) -> None:
-        """Have the recordings, and simulators of every kind that is searched."""
+        """Make the recordings, and simulators of every kind in the search."""
         study, space = self._tuning.study, self._tuning.space
         if not study.needs_neurons:
             return
         own = own_settings(study)
-        variants = [
-            with_settings(study, {"simulator": kind, "conditions": conditions, "readouts": readouts})
-            for kind in {own["simulator"]: None, **dict.fromkeys(_choices(space.get("simulator")))}
-            for conditions in {own["conditions"]: None, **dict.fromkeys(_choices(space.get("conditions")))}
-            for readouts in {own["readouts"]: None, **dict.fromkeys(_choices(space.get("readouts")))}
-        ]
+        names = ("simulator", "conditions", "readouts")
+        choices = [dict.fromkeys((own[name], *_choices(space.get(name)))) for name in names]
+        variants = [with_settings(study, dict(zip(names, chosen, strict=True))) for chosen in product(*choices)]
         fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
-        self._do([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
+        self._run_jobs([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
 
-    def search(self) -> list[Told]:
-        """All trials, from the journal as far as it goes."""
+    def search(self) -> list[TrialResult]:
+        """Run all trials, reusing those in the journal."""
         tune, search, known = self._tuning.tune, Search(self._tuning), read_journal(self._folder)
-        told: list[Told] = []
+        results: list[TrialResult] = []
         for first in range(0, tune.trials, tune.together):
-            asked = search.ask(min(tune.together, tune.trials - first))
-            generation = [Trial(first + i, settings) for i, settings in enumerate(asked)]
-            found = known[first : first + len(asked)]
+            proposed = search.ask(min(tune.together, tune.trials - first))
+            batch = known[first : first + len(proposed)]
             place = f"{UNFINISHED}/from-{first}"
-            if len(found) < len(asked):
-                found = self._generation(generation, place)
-                told += found
-                write_journal(self._folder, told)
-            elif [each.settings for each in found] != asked:
+            if len(batch) < len(proposed):
+                batch = self._run_batch([Trial(first + i, settings) for i, settings in enumerate(proposed)], place)
+                write_journal(self._folder, results + batch)
+            elif [result.settings for result in batch] != proposed:
                 raise InvalidFile(
                     f"{self._folder}: expected the journal of this tuning, got one with other settings in trials "
-                    f"{first} to {first + len(asked) - 1}; remove it, and its trials are made again"
+                    f"{first} to {first + len(proposed) - 1}; remove it to run its trials again"
                 )
             else:
-                told += found
-                self._done_s += 0.4 * self._cost_s(tune.policies * len(asked), CHUNKS)
-            # What its trials had learned is of no more use.
+                self._done_s += 0.4 * self._cost_s(tune.policies * len(proposed), CHUNKS)
+            results += batch
+            # What its trials learned is not needed any more.
             shutil.rmtree(self._folder / place, ignore_errors=True)
-            search.tell(found)
-        return told
+            search.report(batch)
+        return results
 
-    def _generation(self, trials: Sequence[Trial], place: str) -> list[Told]:
+    def _run_batch(self, trials: Sequence[Trial], place: str) -> list[TrialResult]:
         """Successive halving: all trials up to the first rung, the best of them up to the next, and so on."""
         tune = self._tuning.tune
         seeds = draw_seed("tuning", tune.seed, "training"), draw_seed("tuning", tune.seed, "episodes")
@@ -157,28 +153,26 @@ class _Run:
                         self._tuning.study, group, members, seeds, tune.episodes, (first, last), place, last < CHUNKS
                     ),
                 )
-                for group in same_shapes(racing, tune.policies)
+                for group in group_by_shape(racing, tune.policies)
             ]
-            names = (
-                f"trials {trials[0].number} to {trials[-1].number} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
-            )
-            self._do(jobs, f"{place}/jobs", sum(job.cost_s for job in jobs), names)
+            note = f"trials {trials[0].number} to {trials[-1].number} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
+            self._run_jobs(jobs, f"{place}/jobs", sum(job.cost_s for job in jobs), note)
             for trial in racing:
-                got = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
-                if got is None:
+                trial_returns = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
+                if trial_returns is None:
                     diverged.add(trial.number)
                 else:
                     chunks[trial.number].append(last)
-                    returns[trial.number].append(tuple(got))
+                    returns[trial.number].append(tuple(trial_returns))
             racing = [trial for trial in racing if trial.number not in diverged]
             if last < CHUNKS:
                 ranked = sorted(racing, key=lambda trial: (-sum(returns[trial.number][-1]), trial.number))
-                goes_on = {trial.number for trial in ranked[: -(-len(trials) // tune.keep ** (rung + 1))]}
-                # The settings that were there before the search go the whole way, to compare with.
-                racing = [trial for trial in racing if trial.number in goes_on or trial.number < self._first]
+                best = {trial.number for trial in ranked[: -(-len(trials) // tune.keep ** (rung + 1))]}
+                # The settings from before the search are always trained to the end, for comparison.
+                racing = [trial for trial in racing if trial.number in best or trial.number < self._first]
         complete = {trial.number for trial in racing}
         return [
-            Told(
+            TrialResult(
                 trial.number,
                 trial.settings,
                 "diverged" if trial.number in diverged else "complete" if trial.number in complete else "stopped",
@@ -188,18 +182,18 @@ class _Run:
             for trial in trials
         ]
 
-    def finals(self, told: Sequence[Told]) -> list[Final]:
-        """The first settings and the best of the others, trained anew with the study's policies, in fresh episodes."""
+    def finals(self, results: Sequence[TrialResult]) -> list[Final]:
+        """Retrain the first settings and the best of the others with the study's policies, in fresh episodes."""
         tune, study = self._tuning.tune, self._tuning.study
-        complete = [each for each in told if each.state == "complete"]
+        complete = [result for result in results if result.state == "complete"]
         if not complete:
             raise UnusableData(
-                f"{self._folder}: expected a trial of finite returns, got none of {len(told)}: search among smaller "
+                f"{self._folder}: expected a trial with finite returns, got none in {len(results)}: search smaller "
                 "learning rates and reward scales"
             )
-        ranked = sorted(complete, key=lambda each: (-each.means[-1], each.trial))
-        others = [each for each in ranked if each.trial >= self._first][: tune.finalists]
-        finalists = [Trial(each.trial, each.settings) for each in (*told[: self._first], *others)]
+        ranked = sorted(complete, key=lambda result: (-result.means[-1], result.trial))
+        others = [result for result in ranked if result.trial >= self._first][: tune.finalists]
+        finalists = [Trial(result.trial, result.settings) for result in (*results[: self._first], *others)]
         seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
         jobs = [
             self._job(
@@ -209,15 +203,14 @@ class _Run:
             for trial in finalists
             for members in split_groups(study.policies)
         ]
-        self._do(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "the best and the first settings, anew")
-        finals = []
+        self._run_jobs(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "retraining the first and the best settings")
+        finals, firsts = [], [members[0] for members in split_groups(study.policies)]
         for trial in finalists:
-            returns: list[float] | None = []
-            for members in split_groups(study.policies):
-                got = json.loads(returns_file(self._folder / FINALS, trial, CHUNKS, members[0]).read_text())
-                returns = None if got is None or returns is None else returns + got
-            finals.append(Final(trial.number, trial.settings, None if returns is None else tuple(returns)))
-        if all(each.returns is None for each in finals):
+            files = [returns_file(self._folder / FINALS, trial, CHUNKS, first) for first in firsts]
+            groups = [json.loads(file.read_text()) for file in files]
+            returns = None if None in groups else tuple(number for group in groups for number in group)
+            finals.append(Final(trial.number, trial.settings, returns))
+        if all(final.returns is None for final in finals):
             raise UnusableData(f"{self._folder}: expected finite returns of the best trials, got none")
         return finals
 
@@ -225,11 +218,11 @@ class _Run:
         first, last = task.chunks
         return Job(name, task, (), self._cost_s(len(task.trials) * len(task.members), last - first), task.reads)
 
-    def _do(self, jobs: list[Job], receipts: str, cost_s: float, words: str) -> None:
+    def _run_jobs(self, jobs: list[Job], receipts: str, cost_s: float, note: str) -> None:
         left = Jobs(jobs, self._folder, self._folder / receipts, self._fingerprint)
         if left.waiting:
-            part = Part(self._progress, self._done_s, cost_s, max(self._total_s, self._done_s + cost_s), words)
-            left.run(workers=None, executor=self._at, progress=part)
+            part = Part(self._progress, self._done_s, cost_s, max(self._total_s, self._done_s + cost_s), note)
+            left.run(workers=None, executor=self._executor, progress=part)
         self._done_s += cost_s
 
     def _cost_s(self, policies: int, chunks: int) -> float:

@@ -1,4 +1,4 @@
-"""The search itself: Optuna's tree-structured Parzen estimator, told in order, and which settings mattered."""
+"""The search itself, by Optuna's tree-structured Parzen estimator, and the importance of settings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from animat.extras import expect_extra
 from animat.studies.task import draw_seed
 from animat.training.settings import SAC
-from animat.tuning.journal import Told
+from animat.tuning.journal import TrialResult
 from animat.tuning.space import Range, Settings, Space, Value, first_settings
 from animat.tuning.specification import Tuning
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from optuna.trial import Trial
 
 FEWEST = 4
-"""Trials from which is told which settings mattered."""
+"""Fewest trials from which importance is reported."""
 
 
 class Search:
-    """Which settings to try next (Bergstra et al. 2011, "Algorithms for hyper-parameter optimization").
+    """Proposes the settings to try next (Bergstra et al. 2011, "Algorithms for hyper-parameter optimization").
 
-    It is in memory, and made again from the journal at each start. Optuna's own journal file would hold times of day,
-    and trials that a kill had left half told: it would not be the same twice.
+    It lives in memory and is rebuilt from the journal at each start. Optuna's own journal file would not be
+    reproducible: it holds times of day, and trials that a kill left half reported.
     """
 
     def __init__(self, tuning: Tuning) -> None:
@@ -42,51 +42,50 @@ class Search:
         self._running: list[Trial] = []
 
     def ask(self, n: int) -> list[Settings]:
-        """Settings of the next trials, before any of them is known."""
+        """Propose the settings of the next `n` trials, before the result of any of them is known."""
         self._running = [self._study.ask(self._distributions) for _ in range(n)]
         return [_mirrored(self._space, trial.params) for trial in self._running]
 
-    def tell(self, told: Sequence[Told]) -> None:
-        """What the trials that were asked for last got, in the same order."""
-        states = self._optuna.trial.TrialState
-        for trial, each in zip(self._running, told, strict=True):
-            if each.state != "diverged":
-                for chunks, mean in zip(each.chunks, each.means, strict=True):
+    def report(self, results: Sequence[TrialResult]) -> None:
+        """Report the results of the trials proposed last, in the same order."""
+        for trial, result in zip(self._running, results, strict=True):
+            if result.state != "diverged":
+                for chunks, mean in zip(result.chunks, result.means, strict=True):
                     trial.report(mean, chunks)
-            if each.state == "complete":
-                self._study.tell(trial, each.means[-1])
+            if result.state == "complete":
+                self._study.tell(trial, result.means[-1])
             else:
-                # One that diverged reports nothing, however it began, and is then the worst of all.
-                self._study.tell(trial, state=states.PRUNED)
+                # A diverged trial reports nothing, however it began, and so counts as the worst.
+                self._study.tell(trial, state=self._optuna.trial.TrialState.PRUNED)
 
 
-def importance_of(space: Space, told: Sequence[Told]) -> dict[str, float]:
-    """The share of each setting in what trials got after the first rung, the largest first; nothing of a few trials.
+def importance_of(space: Space, results: Sequence[TrialResult]) -> dict[str, float]:
+    """The share of each setting in the return after the first rung, the largest first; empty for too few trials.
 
-    By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255). All trials that did not diverge were run until there; of
-    those that were stopped no more is known.
+    By PED-ANOVA (Watanabe et al. 2023, arXiv:2304.10255). The first rung is what all trials that did not diverge have
+    in common; stopped trials have no later return.
     """
-    known = [each for each in told if each.state != "diverged"]
-    if len(known) < FEWEST or len({each.means[0] for each in known}) < 2:
+    known = [result for result in results if result.state != "diverged"]
+    if len(known) < FEWEST or len({result.means[0] for result in known}) < 2:
         return {}
     optuna = expect_optuna()
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
     among = distributions(space)
-    for each in known:
-        params = _mirrored(space, each.settings)
-        study.add_trial(optuna.trial.create_trial(params=params, distributions=among, value=each.means[0]))
+    for result in known:
+        params = _mirrored(space, result.settings)
+        study.add_trial(optuna.trial.create_trial(params=params, distributions=among, value=result.means[0]))
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     shares = optuna.importance.get_param_importances(study, evaluator=evaluator, params=list(space))
     return {name: float(share) for name, share in sorted(shares.items(), key=lambda pair: (-pair[1], pair[0]))}
 
 
 def distributions(space: Space) -> dict[str, BaseDistribution]:
-    """The search in Optuna's words, where a discount may stand for its distance from 1."""
+    """The search as Optuna's distributions, in which a discount may be replaced by its distance from 1."""
     return {name: _distribution(name, among) for name, among in space.items()}
 
 
 def _mirrored(space: Space, settings: Settings) -> Settings:
-    """Settings as Optuna has them, and back: a discount that is searched in its logarithm is its distance from 1."""
+    """Convert settings to Optuna's and back: a discount on a log scale is replaced by its distance from 1."""
     return {name: 1 - value if _is_mirrored(name, space[name]) else value for name, value in settings.items()}  # type: ignore[operator]
 
 
@@ -97,17 +96,16 @@ def _is_mirrored(name: str, among: Range | tuple[Value, ...]) -> bool:
 def _distribution(name: str, among: Range | tuple[Value, ...]) -> BaseDistribution:
     d: Any = expect_optuna().distributions
     if not isinstance(among, Range):
-        made: BaseDistribution = d.CategoricalDistribution(among)
-        return made
-    if isinstance(asdict(SAC())[name], int):
-        made = d.IntDistribution(int(among.low), int(among.high), log=among.log)
+        distribution: BaseDistribution = d.CategoricalDistribution(among)
+    elif isinstance(asdict(SAC())[name], int):
+        distribution = d.IntDistribution(int(among.low), int(among.high), log=among.log)
     elif _is_mirrored(name, among):
-        made = d.FloatDistribution(1 - among.high, 1 - among.low, log=True)
+        distribution = d.FloatDistribution(1 - among.high, 1 - among.low, log=True)
     else:
-        made = d.FloatDistribution(among.low, among.high, log=among.log)
-    return made
+        distribution = d.FloatDistribution(among.low, among.high, log=among.log)
+    return distribution
 
 
 def expect_optuna() -> Any:
-    """Optuna, which is imported nowhere else; raises AnimatError if it is not installed."""
+    """Import Optuna; raises AnimatError if it is not installed."""
     return expect_extra("optuna", package="Optuna", extra="tune", what="tuning")

@@ -1,4 +1,4 @@
-"""Trials that are trained side by side: one compiled program, which takes their settings as arrays."""
+"""Trials that are trained side by side by one compiled program, which takes their settings as arrays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from animat.wrappers import EpisodeLimit
 
 
 class Numbers(NamedTuple):
-    """The settings that need no compilation, of one policy; `NUMBERS` are their names."""
+    """The settings of one policy that need no compilation; `NUMBERS` are their names."""
 
     learning_rate: Float[Array, ""]
     discount: Float[Array, ""]
@@ -39,9 +39,9 @@ class Numbers(NamedTuple):
 
 @lru_cache(maxsize=8)
 def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """`begin` and `train_chunk` for policies side by side, each with `Numbers` of its own.
+    """`begin` and `train_chunk` for several policies, each with its own `Numbers`.
 
-    Those of ordinary training (`animat.training.group.programs`) have them compiled in: theirs stay as they are.
+    The programs of ordinary training (`animat.training.group.programs`) have these settings compiled in.
     """
     limited = EpisodeLimit(environment)
 
@@ -59,41 +59,41 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
 
 
 def _traced(algorithm: SAC, numbers: Numbers) -> SAC:
-    """The settings with traced numbers among them, which no check of a record could look at."""
+    """The settings with traced numbers, which bypass the record's checks."""
     settings = object.__new__(SAC)
     vars(settings).update({**vars(algorithm), **numbers._asdict()})
     return settings
 
 
 class Trials(SideBySide):
-    """Policies of several trials while they are trained, a group a trial.
+    """The policies of several trials during training, one group per trial.
 
     Args:
-        training: of all of them, but for its settings that are `NUMBERS`.
-        timeline: what they are trained on; None without neurons.
-        algorithms: of each trial, which differ in `NUMBERS` only.
-        members: numbers of the policies of each, which decide their random numbers: those of two trials are the same.
+        training: the training of all trials, except for the settings in `NUMBERS`.
+        timeline: the simulators they are trained on; None without neurons.
+        algorithms: settings of each trial, which differ only in `NUMBERS`.
+        members: numbers of each trial's policies, which decide their random numbers: all trials use the same ones.
     """
 
     def __init__(
         self, training: Training, timeline: SimulatorTimeline | None, algorithms: Sequence[SAC], members: Sequence[int]
     ) -> None:
-        # With the same numbers in place, so that trials with others find the program that is compiled.
-        usual = {name: getattr(SAC(), name) for name in NUMBERS}
-        training = replace(training, algorithm=replace(algorithms[0], **usual))
+        # The default numbers stand in, so that trials with other numbers reuse the compiled program.
+        defaults = {name: getattr(SAC(), name) for name in NUMBERS}
+        training = replace(training, algorithm=replace(algorithms[0], **defaults))
         numbers = Numbers(
             *(
-                jnp.repeat(jnp.array([getattr(each, name) for each in algorithms], jnp.float32), len(members))
+                jnp.repeat(jnp.array([getattr(settings, name) for settings in algorithms], jnp.float32), len(members))
                 for name in Numbers._fields
             )
         )
-        ours = [partial(each, numbers) for each in programs(training.environment_on(timeline), training.algorithm)]
+        compiled = programs(training.environment_on(timeline), training.algorithm)
         groups = [Group(training, tuple(members), timeline, "", {})] * len(algorithms)
-        # Nobody reads their curves, and a trial that diverges leaves those beside it alone.
-        super().__init__(*groups, own_programs=ours, is_followed=False)
+        # Nobody reads their curves, and a diverging trial must not stop the others.
+        super().__init__(*groups, own_programs=[partial(program, numbers) for program in compiled], is_diagnosed=False)
 
     def networks(self, trial: int, *, greedy: bool) -> Networks | None:
-        """The policies of a trial as they would be deployed; None where what was learned is no finite number."""
+        """The deployable policies of a trial; None if their parameters are not finite."""
         network = jax.tree.map(lambda leaf: self.split(np.asarray(leaf))[trial], self._learners.deployed)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(network)):
             return None

@@ -1,4 +1,4 @@
-"""What is searched: settings by name, each in a range or among choices; and a study with settings put in."""
+"""The search space: settings by name, each with a range or choices; and studies with changed settings."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from animat.studies.specification import Study
 from animat.training.settings import SAC
 
 NUMBERS = ("learning_rate", "discount", "tau", "reward_scale", "initial_alpha", "target_entropy_ratio", "entropy_nats")
-"""Settings of the algorithm that a compiled program takes as numbers: trials that differ in nothing else share one."""
+"""Settings that a compiled program takes as numbers: trials that differ only in these share a program."""
 _OF_SIMULATORS = {"simulator": "kind", "conditions": "conditions", "readouts": "readouts"}
-"""Settings of a study's simulators, and their fields there."""
+"""Settings of a study's simulators, and the names of their fields."""
 THROUGH_NEURONS = ("mapping", *_OF_SIMULATORS)
 FITTING = ("environments", "replay")
 """Settings of the algorithm that depend on each other: one is a multiple of the other."""
@@ -24,14 +24,14 @@ SEARCHABLE = (*(field.name for field in fields(SAC)), *THROUGH_NEURONS)
 
 Value = float | int | str
 Settings = dict[str, Value]
-"""Settings by name: of the algorithm, and `mapping`, `simulator`, `conditions`, `readouts`."""
+"""Settings by name: those of the algorithm, and `mapping`, `simulator`, `conditions`, `readouts`."""
 
 
 @record
 class Range:
-    """Numbers from `low` to `high`; with `log` evenly in their logarithm. Whole ones for settings that are counts.
+    """Numbers from `low` to `high`, uniform or, with `log`, uniform in the logarithm; integers for counts.
 
-    The logarithm of a discount is that of its distance from 1: from 0.9 to 0.99 is as far as from 0.99 to 0.999.
+    The logarithm of a discount is taken of its distance from 1: 0.9 to 0.99 is as far as 0.99 to 0.999.
     """
 
     low: Number
@@ -50,7 +50,7 @@ class Range:
 
 Space = dict[str, Range | tuple[Value, ...]]
 
-USUAL: Space = {
+DEFAULT: Space = {
     "learning_rate": Range(1e-4, 1e-2, True),
     "discount": Range(0.9, 0.999, True),
     "tau": Range(1e-3, 5e-2, True),
@@ -60,23 +60,23 @@ USUAL: Space = {
     "mapping": ("1-threshold", "9-thresholds", "linear"),
     "simulator": ("histogram", "empirical", "memory"),
 }
-"""Where nothing else is said; of each as far as it concerns the study, and widened to hold its own setting."""
+"""The default search; only what applies to the study is used, widened to include the study's own settings."""
 
 
-def usual_space(study: Study) -> Space:
-    """The usual search of a study with one robot and one arm."""
+def default_space(study: Study) -> Space:
+    """The default search for a study with one robot and one arm."""
     space: Space = {}
-    through = study.arms[0].through_neurons
-    usual: Space = dict(USUAL)
-    if not through and study.robots[0].robot().baseline_commands is None:
-        del usual["target_entropy_ratio"]
-        usual["entropy_nats"] = Range(-3.0, 0.5)
-    for name, among in usual.items():
-        if name in THROUGH_NEURONS and not through:
+    has_neurons = study.arms[0].through_neurons
+    defaults: Space = dict(DEFAULT)
+    if not has_neurons and study.robots[0].robot().baseline_commands is None:
+        del defaults["target_entropy_ratio"]
+        defaults["entropy_nats"] = Range(-3.0, 0.5)
+    for name, among in defaults.items():
+        if name in THROUGH_NEURONS and not has_neurons:
             continue
         own: Any = own_settings(study)[name]
         if isinstance(among, Range):
-            # The logarithm of nothing is none: such a setting is searched evenly.
+            # A range that reaches 0 has no logarithm, and is searched uniformly.
             low, high = min(among.low, own), max(among.high, own)
             log = among.log and low > 0 and not (name == "discount" and high == 1)
             space[name] = Range(low, high, log)
@@ -85,17 +85,17 @@ def usual_space(study: Study) -> Space:
     return space
 
 
-def read_space(given: Mapping[str, Any], study: Study) -> Space:
+def read_space(table: Mapping[str, Any], study: Study) -> Space:
     """The search of a file's `[tune.search]`: tables `{ low, high, log }` and lists of choices, by name.
 
     Raises:
-        InvalidArgument: for a setting that cannot be searched, a range or choices that are none, a value that the
-            setting may not have, or a search that does not hold the study's own setting, with which it begins.
+        InvalidArgument: for a setting that cannot be searched, an invalid range or list of choices, a value that the
+            setting cannot have, or a search that does not include the study's own setting, with which it begins.
     """
-    if not given:
+    if not table:
         raise InvalidArgument("tune.search: expected at least one setting to search for, got none")
     space: Space = {}
-    for name, among in given.items():
+    for name, among in table.items():
         where = f"tune.search.{name}"
         if name not in SEARCHABLE:
             near = did_you_mean(name, SEARCHABLE) or f"; there are {', '.join(SEARCHABLE)}"
@@ -120,18 +120,18 @@ def read_space(given: Mapping[str, Any], study: Study) -> Space:
         own = own_settings(study)[name]
         if own not in space[name]:
             raise InvalidArgument(
-                f"{where}: expected it to hold the study's own setting, {own!r}, which is tried first; got "
-                f"{shown(given[name])}"
+                f"{where}: expected it to include the study's own setting, {own!r}, which is tried first; got "
+                f"{shown(table[name])}"
             )
     _expect_fitting(study, space)
     return space
 
 
 def _expect_fitting(study: Study, space: Space) -> None:
-    """That whatever is chosen of settings that depend on each other fits."""
+    """Refuse choices of settings that depend on each other if any combination does not fit."""
     own = own_settings(study)
-    among = [value if isinstance(value := space.get(name), tuple) else (own[name],) for name in FITTING]
-    for chosen in itertools.product(*among):
+    choices = [value if isinstance(value := space.get(name), tuple) else (own[name],) for name in FITTING]
+    for chosen in itertools.product(*choices):
         try:
             with_settings(study, dict(zip(FITTING, chosen, strict=True)))
         except InvalidArgument as error:
@@ -139,26 +139,26 @@ def _expect_fitting(study: Study, space: Space) -> None:
 
 
 def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], where: str) -> None:
-    """That the study could be run with every setting of the search: a range is possible where its ends are."""
+    """Refuse a search with settings that the study could not run with; of a range its ends are checked."""
     for value in (among.low, among.high) if isinstance(among, Range) else among:
         try:
             value = _whole(value, own_settings(study)[name])
             if name == "mapping" and value == "none":
-                raise InvalidArgument("expected mappings, got 'none'; without neurons nothing else is comparable")
-            tried = with_settings(study, {name: value})
+                raise InvalidArgument("expected mappings, got 'none'; a search compares policies with neurons only")
+            changed = with_settings(study, {name: value})
             if name == "mapping":
-                mapping_named(tried.arms[0].mapping)
+                mapping_named(changed.arms[0].mapping)
         except InvalidArgument as error:
             raise InvalidArgument(f"{where}: {error}") from error
 
 
 def _whole(value: Any, own: Any) -> Any:
-    """A number as whole as the study's own: TOML may have 64.0 for a count."""
+    """An integer if the study's own value is one, as TOML may have 64.0 for a count."""
     return int(value) if isinstance(value, float) and isinstance(own, int) and value.is_integer() else value
 
 
 def own_settings(study: Study) -> dict[str, Any]:
-    """What a study of one robot and one arm has for every setting that can be searched."""
+    """The values of all searchable settings in a study of one robot and one arm."""
     return {
         **asdict(SAC(**study.algorithm)),  # type: ignore[arg-type]
         "mapping": study.arms[0].mapping,
@@ -167,18 +167,18 @@ def own_settings(study: Study) -> dict[str, Any]:
 
 
 def first_settings(study: Study, space: Space) -> list[Settings]:
-    """What is tried first: the study's own settings, and the algorithm's defaults if they are others and searched."""
+    """The first settings to try: the study's own, and the algorithm's defaults if they differ and are in the search."""
     own = own_settings(study)
-    usual = {**own, **asdict(SAC())}
-    first, second = ({name: of[name] for name in space} for of in (own, usual))
+    defaults = {**own, **asdict(SAC())}
+    first, second = ({name: settings[name] for name in space} for settings in (own, defaults))
     is_searched = all(value in space[name] for name, value in second.items())
     return [first, second] if is_searched and second != first else [first]
 
 
 def with_settings(study: Study, settings: Mapping[str, Value]) -> Study:
-    """The study with settings in place of its own; raises InvalidArgument for a value that a setting may not have."""
+    """The study with changed settings; raises InvalidArgument for a value that a setting cannot have."""
     changed: dict[str, Any] = dict(settings)
     arm = replace(study.arms[0], mapping=changed.pop("mapping", study.arms[0].mapping))
-    of_simulators = {field: changed.pop(name) for name, field in _OF_SIMULATORS.items() if name in changed}
-    simulators = replace(study.simulators, **of_simulators)
+    fields_changed = {field: changed.pop(name) for name, field in _OF_SIMULATORS.items() if name in changed}
+    simulators = replace(study.simulators, **fields_changed)
     return replace(study, arms=(arm,), simulators=simulators, algorithm={**study.algorithm, **changed})

@@ -1,4 +1,4 @@
-"""What a tuning is: a study of one robot and one arm, and how its settings are searched."""
+"""The specification of a tuning: a study of one robot and one arm, and how its settings are searched."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
 from animat.studies.toml import read_toml, study_from
 from animat.training.specification import CHUNKS
-from animat.tuning.space import Range, Space, read_space, usual_space
+from animat.tuning.space import Range, Space, default_space, read_space
 
 
 @record
@@ -22,17 +22,17 @@ class Tune:
     """How settings are searched: the table `[tune]`.
 
     Attributes:
-        trials: settings that are tried; first the study's own, then the defaults of what is searched of the algorithm.
-        together: trials that are decided at once, before any of them is known. It bounds how many can run side by
-            side, and the same seed gives the same trials with any number of workers.
-        policies: of each trial; what counts is their mean return.
-        rungs, keep: successive halving: trials are trained for a share of the whole training, one in `keep` of those
-            decided together goes on, and so on; the last of the `rungs` is the whole training. One rung: no halving.
-        episodes: of each policy, on the simulator.
-        finalists: the best trials that were trained anew, beside the settings tried first, with the study's number of
-            policies, other random numbers and fresh episodes; the best of these wins.
+        trials: number of settings tried; first the study's own, then the algorithm's defaults of what is searched.
+        together: trials proposed as one batch, before the result of any of them is known. It limits how many can run
+            side by side, and makes the trials of a seed the same with any number of workers.
+        policies: policies per trial, which is judged by their mean return.
+        rungs, keep: successive halving: the trials of a batch are trained for a share of the whole training, one in
+            `keep` continues, and so on; the last of the `rungs` is the whole training. One rung: no halving.
+        episodes: episodes of each policy, on the simulator.
+        finalists: number of best trials to retrain, along with the settings tried first, with the study's number of
+            policies, different random numbers and fresh episodes; the best of these wins.
         seed: decides every draw of the search, of its trainings and of their episodes.
-        search: of each setting a range or choices, as TOML has them; empty: the usual ones.
+        search: a range or choices for each setting, as in TOML; None: the default search.
     """
 
     trials: Annotated[Whole, Field(ge=1, le=10_000)] = 40
@@ -48,21 +48,21 @@ class Tune:
     def __post_init__(self) -> None:
         if self.keep ** (self.rungs - 1) > CHUNKS:
             raise InvalidArgument(
-                f"rungs: expected keep^(rungs - 1) to be at most {CHUNKS}, the parts of a training, got "
+                f"rungs: expected keep^(rungs - 1) to be at most {CHUNKS}, the chunks of a training, got "
                 f"{self.keep}^{self.rungs - 1}"
             )
 
     @property
     def chunks(self) -> list[int]:
-        """Parts of the training after each rung, of `CHUNKS` after the last."""
+        """Chunks of training done after each rung, `CHUNKS` after the last."""
         return [max(1, round(CHUNKS / self.keep ** (self.rungs - 1 - rung))) for rung in range(self.rungs)]
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Everything that decides how a tuning comes out, but for recordings in files: how is searched, and what.
+    """Everything that determines a tuning's results, except for recordings in files.
 
-    The study is of one robot and one arm, with the settings that the search begins with.
+    The study has one robot and one arm, and the settings with which the search begins.
     """
 
     study: Study
@@ -70,7 +70,7 @@ class Tuning:
     space: Space
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The specification as plain data."""
         space = {
             name: {"low": among.low, "high": among.high, "log": among.log} if isinstance(among, Range) else list(among)
             for name, among in self.space.items()
@@ -80,15 +80,15 @@ class Tuning:
 
 
 def tuning_of(study: Study, tune: Tune) -> Tuning:
-    """A study and how it is searched, checked together.
+    """A tuning of a study, with the two checked against each other.
 
     Raises:
-        InvalidArgument: for other than one robot and one arm, an arm that is not trained, a body of others, or as
-            `read_space` does.
+        InvalidArgument: for more than one robot or arm, an arm that is not trained, a robot that is stepped outside
+            JAX, lessons or drawn recordings, or as in `read_space`.
     """
-    for what in ("robots", "arms"):
-        if (n := len(getattr(study, what))) != 1:
-            raise InvalidArgument(f"{what}: expected one [[{what}]] to tune for, got {n}")
+    for name in ("robots", "arms"):
+        if (n := len(getattr(study, name))) != 1:
+            raise InvalidArgument(f"{name}: expected one [[{name}]] to tune for, got {n}")
     if not study.arms[0].trained:
         raise InvalidArgument("arms.trained: expected an arm that is trained, got one that is not")
     if isinstance(robot := study.robots[0].robot(), HostRobot):
@@ -97,18 +97,18 @@ def tuning_of(study: Study, tune: Tune) -> Tuning:
         )
     if study.robots[0].lessons or study.arms[0].shadowing == "drawn":
         raise InvalidArgument(
-            "robots.lessons: expected none, nor shadowing = 'drawn', as trials are trained side by side; teach "
-            "the best settings afterwards with animat train --lessons"
+            "robots.lessons: expected neither lessons nor shadowing = 'drawn', as trials are trained side by side; "
+            "train with lessons afterwards, with the best settings (animat train --lessons)"
         )
-    return Tuning(study, tune, usual_space(study) if tune.search is None else read_space(tune.search, study))
+    return Tuning(study, tune, default_space(study) if tune.search is None else read_space(tune.search, study))
 
 
 def read_tuning(path: str | os.PathLike[str]) -> Tuning:
-    """Read a study's file with a table `[tune]`; errors as those of `animat.studies.toml.read_study`."""
+    """Read a study's file with a table `[tune]`; errors as in `animat.studies.toml.read_study`."""
     data = read_toml(path)
     tune = data.pop("tune", {})
     if not data:
-        raise InvalidFile(f"{path}: expected the settings of a study beside [tune], such as [[robots]], got none")
+        raise InvalidFile(f"{path}: expected a study's settings in addition to [tune], such as [[robots]], got none")
     study = study_from(data, path)
     try:
         return tuning_of(study, read_record(Tune, tune, "tune"))

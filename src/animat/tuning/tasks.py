@@ -1,4 +1,4 @@
-"""The tasks of a tuning: fitting a simulator of a kind, and training trials side by side up to a rung."""
+"""The tasks of a tuning: fitting simulators of one kind, and training trials side by side up to a rung."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from animat.writing import write_whole
 
 
 def timeline_file(study: Study) -> Path:
-    """Where the simulators of a study's kind, conditions and readouts lie, in a tuning's folder."""
+    """The file of the simulators with a study's kind, conditions and readouts, in a tuning's folder."""
     simulators = study.simulators
-    other = simulators.conditions + ("" if simulators.readouts == "all" else f" {simulators.readouts}")
-    digest = hashlib.sha256(other.encode()).hexdigest()[:8]
-    return Path("simulators") / f"{simulators.kind}{other and '-' + digest}.safetensors"
+    details = simulators.conditions + ("" if simulators.readouts == "all" else f" {simulators.readouts}")
+    digest = hashlib.sha256(details.encode()).hexdigest()[:8]
+    return Path("simulators") / f"{simulators.kind}{details and '-' + digest}.safetensors"
 
 
 @final
@@ -53,7 +53,7 @@ class Fit(StudyTask):
 
 @dataclass(frozen=True)
 class Trial:
-    """Settings that are tried, with a number that counts from 0."""
+    """Settings to try, with a number that counts from 0."""
 
     number: int
     settings: Settings
@@ -62,19 +62,19 @@ class Trial:
 @final
 @dataclass(frozen=True)
 class TrainTrials(StudyTask):
-    """Train trials that share their shapes side by side, from one rung to the next, and see what they get.
+    """Train trials of equal shape side by side, from one rung to the next, and evaluate them.
 
-    Each is trained on simulators of its own kind and run in episodes on those of the study's, as the best is to do well
-    there: a kind that is easy to act on would win otherwise. All have the same random numbers.
+    Each is trained on simulators of its own kind, and evaluated on those of the study's kind, as otherwise the kind
+    that is easiest to control would win. All trials use the same random numbers.
 
     Attributes:
-        trials: which.
+        trials: the trials.
         members: numbers of their policies.
-        seeds: of training, and of the episodes.
-        episodes: of each policy.
-        chunks: of the training, from the first up to, not including, the last.
-        place: folder of what is learned and of the returns, as seen from the tuning's.
-        goes_on: whether what is learned is kept for the next rung.
+        seeds: seeds of training and of the episodes.
+        episodes: episodes per policy.
+        chunks: the chunks of training, from the first up to but excluding the last.
+        place: folder of the learners and the returns, relative to the tuning's.
+        is_continued: whether the learners are stored for the next rung.
     """
 
     sizes = ("algorithm",)
@@ -85,13 +85,15 @@ class TrainTrials(StudyTask):
     episodes: int
     chunks: tuple[int, int]
     place: str
-    goes_on: bool
+    is_continued: bool
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Places of the files that it reads, which other jobs left."""
+        """Places of the files that it reads, which other jobs wrote."""
         study, first = with_settings(self.study, self.trials[0].settings), self.chunks[0]
-        places = [kept_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials] if first else []
+        places = (
+            [learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials] if first else []
+        )
         if study.arms[0].through_neurons:
             places += {timeline_file(each) for each in (study, replace(study, simulators=_judge(self.study, study)))}
         return tuple(place.as_posix() for place in places)
@@ -102,60 +104,54 @@ class TrainTrials(StudyTask):
         algorithms = [SAC(**study.algorithm) for study in studies]  # type: ignore[arg-type]
         training = training_of(studies[0], self.study.robots[0], studies[0].arms[0])
         training = replace(training, seed=self.seeds[0], policies=len(self.members))
-        taught = _timeline(folder, studies[0])
-        judged = _timeline(folder, replace(studies[0], simulators=_judge(self.study, studies[0])))
-        together = Trials(training, taught, algorithms, self.members)
+        timeline = _timeline(folder, studies[0])
+        judging = _timeline(folder, replace(studies[0], simulators=_judge(self.study, studies[0])))
+        together = Trials(training, timeline, algorithms, self.members)
 
-        checkpoint = place / f"{self._name}.npz"
-        kept = [kept_file(place, trial, first, self.members[0]) for trial in self.trials if first]
-        left = [checkpoint] if checkpoint.exists() else kept
-        done = together.resume(*left) if left else 0
+        numbers = ",".join(str(trial.number) for trial in self.trials)
+        checkpoint = place / f"t{numbers}-p{self.members[0]}-to-{last}-of-{CHUNKS}.npz"
+        learners = [learner_file(place, trial, first, self.members[0]) for trial in self.trials if first]
+        files = [checkpoint] if checkpoint.exists() else learners
+        done = together.resume(*files) if files else 0
         written = time.monotonic()
         for index in range(done, last):
-            together.train(index, _at(taught, training.minute(index)))
+            together.train(index, _at(timeline, training.minute(index)))
             progress.update(index + 1 - first, last - first + 1)
             if index + 1 < last and time.monotonic() - written > CHECKPOINT_S:
-                together.keep(checkpoint)
+                together.save_checkpoint(checkpoint)
                 written = time.monotonic()
 
-        environment = training.environment_on(taught)
+        environment, n = training.environment_on(timeline), len(self.members)
+        simulator = _at(judging, training.minute(CHUNKS - 1))
         files = []
         for i, trial in enumerate(self.trials):
             networks = together.networks(i, greedy=self.study.actions == "most probable")
             returns: list[float] | None = None
             if networks is not None:
-                simulator = _at(judged, training.minute(CHUNKS - 1))
-                n = len(self.members)
                 ran = roll_out(environment, simulator, networks, n, episodes=self.episodes, seed=self.seeds[1])
-                returns = ran.returns.mean(axis=1).tolist()
-                if not np.isfinite(returns).all():
-                    returns = None
+                means = ran.returns.mean(axis=1)
+                returns = means.tolist() if np.isfinite(means).all() else None
             file = returns_file(place, trial, last, self.members[0])
             files.append(write_whole(file, json.dumps(returns) + "\n"))
-            if self.goes_on:
-                files.append(kept_file(place, trial, last, self.members[0]))
-                together.keep(files[-1], i)
+            if self.is_continued:
+                files.append(learner_file(place, trial, last, self.members[0]))
+                together.save_checkpoint(files[-1], i)
         checkpoint.unlink(missing_ok=True)
         return files
 
-    @property
-    def _name(self) -> str:
-        numbers = ",".join(str(trial.number) for trial in self.trials)
-        return f"t{numbers}-p{self.members[0]}-to-{self.chunks[1]}-of-{CHUNKS}"
-
 
 def returns_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
-    """The mean return of each of a trial's policies after so many chunks, JSON; null where learning went wrong."""
+    """The JSON file with the mean return of each of a trial's policies after so many chunks; null if not finite."""
     return place / f"t{trial.number}-p{member}-{chunks}.json"
 
 
-def kept_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
-    """What a trial's policies had learned after so many chunks."""
+def learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
+    """The file of a trial's learners after so many chunks."""
     return place / f"t{trial.number}-p{member}-{chunks}.npz"
 
 
 def _judge(own: Study, trial: Study) -> Any:
-    """Simulators of the study's own kind, with the trial's conditions."""
+    """The simulators that judge a trial: of the study's own kind, with the trial's conditions."""
     return replace(trial.simulators, kind=own.simulators.kind)
 
 
@@ -167,23 +163,23 @@ def _timeline(folder: Path, study: Study) -> SimulatorTimeline | None:
 
 
 def _at(timeline: SimulatorTimeline | None, minute: float) -> Any:
-    """The simulator in use a time after the first recording; None without neurons."""
+    """The simulator in use `minute` minutes after the first recording; None without neurons."""
     return None if timeline is None else timeline.at(float(timeline.start_min[0]) + minute)
 
 
-def same_shapes(trials: Sequence[Trial], policies: int) -> list[tuple[Trial, ...]]:
-    """Groups of trials that one compiled program can train: they differ in numbers only, five policies at most.
+def group_by_shape(trials: Sequence[Trial], policies: int) -> list[tuple[Trial, ...]]:
+    """Groups of trials that one compiled program can train: they differ only in `NUMBERS`, five policies at most.
 
-    Which are trained side by side depends on the trials alone, not on the machine: it could change the last bits. Two
-    groups at least, where there are two trials: they keep two cores busy.
+    The grouping depends only on the trials, not on the machine, as it could change the last bits. Two or more trials
+    give at least two groups, which keep two cores busy.
     """
-    alike: dict[tuple[Any, ...], list[Trial]] = {}
+    by_shape: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
         shape = tuple((name, value) for name, value in trial.settings.items() if name not in NUMBERS)
-        alike.setdefault(shape, []).append(trial)
+        by_shape.setdefault(shape, []).append(trial)
     most = max(1, 5 // policies)
     groups = []
-    for each in alike.values():
-        n = max(-(-len(each) // most), min(2, len(each)) if len(alike) == 1 else 1)
-        groups += [tuple(each[i] for i in part) for part in np.array_split(np.arange(len(each)), n)]
+    for same in by_shape.values():
+        n = max(-(-len(same) // most), min(2, len(same)) if len(by_shape) == 1 else 1)
+        groups += [tuple(same[i] for i in part) for part in np.array_split(np.arange(len(same)), n)]
     return groups

@@ -1,0 +1,110 @@
+"""Tasks that train a group of policies: alone on a core, or together with others of the same program on a GPU."""
+
+from __future__ import annotations
+
+import abc
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from animat.execution.task import UNFINISHED, Task, TaskResult, carry_out_together
+from animat.progress import Part, Progress
+from animat.training.folder import write_description
+from animat.training.group import CHECKPOINT_S, AddPart, Group, save_policies, train_groups
+from animat.training.memory import parts_that_fit
+from animat.training.policy import Policy
+from animat.training.specification import CHUNKS, Training
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingWork:
+    """A group of policies to train.
+
+    Attributes:
+        group: the group.
+        place: the folder of its policies.
+        checkpoint: the file of its checkpoint if it is trained alone.
+        checkpoint_s: seconds between checkpoints.
+        add_part: as in `animat.training.group.train_group`.
+        description: a description to write next to the policies; None: it already exists.
+    """
+
+    group: Group
+    place: Path
+    checkpoint: Path
+    checkpoint_s: float = CHECKPOINT_S
+    add_part: AddPart | None = None
+    description: dict[str, Any] | None = None
+
+    def save(self, policies: Sequence[Policy]) -> list[Path]:
+        """Write the trained policies; returns the files."""
+        files = save_policies(self.group, policies, self.place)
+        return files if self.description is None else [*files, write_description(self.place, self.description)]
+
+
+class TrainingTask(Task):
+    """A task that trains a group of policies."""
+
+    @property
+    @abc.abstractmethod
+    def training(self) -> Training | None:
+        """The training, as far as it is known before anything is read; None: policies are not trained."""
+
+    @abc.abstractmethod
+    def prepare(self, folder: Path) -> TrainingWork:
+        """Read what it needs, and register robots and mappings; called in the process that trains."""
+
+    def run(self, folder: Path, progress: Progress) -> list[Path]:
+        return train_alone(self.prepare(folder), progress)
+
+
+def train_alone(work: TrainingWork, progress: Progress) -> list[Path]:
+    """Train a group of policies, resuming from its checkpoint; returns the files written."""
+    progress.update(0, CHUNKS, "compiling")
+    files = _train([work], work.checkpoint, progress)[0]
+    work.checkpoint.unlink(missing_ok=True)
+    return files
+
+
+def train_together(tasks: Sequence[TrainingTask], folder: Path, notices: Sequence[Path]) -> list[TaskResult]:
+    """Carry out tasks of one program: all of their policies at once, or as many as fit into memory.
+
+    If it is killed before it returns and called again with the same tasks, it writes the same bits. Arguments and
+    errors are those of `animat.execution.task.carry_out_together`.
+    """
+
+    def run(progress: Progress) -> list[list[Path]]:
+        progress.update(0, CHUNKS, "compiling")
+        works = [task.prepare(folder) for task in tasks]
+        parts = parts_that_fit([work.group for work in works])
+        files, checkpoints = [], []
+        for number, part in enumerate(parts):
+            part_works = [works[i] for i in part]
+            # The name identifies exactly these groups.
+            names = "".join(f"{work.group.fingerprint}{work.group.members}" for work in part_works)
+            checkpoints.append(folder / UNFINISHED / f"at-once-{hashlib.sha256(names.encode()).hexdigest()[:16]}.npz")
+            part_progress = Part(progress, number * CHUNKS, CHUNKS, len(parts) * CHUNKS)
+            files += _train(part_works, checkpoints[-1], part_progress, keeps_last=True)
+        # Only now, so that finished parts are not trained again if a later one is killed.
+        for checkpoint in checkpoints:
+            checkpoint.unlink(missing_ok=True)
+        return files
+
+    return carry_out_together(tasks, folder, notices, run)
+
+
+def _train(
+    works: Sequence[TrainingWork], checkpoint: Path, progress: Progress, *, keeps_last: bool = False
+) -> list[list[Path]]:
+    policies = train_groups(
+        [work.group for work in works],
+        checkpoint,
+        progress,
+        # Writing a checkpoint takes time in proportion to the policies.
+        checkpoint_s=works[0].checkpoint_s * len(works),
+        add_parts=[work.add_part for work in works],
+        keeps_last=keeps_last,
+    )
+    return [work.save(trained) for work, trained in zip(works, policies, strict=True)]
