@@ -587,7 +587,7 @@ def test_the_brainoware_recording(real_data: Path) -> None:
 
 
 def test_an_npz_of_counts_without_times_is_refused_by_its_keys(real_data: Path) -> None:
-    said = r"expected times of spikes .*only counts \(culture0_spikes_per_electrode.*bring the times"
+    said = r"expected times of spikes .*only counts \(culture0_spikes_per_electrode.*provide the times"
     with pytest.raises(AnimatError, match=said):
         read_recording(real_data / "rat_cortical_64ch_responses.npz")
 

@@ -248,8 +248,8 @@ def rat(real_data: Path, tmp_path: Path) -> list[str]:
 
 def test_a_real_table_is_inspected(rat: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", *rat, "--out", str(tmp_path / "figures")]) == 0
-    told = capsys.readouterr().out
-    assert "spikes on 64 channels" in told and "no times of spikes" in told
+    printed = capsys.readouterr().out
+    assert "spikes on 64 channels" in printed and "no spike times" in printed
     assert sorted(f.name for f in (tmp_path / "figures").iterdir()) == ["rat-burst-separation.png", "rat-responses.png"]
 
 

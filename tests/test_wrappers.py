@@ -223,6 +223,6 @@ def test_a_file_that_is_wrong_about_what_its_policy_sees_is_refused(seeing: Poli
     # Told again by its provenance, further on.
     assert whole.count(field) == 2
     for other in (b"0   ", b"null", b"[5] "):
-        (tmp_path / "other.safetensors").write_bytes(whole.replace(told, told.replace(b"true", other), 1))
+        (tmp_path / "other.safetensors").write_bytes(whole.replace(field, field.replace(b"true", other), 1))
         with pytest.raises(InvalidFile, match=r"a complete, consistent policy, got a faulty one: (weights|neural)"):
             Policy.load(tmp_path / "other.safetensors")
