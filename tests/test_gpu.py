@@ -79,7 +79,7 @@ class AtOnce(NamedTuple):
 def at_once() -> AtOnce:
     rows: list[list[np.ndarray]] = [[], []]
     policies = train_groups(
-        [group_of(arm, 0, 1) for arm in ARMS], None, Silent(), add_parts=[rows[0].append, rows[1].append]
+        [group_of(arm, 0, 1) for arm in ARMS], None, Silent(), add_chunks=[rows[0].append, rows[1].append]
     )
     return AtOnce(policies, rows)
 
@@ -96,7 +96,7 @@ def test_a_stack_of_simulators_is_to_each_policy_what_one_for_all_is(at_once: At
 @pytest.mark.oracle
 def test_at_once_or_in_groups_differs_in_last_bits_only_before_they_grow() -> None:
     brief = replace(SHORTEST, iterations=CHUNKS * SMALL.environments)
-    several = train_groups([group_of(brief, 0), group_of(brief, 1, 2)], None, Silent(), add_parts=[None, None])
+    several = train_groups([group_of(brief, 0), group_of(brief, 1, 2)], None, Silent(), add_chunks=[None, None])
     for policies, members in zip(several, ((0,), (1, 2)), strict=True):
         for one, other in zip(policies, train_group(group_of(brief, *members), None, Silent()), strict=True):
             jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-5), arrays(one), arrays(other))
@@ -111,9 +111,9 @@ def test_stopped_at_a_checkpoint_all_go_on_to_the_same_bits(at_once: AtOnce, tmp
 
     groups, checkpoint, rows = [group_of(arm, 0, 1) for arm in ARMS], tmp_path / "kept.npz", list[np.ndarray]()
     with pytest.raises(KeyboardInterrupt):
-        train_groups(groups, checkpoint, Stopping(), checkpoint_s=0.0, add_parts=[None, None])
+        train_groups(groups, checkpoint, Stopping(), checkpoint_s=0.0, add_chunks=[None, None])
     kept = Kept()
-    again = train_groups(groups, checkpoint, kept, add_parts=[None, rows.append])
+    again = train_groups(groups, checkpoint, kept, add_chunks=[None, rows.append])
     assert [done for done, _ in kept.updates] == [CHUNKS - 2, CHUNKS - 1, CHUNKS]
     assert_same(chain(*again), chain(*at_once.policies))
     np.testing.assert_array_equal(rows, at_once.rows[1])
@@ -260,7 +260,7 @@ def test_what_does_not_fit_into_memory_is_trained_in_parts(tmp_path: Path, monke
     done = train_together(tasks, tmp_path, notices)
     assert [list(each.files) for each in done] == [[f"p{i}.safetensors"] for i in range(3)]
     groups = [task.prepare(tmp_path).group for task in tasks]
-    wanted = [*train_groups(groups[:2], None, Silent(), add_parts=[None] * 2), train_group(groups[2], None, Silent())]
+    wanted = [*train_groups(groups[:2], None, Silent(), add_chunks=[None] * 2), train_group(groups[2], None, Silent())]
     assert_same([Policy.load(tmp_path / f"p{i}.safetensors") for i in range(3)], chain(*wanted))
 
 

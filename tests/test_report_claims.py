@@ -452,7 +452,7 @@ def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> N
     figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
     said = legend(figure)
     assert {
-        "optimal return, rough grid",
+        "optimal return, coarse grid",
         "optimal return, fine grid",
         "random actions",
         "linear",
@@ -460,7 +460,7 @@ def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> N
     } <= said
     assert "2 more arms" in figure.axes[0].get_title(loc="left")
     colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
-    (dashed,) = [line for line in figure.axes[0].lines if "rough" in str(line.get_label())]
+    (dashed,) = [line for line in figure.axes[0].lines if "coarse" in str(line.get_label())]
     assert len(colours) == 6 and dashed.get_color() not in colours
 
 

@@ -108,7 +108,7 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     assert block(before, "Entropy")["words"].startswith("Not in these files")
     stopped = TrainingView(tmp_path).view(None, 8.0)
     assert stopped["state"] == "silent"
-    assert "start it again and it continues" in stopped["message"]
+    assert "run its command again to continue" in stopped["message"]
     # As all are trained at once: numbers in the file, and words of the first job alone.
     (tmp_path / ".unfinished" / "from-p0.npz").unlink()
     np.savez(tmp_path / ".unfinished" / "at-once-ab.npz", curve=curve, members=np.array([1, 2]), done=np.array(30))
@@ -192,7 +192,7 @@ def test_a_study_over_cultures_shows_progress_and_comparisons_so_far(tmp_path: P
     assert view.about()["title"] == "study over 5 cultures"
     failed = view.view(None, 8.0)
     assert (failed["state"], facts(failed, "Cultures")["failed"]) == ("ended", 1)
-    assert failed["message"] == "1 of the cultures failed; start the study again and it continues"
+    assert failed["message"] == "1 of the cultures failed; run the study again to continue"
     assert block(failed, "Failed")["rows"] == [[names[4], "no responses"]]
     for damage in (b"comparison,robot,mean_first,mean_second\na and b,arm,nan,4", b"\xff\x00", b"comparison\nx"):
         (tmp_path / names[0] / "tables" / "comparisons.csv").write_bytes(damage)

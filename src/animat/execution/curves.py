@@ -25,10 +25,10 @@ class CurveFile:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._path.write_text("")
 
-    def add(self, part: Float64[ndarray, "policies columns"]) -> None:
+    def add(self, chunk: Float64[ndarray, "policies columns"]) -> None:
         """Add one chunk of the training, one row per policy."""
         with self._path.open("a") as file:
-            file.write(json.dumps(part.tolist()) + "\n")
+            file.write(json.dumps(chunk.tolist()) + "\n")
 
 
 class Curves:
@@ -69,14 +69,14 @@ class Curves:
                 continue
             self._n_bytes[members[0]] = len(text)
             # The last line may be incomplete.
-            parts = [json.loads(line) for line in text.split("\n")[:-1]]
+            chunks = [json.loads(line) for line in text.split("\n")[:-1]]
             for column, member in enumerate(members):
-                for part in parts[self._n_reported[member] :]:
-                    self._report(member, part[column])
+                for chunk in chunks[self._n_reported[member] :]:
+                    self._report(member, chunk[column])
 
-    def add(self, members: Sequence[int], part: Float64[ndarray, "policies columns"]) -> None:
+    def add(self, members: Sequence[int], chunk: Float64[ndarray, "policies columns"]) -> None:
         """Report one chunk of a group that is trained in this process."""
-        for member, row in zip(members, part.tolist(), strict=True):
+        for member, row in zip(members, chunk.tolist(), strict=True):
             self._report(member, row)
 
     def _report(self, member: int, numbers: Sequence[float]) -> None:

@@ -177,8 +177,8 @@ class TrainGroup(TrainingTask):
     def prepare(self, folder: Path) -> TrainingWork:
         self.training.register()
         checkpoint = folder / UNFINISHED / f"from-p{self.group.members[0]}.npz"
-        add_part = CurveFile(folder, self.group.members[0]).add if self.writes_rows else None
-        return TrainingWork(self.group, folder, checkpoint, self.checkpoint_s, add_part)
+        add_chunk = CurveFile(folder, self.group.members[0]).add if self.writes_rows else None
+        return TrainingWork(self.group, folder, checkpoint, self.checkpoint_s, add_chunk)
 
 
 def _phase_of(groups: Sequence[Group], progress: Progress | None) -> Progress:
@@ -209,6 +209,6 @@ def _train_in_memory(
     curves = Curves(None, [group.members for group in groups], callbacks, progress)
     for number, group in enumerate(groups):
         part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
-        policies = train_group(group, None, part, add_part=partial(curves.add, group.members) if callbacks else None)
+        policies = train_group(group, None, part, add_chunk=partial(curves.add, group.members) if callbacks else None)
         trained |= {f"p{member}": policy for member, policy in zip(group.members, policies, strict=True)}
     return trained

@@ -12,7 +12,7 @@ from typing import Any
 from animat.execution.task import UNFINISHED, Task, TaskResult, carry_out_together
 from animat.progress import Part, Progress
 from animat.training.folder import write_description
-from animat.training.group import CHECKPOINT_S, AddPart, Group, save_policies, train_groups
+from animat.training.group import CHECKPOINT_S, AddChunk, Group, save_policies, train_groups
 from animat.training.memory import parts_that_fit
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
@@ -27,7 +27,7 @@ class TrainingWork:
         place: the folder of its policies.
         checkpoint: the file of its checkpoint if it is trained alone.
         checkpoint_s: seconds between checkpoints.
-        add_part: as in `animat.training.group.train_group`.
+        add_chunk: as in `animat.training.group.train_group`.
         description: a description to write next to the policies; None: it already exists.
     """
 
@@ -35,7 +35,7 @@ class TrainingWork:
     place: Path
     checkpoint: Path
     checkpoint_s: float = CHECKPOINT_S
-    add_part: AddPart | None = None
+    add_chunk: AddChunk | None = None
     description: dict[str, Any] | None = None
 
     def save(self, policies: Sequence[Policy]) -> list[Path]:
@@ -104,7 +104,7 @@ def _train(
         progress,
         # Writing a checkpoint takes time in proportion to the policies.
         checkpoint_s=works[0].checkpoint_s * len(works),
-        add_parts=[work.add_part for work in works],
+        add_chunks=[work.add_chunk for work in works],
         keeps_last=keeps_last,
     )
     return [work.save(trained) for work, trained in zip(works, policies, strict=True)]

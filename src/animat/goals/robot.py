@@ -85,7 +85,7 @@ class RobotWithGoal(Robot[GoalState]):
         if not isinstance(self.goal, Goal):
             raise InvalidArgument(f"goal: expected a Goal, or a string for with_goal, got {shown(self.goal)}")
         if len(self._spec) != len(robot.observation_spec):
-            raise InvalidArgument(f"goal: expected quantities of different names, got two alike in {robot.name}")
+            raise InvalidArgument(f"goal: expected quantities of different names, {robot.name} has one name twice")
         _ = self._objectives
         # Other robots have these as class attributes.
         for name in ("name", "n_commands", "noise_size", "paper_iterations", "baseline_commands", "episode_limit"):

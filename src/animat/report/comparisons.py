@@ -68,10 +68,10 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
         label = f"{stars(row.p_holm)}  p corrected = {cell(row.p_holm)}, U = {row.u:g}"
         whole.text(0.5, high + 0.08 * room, label, ha="center", va="bottom", fontsize=8)
         whole.set_ylim(low, high + 0.2 * room)
-        for axes, title in ((whole, f"at {row.at_min:g} min"), (close, "enlarged")):
+        for axes, heading in ((whole, f"at {row.at_min:g} min"), (close, "enlarged")):
             axes.set_xlim(-0.6, 1.6)
             axes.set_xticks([0, 1], [_name(row.first, row.score_first), _name(row.second, row.score_second)])
-            style_axes(axes, title, "", "mean return of a policy")
+            style_axes(axes, heading, "", "mean return of a policy")
     add_common_legend(figure, list(rows[0]), columns=2)
     return figure
 

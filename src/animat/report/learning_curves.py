@@ -19,18 +19,18 @@ class LearningCurve:
 
     Attributes:
         name: of the arm.
-        iterations: done at the end of each part of training, shape (parts,).
+        iterations: done at the end of each chunk of training, shape (chunks,).
         returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known, shape
-            (policies, parts).
-        random, optimum: return of random actions and optimal return with the simulator in use in each part, NaN if not
-            known, shape (parts,); None if known for no part.
+            (policies, chunks).
+        random, optimum: return of random actions and optimal return with the simulator in use in each chunk, NaN if not
+            known, shape (chunks,); None if known for no chunk.
     """
 
     name: str
-    iterations: Float64[np.ndarray, " parts"]
-    returns: Float64[np.ndarray, "policies parts"]
-    random: Float64[np.ndarray, " parts"] | None = None
-    optimum: Float64[np.ndarray, " parts"] | None = None
+    iterations: Float64[np.ndarray, " chunks"]
+    returns: Float64[np.ndarray, "policies chunks"]
+    random: Float64[np.ndarray, " chunks"] | None = None
+    optimum: Float64[np.ndarray, " chunks"] | None = None
 
 
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
@@ -54,7 +54,7 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
             ("random actions", curve.random, GREY, ":"),
         ):
             if levels is not None:
-                # A level holds up to the end of its part; the first part begins at 0.
+                # A level holds up to the end of its chunk; the first chunk begins at 0.
                 steps = np.append(0.0, x), np.append(levels[:1], levels)
                 axes.step(*steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name)
         style_axes(axes, curve.name, "iterations (thousands)", "return")
@@ -64,20 +64,20 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
 
 
 def over_rounds(
-    iterations: Float64[np.ndarray, " parts"],
-    episodes: Float64[np.ndarray, "policies parts"],
-    returns: Float64[np.ndarray, "policies parts"],
+    iterations: Float64[np.ndarray, " chunks"],
+    episodes: Float64[np.ndarray, "policies chunks"],
+    returns: Float64[np.ndarray, "policies chunks"],
     longest: int,
-) -> Float64[np.ndarray, "policies parts"]:
-    """The mean return of the episodes that ended within the round before the end of each part.
+) -> Float64[np.ndarray, "policies chunks"]:
+    """The mean return of the episodes that ended within the round before the end of each chunk.
 
     In a round every environment ends at least one episode. The episodes that end in a shorter time are a biased sample:
     first the short ones, which succeeded or failed early, and later the long ones, as environments that begin together
     stay in step.
 
     Args:
-        iterations: done at the end of each part, by all environments together.
-        episodes: number that ended in each part.
+        iterations: done at the end of each chunk, by all environments together.
+        episodes: number that ended in each chunk.
         returns: their mean return; NaN if there are none.
         longest: iterations of a round: those of the longest possible episode, times the number of environments.
 
@@ -85,7 +85,7 @@ def over_rounds(
         Mean returns; NaN before the end of the first round. If training is shorter than a round, all of it is one.
     """
     longest_known = min(float(longest), float(iterations[-1]))
-    # The number of parts that ended at least a round before the end of each.
+    # The number of chunks that ended at least a round before the end of each.
     before = np.searchsorted(iterations, iterations - longest_known, side="right")
     sums = [np.cumsum(of, axis=1) for of in (np.where(episodes > 0, episodes * returns, 0.0), episodes)]
     total, count = (np.concatenate([np.zeros((len(of), 1)), of], axis=1) for of in sums)
@@ -95,11 +95,11 @@ def over_rounds(
 
 
 def mean_with_interval(
-    returns: Float64[np.ndarray, "policies parts"],
-) -> tuple[Float64[np.ndarray, " parts"], Float64[np.ndarray, " parts"], Float64[np.ndarray, " parts"]]:
-    """The mean over policies in each part and its 95 % bootstrap interval; NaN if no episode of any policy ended.
+    returns: Float64[np.ndarray, "policies chunks"],
+) -> tuple[Float64[np.ndarray, " chunks"], Float64[np.ndarray, " chunks"], Float64[np.ndarray, " chunks"]]:
+    """The mean over policies in each chunk and its 95 % bootstrap interval; NaN if no episode of any policy ended.
 
-    The same resampled policies are used in all parts, as each policy is one sample.
+    The same resampled policies are used in all chunks, as each policy is one sample.
     """
     known = np.isfinite(returns)
     filled = np.where(known, returns, 0.0)

@@ -42,7 +42,7 @@ class Courses:
         title: the mapping.
         courses: of the arms, with the same minutes; at most `MOST` are drawn.
         random: return of random actions at the same minutes; None if not known.
-        optimum: optimal return on a rough grid at the same minutes; None if not known.
+        optimum: optimal return on a coarse grid at the same minutes; None if not known.
         fine_optimum: pairs of a minute and the optimal return on a fine grid, for some minutes.
         left_out: number of arms that are not drawn.
     """
@@ -70,7 +70,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
         minutes = of.courses[0].minutes
         if of.optimum is not None:
-            name = "optimal return, rough grid"
+            name = "optimal return, coarse grid"
             axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=name)
         if of.fine_optimum:
             points = zip(*of.fine_optimum, strict=True)

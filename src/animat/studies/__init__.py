@@ -1,1 +1,1 @@
-"""Studies: a specification, its jobs, the folder that they fill, and going on where one stopped."""
+"""Studies: a specification, its jobs, the folder that they fill, and resuming one that was stopped."""

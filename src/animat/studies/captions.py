@@ -69,7 +69,7 @@ ROBOT: dict[str, tuple[str, str]] = {
         "with its 95 % bootstrap interval. Each point is the mean over the episodes that ended within the {round} "
         "iterations before, in which every environment ends at least one. Curves begin there, because the first "
         "episodes to end are not a representative sample. Actions are drawn. Lines: random actions and the optimal "
-        "return with the simulator in use, which changes with it (from the second recording on: on a rough grid). A "
+        "return with the simulator in use, which changes with it (from the second recording on: on a coarse grid). A "
         "control has no such return: whatever it chooses is as good as random.",
     ),
     "comparisons": (
@@ -85,7 +85,7 @@ ROBOT: dict[str, tuple[str, str]] = {
         "The same policies on the simulator of each recording: median and quartiles over {policies} policies of "
         "{episodes_over_time} episodes each, with the optimal return. A fall that the optimal return shares is due to "
         "the simulator: to the culture, and to what its bins keep of it. A steeper fall is due to the policy. The "
-        "optimal return at every recording is on a rough grid, which can lie slightly below the fine one, and is left "
+        "optimal return at every recording is on a coarse grid, which can lie slightly below the fine one, and is left "
         "out for mappings without steps, such as linear.",
     ),
     "controls": (

@@ -230,7 +230,7 @@ class Measure(RobotTask):
                 progress=EqualPhases(progress, 4),
             )
         if gap.session.ending.by != "plan":
-            raise AnimatError(f"the session ended early: {gap.session.ending.message}; start again to continue")
+            raise AnimatError(f"the session ended early: {gap.session.ending.message}; run the study again to continue")
         fields = gap.to_dict()
         # Left out: the session, whose folder and times differ from run to run.
         kept = {name: fields[name] for name in ("robot", "mapping", "rows", "optimum", "verdict", "reasons")}

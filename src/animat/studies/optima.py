@@ -1,4 +1,4 @@
-"""Jobs that compute optimal returns: at the minutes of the comparisons, and on a rough grid at every recording."""
+"""Jobs that compute optimal returns: at the minutes of the comparisons, and on a coarse grid at every recording."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class FindOptima(StudyTask):
     For a robot without a grid the table is empty.
 
     Attributes:
-        over_time: at every recording, on a rough grid, without the controller's return and without an interval;
+        over_time: at every recording, on a coarse grid, without the controller's return and without an interval;
             otherwise at the minutes at which anything is evaluated.
     """
 

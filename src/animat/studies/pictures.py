@@ -95,7 +95,7 @@ class RobotPictures(StudyTask):
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
-        # For every recording, with the optimum on a rough grid.
+        # For every recording, with the optimum on a coarse grid.
         rough = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
@@ -168,13 +168,13 @@ def round_of(study: Study, spec: RobotSpec) -> int:
     return spec.robot().episode_limit * read_record(SAC, study.algorithm, "algorithm").environments
 
 
-def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, parts: int) -> list[float]:
-    """The minute of the recording in use in each part of training."""
+def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, chunks: int) -> list[float]:
+    """The minute of the recording in use in each chunk of training."""
     if timeline is None or not arm.through_neurons:
-        return [span_min(timeline)[1]] * parts
+        return [span_min(timeline)[1]] * chunks
     start, _ = span_min(timeline)
-    share = 1 / parts if arm.shadowing else 0.0
-    rows = [timeline.row_at(start + study.training_min * share * part) for part in range(parts)]
+    share = 1 / chunks if arm.shadowing else 0.0
+    rows = [timeline.row_at(start + study.training_min * share * chunk) for chunk in range(chunks)]
     return [float(timeline.start_min[row]) for row in rows]
 
 

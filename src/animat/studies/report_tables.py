@@ -128,7 +128,7 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
         "error: a return that is achievable. The optimal return lies between the two; scores use the value, the upper "
         "end. Highlighted: the two differ by more than 3 standard errors and the grid's error. Without clock: the same "
         "controller without knowledge of the time left, which policies do not have either. Optima at every recording, "
-        "on a rough grid, are in optima/." + left_out,
+        "on a coarse grid, are in optima/." + left_out,
         beside="tables/optima.csv",
         marked=tuple(i for i, row in enumerate(optima) if row.findings()),
     )
@@ -167,7 +167,7 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
     )
     if kinds:
         mapping = mapping_label(*kinds[0].kind)
-        note += f" Optimum: the optimal return with {mapping} on a rough grid."
+        note += f" Optimum: the optimal return with {mapping} on a coarse grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all of them."
     return Table(

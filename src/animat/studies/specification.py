@@ -248,7 +248,7 @@ class Study:
         episodes: of each policy where no comparison says otherwise, and of controls.
         episodes_over_time: of each policy at every recording.
         actions: how policies act in evaluation: the most probable action, or drawn as in training.
-        optimum_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and rough.
+        optimum_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and coarse.
         optimum_episodes: episodes in which the optimal controller's return is checked.
         algorithm: settings of `animat.training.settings.SAC` that replace its defaults.
         paper: whether the paper's results are printed with comparisons of the same name and robot.

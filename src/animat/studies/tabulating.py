@@ -109,7 +109,7 @@ def _findings(study: Study, timeline: SimulatorTimeline | None, optima: Iterable
 class References:
     """Mean returns of random actions and optimal returns on a robot, for every mapping and minute.
 
-    With `over_time`: of the few episodes at every recording, with the optimum on a rough grid.
+    With `over_time`: of the few episodes at every recording, with the optimum on a coarse grid.
     """
 
     def __init__(

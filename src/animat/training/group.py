@@ -41,7 +41,7 @@ CHECKPOINT_S = 2.0
 
 
 Rows = TypeVar("Rows", list[Policy], np.ndarray)
-AddPart: TypeAlias = Callable[[Float64[np.ndarray, "policies columns"]], None]
+AddChunk: TypeAlias = Callable[[Float64[np.ndarray, "policies columns"]], None]
 """A function that takes one chunk of the learning curves, one row per policy; columns as `CURVE`."""
 
 
@@ -70,7 +70,7 @@ def train_group(
     progress: Progress,
     *,
     checkpoint_s: float = CHECKPOINT_S,
-    add_part: AddPart | None = None,
+    add_chunk: AddChunk | None = None,
 ) -> list[Policy]:
     """Train a group of policies, resuming from its checkpoint if there is one.
 
@@ -82,12 +82,12 @@ def train_group(
             no checkpoint is written.
         progress: updated after each chunk with the number done and the mean return of the episodes that ended in it.
         checkpoint_s: seconds between checkpoints; they change how much is repeated, never the result.
-        add_part: called with each chunk of the learning curves, one row per policy, those from the checkpoint first.
+        add_chunk: called with each chunk of the learning curves, one row per policy, those from the checkpoint first.
 
     Raises:
         InvalidFile: if the checkpoint cannot be read or written, or is of another training.
     """
-    return train_groups([group], checkpoint, progress, checkpoint_s=checkpoint_s, add_parts=[add_part])[0]
+    return train_groups([group], checkpoint, progress, checkpoint_s=checkpoint_s, add_chunks=[add_chunk])[0]
 
 
 def train_groups(
@@ -96,7 +96,7 @@ def train_groups(
     progress: Progress,
     *,
     checkpoint_s: float = CHECKPOINT_S,
-    add_parts: Sequence[AddPart | None],
+    add_chunks: Sequence[AddChunk | None],
     keeps_last: bool = False,
 ) -> list[list[Policy]]:
     """Train several groups of policies at once, as `train_group` does with one; returns the policies of each.
@@ -106,20 +106,20 @@ def train_groups(
     Args:
         groups: groups that one program can train (`animat.execution.gpu.group_by_program`).
         checkpoint, progress, checkpoint_s: as in `train_group`.
-        add_parts: `add_part` of each group, or None.
+        add_chunks: `add_chunk` of each group, or None.
         keeps_last: whether a checkpoint is also written at the end, from which the same policies can be restored.
     """
     together = SideBySide(*groups)
     done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
     simulators = [_simulators_of(group) for group in groups]
 
-    def pass_on(part: Float64[np.ndarray, "policies columns"]) -> None:
-        for rows, add_part in zip(together.split(part), add_parts, strict=True):
-            if add_part is not None:
-                add_part(rows)
+    def pass_on(chunk: Float64[np.ndarray, "policies columns"]) -> None:
+        for rows, add_chunk in zip(together.split(chunk), add_chunks, strict=True):
+            if add_chunk is not None:
+                add_chunk(rows)
 
-    for part in together.curve:
-        pass_on(part)
+    for chunk in together.curve:
+        pass_on(chunk)
     written = time.monotonic()
     for index in range(done, CHUNKS):
         mean_return = together.train(index, *(simulator_at(index) for simulator_at in simulators))

@@ -185,7 +185,7 @@ class _Chunks:
         finished = Finished(np.zeros(members), np.zeros(members))  # type: ignore[arg-type]
         if int(last_round) == int(first_round):
             return learners, finished
-        learners, bodies = self._standing(learners)
+        learners, bodies = self._restore(learners)
         learners, acted = self._act(learners, simulator)
         for index in range(int(first_round), int(last_round)):
             commands = np.asarray(acted.command).reshape(len(self._seeds), -1)
@@ -199,10 +199,10 @@ class _Chunks:
             )
             if len(ended):
                 finished = Finished(*(a + np.asarray(b) for a, b in zip(finished, of_round, strict=True)))
-        standing = self._by_policy(bodies.snapshot)
-        return learners._replace(episodes=learners.episodes._replace(robot=standing)), finished
+        snapshot = self._by_policy(bodies.snapshot)
+        return learners._replace(episodes=learners.episodes._replace(robot=snapshot)), finished
 
-    def _standing(self, learners: Learner) -> tuple[Learner, Bodies]:
+    def _restore(self, learners: Learner) -> tuple[Learner, Bodies]:
         """The bodies, placed as the learners have them, and learners that hold only their observations."""
         flat = Snapshot(
             *(np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)

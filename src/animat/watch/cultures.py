@@ -48,7 +48,7 @@ class CulturesView(View):
         if failed and state["state"] == "silent":
             state = {
                 "state": "ended",
-                "message": f"{len(failed)} of the cultures failed; start the study again and it continues",
+                "message": f"{len(failed)} of the cultures failed; run the study again to continue",
             }
         rows: list[tuple[str, Any]] = [
             ("cultures done", f"{len(done):,} of {len(names):,}"),

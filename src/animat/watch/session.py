@@ -55,23 +55,23 @@ class SessionView(View):
 
     def about(self) -> dict[str, Any]:
         self._look()
-        header, words = self._header, self._words
-        loop, channels = mapped(words.get("loop")), header.channels
+        header, fields = self._header, self._fields
+        loop, channels = mapped(fields.get("loop")), header.channels
         robot = text(mapped(loop.get("robot")).get("name", "robot"))
         return {
             "generation": self.tail.generation,
-            "title": f"{robot} on the {text(words.get('culture', ''))} culture",
+            "title": f"{robot} on the {text(fields.get('culture', ''))} culture",
             "conditions": list(map(text, header.conditions)),
-            "agents": [text(agent.get("name")) for agent in map(mapped, listed(words.get("agents")))],
+            "agents": [text(agent.get("name")) for agent in map(mapped, listed(fields.get("agents")))],
             "observed": list(map(text, header.observed)),
             "readouts": list(map(text, header.readouts)),
             "mapping": text(mapped(loop.get("mapping")).get("name", loop.get("mapping"))),
             "thresholds": _thresholds(loop.get("mapping")),
             "adaptive": bool(loop.get("adaptive")),
             "percentiles_hz": first_readout(listed(loop.get("percentiles"))),
-            "planned": len(listed(words.get("turns"))),
-            "limits": {text(name): number(value) for name, value in mapped(words.get("limits")).items()},
-            "account": {text(name): number(value) for name, value in mapped(words.get("account")).items()},
+            "planned": len(listed(fields.get("turns"))),
+            "limits": {text(name): number(value) for name, value in mapped(fields.get("limits")).items()},
+            "account": {text(name): number(value) for name, value in mapped(fields.get("account")).items()},
             "is_drawn": is_drawn(loop),
             "channels": {
                 "x_um": list(map(number, channels.x_um.tolist())),
@@ -140,17 +140,17 @@ class SessionView(View):
     def robot_data(self) -> dict[str, Any]:
         """The header's description of the robot and its goal."""
         self._look()
-        return mapped(self._words.get("loop"))
+        return mapped(self._fields.get("loop"))
 
     def _look(self) -> bool:
         """Find new records in the log; False if there are more than could be found in time."""
         is_whole = self.tail.grow(_GROW_S)
-        if self._generation != self.tail.generation or not hasattr(self, "_words"):
+        if self._generation != self.tail.generation or not hasattr(self, "_fields"):
             first = self.tail.record(0)
             if first is None:
                 raise InvalidFile(f"{self.tail.path}: expected a log of a session, got one without a whole beginning")
             self._header: Header = read_header(self.tail.path, first.fields)
-            self._words = first.fields
+            self._fields = first.fields
             self._sums = Sums(self.tail)
             self._generation = self.tail.generation
         return is_whole
@@ -165,11 +165,11 @@ class SessionView(View):
             self._agents_at = outline.ticks, self._generation
             episodes = outline.episodes
             self._done = sum(episode.is_whole for episode in episodes)
-            self._agents = by_agent(episodes, self._words)
+            self._agents = by_agent(episodes, self._fields)
             self._agents_until_s = time.monotonic() + _AGENTS_S
         done = self._done
         last = self._last_tick()
-        planned, wall_s = len(listed(self._words.get("turns"))), number(mapped(last).get("wall_s"))
+        planned, wall_s = len(listed(self._fields.get("turns"))), number(mapped(last).get("wall_s"))
         # The time before the first move is spent only once.
         moving_s = None if wall_s is None else wall_s - (number(outline.moved_at_s) or 0.0)
         left_s = None if not done or moving_s is None else moving_s * (planned - done) / done
@@ -201,7 +201,7 @@ class SessionView(View):
         damage = self.tail.damage
         if last.get("kind") == "end":
             state, message = "ended", text(last.get("message"))
-        elif silent_s < _SILENT_S + (number(mapped(self._words.get("loop")).get("pause_s")) or 0.0):
+        elif silent_s < _SILENT_S + (number(mapped(self._fields.get("loop")).get("pause_s")) or 0.0):
             # A record that is just being written looks like a truncated one.
             state, message, damage = "running", "stopping" if stop else "", ""
         elif is_locked(self.folder):
@@ -284,9 +284,9 @@ def _plain(value: Any) -> float | bool | None:
     return value if isinstance(value, bool) else number(value)
 
 
-def _span(words: dict[str, Any]) -> tuple[float, float] | None:
-    start, duration = number(words.get("start_s")), number(words.get("duration_s"))
-    if words.get("kind") != "seen" or start is None or duration is None or number(start + duration) is None:
+def _span(fields: dict[str, Any]) -> tuple[float, float] | None:
+    start, duration = number(fields.get("start_s")), number(fields.get("duration_s"))
+    if fields.get("kind") != "seen" or start is None or duration is None or number(start + duration) is None:
         return None
     return start, start + duration
 

@@ -34,6 +34,6 @@ def state_of(folder: Path, changed_s: float, *, is_done: bool) -> dict[str, Any]
         return {"state": "running", "message": ""}
     message = (
         "no program is working in the folder: the run was stopped, was killed or failed (its command then reported "
-        "why); start it again and it continues"
+        "why); run its command again to continue"
     )
     return {"state": "silent", "message": message}

@@ -65,25 +65,25 @@ class Sums:
         """The share of the log's records that are counted."""
         return self.counted / max(1, len(self._tail))
 
-    def _add(self, words: dict[str, Any]) -> None:
+    def _add(self, fields: dict[str, Any]) -> None:
         total = math.nan
         try:
-            _expect_fit(words)
-            self.outline.add(words)
-            kind = words["kind"]
+            _expect_fit(fields)
+            self.outline.add(fields)
+            kind = fields["kind"]
             if kind == "seen":
-                self._end_s = float(words["start_s"]) + float(words["duration_s"])
-                for _, _, _, electrodes in words["stimuli"]:
+                self._end_s = float(fields["start_s"]) + float(fields["duration_s"])
+                for _, _, _, electrodes in fields["stimuli"]:
                     self.on_electrode.update(electrodes)
-                if words["tick"]:
-                    total = self._add_tick(words["tick"])
+                if fields["tick"]:
+                    total = self._add_tick(fields["tick"])
             elif kind == "event":
                 self.n_faults += 1
-                when, what = number(words.get("asked_at_s")), f"{text(words['what'])}: {text(words['message'])}"
+                when, what = number(fields.get("asked_at_s")), f"{text(fields['what'])}: {text(fields['message'])}"
                 self.faults = [*self.faults, (when, what)][-_MOST_FAULTS:]
             # Older sessions have separate records for them.
-            if "percentiles_hz" in words:
-                self.percentiles.append((self._end_s, first_readout(words["percentiles_hz"])))
+            if "percentiles_hz" in fields:
+                self.percentiles.append((self._end_s, first_readout(fields["percentiles_hz"])))
                 if len(self.percentiles) > _MOST_THRESHOLDS:
                     del self.percentiles[1::2]
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError):
@@ -102,9 +102,9 @@ def first_readout(percentiles: Any) -> list[float | None]:
     return numbers(percentiles[0] if percentiles and isinstance(percentiles[0], list) else percentiles)
 
 
-def _expect_fit(words: dict[str, Any]) -> None:
+def _expect_fit(fields: dict[str, Any]) -> None:
     """Raise ValueError for a record that cannot be counted: it would spoil the sums for good."""
-    tick, kind = words.get("tick"), words["kind"]
+    tick, kind = fields.get("tick"), fields["kind"]
     if kind == "seen" and tick:
         fits = all(isinstance(tick[name], kind) for name, kind in _KINDS.items())
         fits &= None not in (number(tick["late_s"]), number(tick["frequency_hz"]), whole(tick["episode"]))
@@ -112,9 +112,9 @@ def _expect_fit(words: dict[str, Any]) -> None:
             raise ValueError("tick")
         if tick["reward"] is not None and number(tick["reward"]) is None:
             raise ValueError("reward")
-    elif kind == "start" and (whole(words["episode"]) is None or not isinstance(words["observation"], list)):
+    elif kind == "start" and (whole(fields["episode"]) is None or not isinstance(fields["observation"], list)):
         raise ValueError("start")
-    elif kind in ("asked", "event") and not isinstance(words.get("stimuli", []), list):
+    elif kind in ("asked", "event") and not isinstance(fields.get("stimuli", []), list):
         raise ValueError("stimuli")
-    if words.get("stretch") is not None and whole(words["stretch"]) is None:
+    if fields.get("stretch") is not None and whole(fields["stretch"]) is None:
         raise ValueError("stretch")

@@ -71,8 +71,8 @@ class Tail:
                 begin, block = place, os.pread(self._file, _BLOCK_BYTES, place)
                 if len(block) < HEAD.size:
                     break
-            mark, n_words, n_spikes, _ = HEAD.unpack_from(block, place - begin)
-            end = place + HEAD.size + n_words + 12 * n_spikes
+            mark, n_fields, n_spikes, _ = HEAD.unpack_from(block, place - begin)
+            end = place + HEAD.size + n_fields + 12 * n_spikes
             if mark != RECORD or end - place > _MOST_BYTES or place == self._damaged_at:
                 self.damage = f"{size - place:,} bytes after the last whole record are damaged"
                 break
@@ -99,7 +99,7 @@ class Tail:
         return record
 
     def peek(self, number: int) -> dict[str, Any] | None:
-        """The words of a record, without keeping it; None if it is not whole."""
+        """The fields of a record, without keeping it; None if it is not whole."""
         if (kept := self._kept.get(number)) is not None:
             return kept.fields
         return self._read(number, parse_fields)

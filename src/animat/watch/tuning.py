@@ -81,7 +81,7 @@ def _finals(folder: Path) -> dict[str, Any]:
         for row in finals
     ]
     head = ["trial", "mean return", "standard error", "settings"]
-    note = "With all policies of the study, other random numbers and new episodes." if rows else "none is known"
+    note = "With all policies of the study, different random numbers and fresh episodes." if rows else "none is known"
     return table("Retrained", head, rows, note, width="whole")
 
 

@@ -106,14 +106,14 @@ class _Reading:
         self._conditions, self._turns = conditions, Counter[str]()
         self._starts: dict[int, tuple[float, ...]] = {}
 
-    def add(self, words: dict[str, Any]) -> None:
-        if words["kind"] == "start":
-            self._starts[words["episode"]] = tuple(words["observation"])
-        elif words["kind"] == "seen":
-            if words.get("start_s") is not None:
-                self.stop_s = max(self.stop_s, words["start_s"] + words["duration_s"])
-            if words["tick"]:
-                self._add_tick(words["tick"])
+    def add(self, fields: dict[str, Any]) -> None:
+        if fields["kind"] == "start":
+            self._starts[fields["episode"]] = tuple(fields["observation"])
+        elif fields["kind"] == "seen":
+            if fields.get("start_s") is not None:
+                self.stop_s = max(self.stop_s, fields["start_s"] + fields["duration_s"])
+            if fields["tick"]:
+                self._add_tick(fields["tick"])
 
     def _add_tick(self, tick: dict[str, Any]) -> None:
         before = self.moments[-1] if self.moments else None
