@@ -71,8 +71,8 @@ class Tail:
                 begin, block = place, os.pread(self._file, _BLOCK_BYTES, place)
                 if len(block) < HEAD.size:
                     break
-            mark, n_fields, n_spikes, _ = HEAD.unpack_from(block, place - begin)
-            end = place + HEAD.size + n_fields + 12 * n_spikes
+            mark, fields_size, n_spikes, _ = HEAD.unpack_from(block, place - begin)
+            end = place + HEAD.size + fields_size + 12 * n_spikes
             if mark != RECORD or end - place > _MOST_BYTES or place == self._damaged_at:
                 self.damage = f"{size - place:,} bytes after the last whole record are damaged"
                 break
