@@ -189,8 +189,8 @@ def test_the_papers_burst_rule_is_reported_with_what_it_would_leave_out() -> Non
     words = dict(decisions(paper_study(), [one_peak, two_groups, flat]))["Bursts"]
     assert words == (
         "In the paper Otsu's threshold is always applied. Here it is applied only where the ratios of active channels "
-        "form two groups; elsewhere no response is set apart. That is so in 1 of 3 recordings, which keep 3 of 39 "
-        "responses that the paper's rule would leave out."
+        "form two groups; elsewhere no response is set apart. In 1 of 3 recordings this keeps responses that the "
+        "paper's rule would leave out, 3 of 39 in total."
     )
     assert dict(decisions(paper_study()))["Bursts"].endswith("elsewhere no response is set apart.")
     given = replace(paper_study(), simulators=Simulators(burst_threshold=0.5))

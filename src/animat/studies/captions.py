@@ -37,9 +37,9 @@ CULTURE: dict[str, tuple[str, str]] = {
     "responses": (
         "responses to each stimulus",
         "How large the responses to each stimulus are, without bursts (n: how many). The further apart the histograms "
-        "lie, the more a controller can do. The dashed line is P50, the median over all stimuli. The neuron "
-        "simulators are made of these numbers of the first recording. Outlines, with a dotted P50: the last recording, "
-        "where there are several; they show how far the culture moved in between.",
+        "lie, the more a controller can do. The dashed line is P50, the median over all stimuli. These are the numbers "
+        "of the first recording, from which its neuron simulator is made. Outlines, with a dotted P50: the last "
+        "recording, where there are several; they show how far the culture moved in between.",
     ),
     "over-time": (
         "each stimulus over time",
@@ -59,7 +59,7 @@ BURSTS = (
     "A response to the right of the dashed threshold counts as a burst, as in the last panel. Bursts occur regardless "
     "of the stimulus and are left out."
 )
-NO_BURSTS = "Here no response is classified as a burst, so there is no threshold."
+NO_BURSTS = "Here no response is set apart as a burst, so there is no threshold."
 """Of `bursts`, for {cut}."""
 
 ROBOT: dict[str, tuple[str, str]] = {
@@ -96,8 +96,8 @@ ROBOT: dict[str, tuple[str, str]] = {
     ),
     "paths": (
         "episodes",
-        "One episode of each policy at the last recording. Blue: it arrived, or stayed up to the end; orange: not. "
-        "These are only examples; rely on the figures above.",
+        "One episode of each policy at the last recording. Blue: it ended well (on cartpole it lasted to the limit, on "
+        "navigation it arrived); orange: it did not. These are only examples; rely on the figures above.",
     ),
     "frames": (
         "frames",

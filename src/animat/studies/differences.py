@@ -142,8 +142,8 @@ def _burst_rule(threshold: float | None, series: Sequence[Responses]) -> str:
     uncut = [of.active_ratio for of in series if not of.is_burst.any()]
     above = [n for ratios in uncut if (n := int(np.count_nonzero(ratios > otsu_threshold(ratios))))]
     return (
-        f"{rule} That is so in {len(above)} of {len(series)} recordings, which keep {sum(above):,} of "
-        f"{sum(map(len, series)):,} responses that the paper's rule would leave out."
+        f"{rule} In {len(above)} of {len(series)} recordings this keeps responses that the paper's rule would leave "
+        f"out, {sum(above):,} of {sum(map(len, series)):,} in total."
     )
 
 

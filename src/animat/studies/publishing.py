@@ -332,7 +332,7 @@ def _findings(results: Results) -> Section:
     warnings = tuple((finding.name, finding.message) for finding in results.findings if finding.severity != "note")
     counts = (
         f"{len(warnings)} warnings and {len(results.findings) - len(warnings)} notes on the recordings, the simulators "
-        f"made of them and the optima; all are in {file}."
+        f"made from them and the optima; all are in {file}."
     )
     tables = (Table("Warnings", ("finding", "message"), warnings, beside=file),) if warnings else ()
     left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)
