@@ -112,7 +112,7 @@ def test_what_is_lost_or_changed_is_done_again_and_what_rests_on_other_bytes(tmp
 
 def test_progress_goes_up_to_all_and_says_what_runs(tmp_path: Path) -> None:
     # A run that was killed left its last words.
-    stale = receipt_path(tmp_path / ".unfinished" / ".told", "b")
+    stale = receipt_path(tmp_path / ".unfinished" / ".notices", "b")
     stale.parent.mkdir(parents=True)
     stale.write_text(json.dumps([0.9, "nearly"]))
     kept = Kept()

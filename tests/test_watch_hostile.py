@@ -163,7 +163,7 @@ def test_folders_with_anything_in_them(tmp_path: Path, seed: int) -> None:
     (tmp_path / name).write_text(json.dumps(changed(words, draw.choice(places(words)), anything(draw))))
     trial = changed(TRIAL, draw.choice(places(TRIAL)), anything(draw))
     (tmp_path / "journal.jsonl").write_text(json.dumps(trial) + "\nno JSON\n")
-    notices = tmp_path / ".unfinished" / ".told"
+    notices = tmp_path / ".unfinished" / ".notices"
     notices.mkdir(parents=True, exist_ok=True)
     (notices / "p0 to p1.json").write_text(json.dumps([anything(draw), anything(draw)]))
     for file in (".unfinished/from-p0.npz", "p0.safetensors", "jobs/x.json"):

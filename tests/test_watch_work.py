@@ -50,7 +50,7 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     }  # fmt: skip
     manifest = {"training": training, "simulators": {"recorded_at_min": [0.0, 10.0, 15.0]}}
     (tmp_path / "training.json").write_text(json.dumps(manifest))
-    notices = tmp_path / ".unfinished" / ".told"
+    notices = tmp_path / ".unfinished" / ".notices"
     notices.mkdir(parents=True)
     curve = np.zeros((30, 2, 6))
     curve[:, :, 0] = 100.0 * np.arange(1, 31)[:, None]
@@ -112,7 +112,7 @@ def test_a_training_is_shown_as_far_as_its_checkpoints_go(tmp_path: Path) -> Non
     # As all are trained at once: numbers in the file, and words of the first job alone.
     (tmp_path / ".unfinished" / "from-p0.npz").unlink()
     np.savez(tmp_path / ".unfinished" / "at-once-ab.npz", curve=curve, members=np.array([1, 2]), done=np.array(30))
-    (tmp_path / ".unfinished" / ".told" / "p2.json").write_text(json.dumps([0.55, None]))
+    (tmp_path / ".unfinished" / ".notices" / "p2.json").write_text(json.dumps([0.55, None]))
     together = TrainingView(tmp_path).view(None, 8.0)
     assert block(together, "Learning curves")["series"] == [*policies, mean]
     assert [row[2] for row in block(together, "Policies")["rows"]] == ["none yet", 29.0, 39.0]
@@ -131,7 +131,7 @@ def test_a_study_shows_jobs_done_running_and_waiting(tmp_path: Path) -> None:
     jobs = [job.name for job in planned]
     for job in jobs[:2]:
         Receipt(job, "x", {}, {"a": "b", "c": "d"}).save(tmp_path / "jobs")
-    notices = tmp_path / ".unfinished" / ".told"
+    notices = tmp_path / ".unfinished" / ".notices"
     notices.mkdir(parents=True)
     # As a version before this one left it.
     before = StudyView(tmp_path).view(None, 8.0)
@@ -243,7 +243,7 @@ def test_a_tuning_shows_its_journal(tmp_path: Path) -> None:
     assert [row[1:3] for row in journal[:2]] == [["diverged", None], ["stopped early", 55.0]]
     drawn = {each["name"]: (each["x"], each["y"]) for each in block(found, "Return of each trial")["series"]}
     assert drawn == {"best so far": ([0, 1], [4, 4]), "complete": ([0], [4]), "stopped early": ([1], [55])}
-    notices = tmp_path / ".unfinished" / ".told"
+    notices = tmp_path / ".unfinished" / ".notices"
     notices.mkdir(parents=True)
     (notices / "rung-2+trials-3,4.json").write_text("[0.5, null]")
     with exclusive_lock(tmp_path):

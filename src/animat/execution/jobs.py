@@ -18,7 +18,7 @@ from animat.execution.cluster import Cluster
 from animat.execution.gpu import WithGpu
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.receipts import Receipt, digest_of, receipt_path
-from animat.execution.task import PLANNED, UNFINISHED, Task, TaskResult, carry_out_alone, memory_of, reported
+from animat.execution.task import NOTICES, PLANNED, UNFINISHED, Task, TaskResult, carry_out_alone, memory_of, reported
 from animat.progress import Progress
 from animat.writing import write_whole
 
@@ -102,7 +102,7 @@ class Jobs:
         """
         costs_s = {name: job.cost_s for name, job in self._jobs.items()}
         write_whole(self._folder / UNFINISHED / PLANNED, json.dumps(costs_s, indent=1) + "\n")
-        notices = self._folder / UNFINISHED / ".told"
+        notices = self._folder / UNFINISHED / NOTICES
         notices.mkdir(parents=True, exist_ok=True)
         # Left by a run that was killed; the locks stay, as they may still be held.
         for stale in notices.glob("*.json"):

@@ -26,6 +26,8 @@ UNFINISHED = ".unfinished"
 """Subfolder for checkpoints and the progress of running tasks; removed when everything is done."""
 PLANNED = ".planned.json"
 """File in it with the cost of each job by name, from which others compute the progress."""
+NOTICES = ".notices"
+"""Folder in it with the last progress of each job."""
 
 
 class Task(abc.ABC):

@@ -144,7 +144,7 @@ def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], 
         try:
             value = _whole(value, own_settings(study)[name])
             if name == "mapping" and value == "none":
-                raise InvalidArgument("expected mappings, got 'none'; a search compares policies with neurons only")
+                raise InvalidArgument("expected mappings, got 'none': tune policies without neurons separately")
             changed = with_settings(study, {name: value})
             if name == "mapping":
                 mapping_named(changed.arms[0].mapping)

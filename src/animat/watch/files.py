@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.errors import InvalidFile
-from animat.execution.task import UNFINISHED
+from animat.execution.task import NOTICES, UNFINISHED
 from animat.plain_file import read_plain_text
 from animat.training.policy import CURVE, whole_curve
 from animat.watch.plain import listed, number, text
@@ -37,7 +37,7 @@ JobProgress = dict[str, tuple[float, str, float]]
 def job_progress(folder: Path) -> JobProgress:
     """The last progress reported by the jobs of an unfinished run."""
     progress = {}
-    for path in sorted((folder / UNFINISHED / ".told").glob("*.json"))[:1000]:
+    for path in sorted((folder / UNFINISHED / NOTICES).glob("*.json"))[:1000]:
         report = listed(json_of(path))
         try:
             changed_s = path.stat().st_mtime
