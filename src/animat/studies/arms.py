@@ -38,7 +38,7 @@ def describe_mapping(arm: Arm) -> str:
 
 
 def arm_differences(first: Arm, second: Arm) -> Iterator[str]:
-    """A sentence for each setting in which two arms differ."""
+    """A sentence for each setting in which two arms differ, except for whether they are trained."""
     for arm, other in ((first, second), (second, first)):
         if arm.shadowing is True is not other.shadowing:
             yield f"“{arm.name}” is trained {_REFRESHED}"
