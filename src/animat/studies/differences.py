@@ -117,8 +117,8 @@ def _simulator_decisions(study: Study, series: Sequence[Responses]) -> Iterator[
         yield "Histogram range", paper + bins
         yield (
             "Drawing from a histogram",
-            "A bin is drawn with the probability of its share, then a response uniformly within it. Responses above "
-            "the range count in the last bin, and are reported.",
+            "A bin is drawn with a probability equal to its share of the responses, then a response uniformly within "
+            "it. Responses above the range count in the last bin, and are reported.",
         )
     fixed = any(arm.percentiles == "first" for arm in study.arms)
     yield (
