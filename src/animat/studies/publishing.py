@@ -171,10 +171,10 @@ def _describe(row: Score) -> str:
 
 
 def _at_random(robot: str, arm: Arm, controls: Sequence[ControlReturns]) -> str:
-    """The return that remains if the stimuli are drawn at random."""
+    """The mean return of the control with stimuli drawn at random, in a sentence."""
     kind = robot, arm.mapping, arm.percentiles, "shuffled"
     of = [row for row in controls if (row.robot, row.mapping, row.percentiles, row.control) == kind]
-    return f" With stimuli delivered at random it is {cell(of[-1].mean_return)}." if of else ""
+    return f" With stimuli delivered at random, the mean return is {cell(of[-1].mean_return)}." if of else ""
 
 
 def _compared(study: Study, results: Results) -> Section:
