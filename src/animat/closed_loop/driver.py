@@ -64,7 +64,7 @@ class Driver:
         self.deadline = float("inf"), "nobody"
         """Latest time on `time.monotonic()` for an answer, and from whom; a supervisor watches it."""
         self.request: Request | None = None
-        """The latest request to the culture, which may be unanswered yet; a supervisor logs it."""
+        """The latest request to the culture, answered or not; a supervisor logs it."""
         self._stop_file = stop_file
         self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
