@@ -335,7 +335,7 @@ class Driver:
         try:
             observed = culture.deliver(stimuli, duration_s, since_s=since_s)
         except Exception as error:
-            # The error says so; the culture's own count may include another thread's stimuli.
+            # The error says so, not the culture's own count, which may include another thread's stimuli.
             is_admitted = not isinstance(error, AnimatError) or error.is_admitted
             if not is_admitted:
                 account.take_back(stimuli)
