@@ -88,13 +88,14 @@ def other_patterns(recording: Recording, culture: Culture) -> Finding | None:
         culture: an open culture.
     """
     tables = recording.stimuli.electrodes, culture.patterns
-    recorded, there = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)
-    strange = recorded - there - {frozenset()}
+    recorded, patterns = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)
+    strange = recorded - patterns - {frozenset()}
     if not strange:
         return None
+    are = "is not a pattern" if len(strange) == 1 else "are not patterns"
     message = (
-        f"{len(strange)} of the {len(recorded)} sets of electrodes that were stimulated in the recordings are not "
-        "patterns of this culture, which responds differently through other electrodes (a CL1's patterns are drawn by "
+        f"{len(strange)} of the {len(recorded)} sets of electrodes that were stimulated in the recordings {are} of "
+        "this culture, which responds differently through other electrodes (a CL1's patterns are drawn by "
         "--culture-seed, a MaxOne's are those of --selection)"
     )
     return Finding("other-patterns", "warning", message, float(len(strange)))
