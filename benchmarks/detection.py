@@ -147,7 +147,7 @@ def main() -> None:
             row = rows[engine] = json.loads(done.stdout.splitlines()[-1])
             print(
                 f"{engine}: {row['times_real_time']:.2f} times real time ({row['processor_s_per_s']:.2f} s of "
-                f"processor time a second), {row['memory_gib']:.2f} GiB; "
+                f"processor time per second), {row['memory_gib']:.2f} GiB; "
                 f"{row['found']:,} of {row['true']:,} true spikes found, {row['detected']:,} detected"
             )
     if len(rows) == 2:

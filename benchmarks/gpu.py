@@ -47,8 +47,10 @@ def main() -> None:
     running = [started(options.recordings, POLICIES_A_CORE, core) for core in cores]
     together = [finish(each) for each in running]
     one_per_s, all_per_s = one["iterations_per_s"], sum(each["iterations_per_s"] for each in together)
-    print(f"one core: {one_per_s:,.0f} iterations a second; {len(cores)} cores: {all_per_s:,.0f}\n")
-    print("| policies | iterations a second | beside one core | beside all | ms a round | compiling, s | bits |")
+    print(f"one core: {one_per_s:,.0f} iterations per second; {len(cores)} cores: {all_per_s:,.0f}\n")
+    print(
+        "| policies | iterations per second | times one core | times all cores | ms per round | compiling, s | hash |"
+    )
     print("|---" * 7 + "|")
     for policies in options.policies:
         at_once = finish(started(options.recordings, policies))

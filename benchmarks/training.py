@@ -54,7 +54,7 @@ def main() -> int:
     return 0
 
 
-# --- one process per part--------------------------------------------------------------------------------------------
+# --- one process per part -------------------------------------------------------------------------------------------
 
 
 def start(part: str, cache: Path, core: int | None, **given: Any) -> subprocess.Popen[str]:

@@ -96,8 +96,8 @@ def browser_with(command: str, address: str) -> Iterator[webdriver.Chrome]:
 @contextmanager
 def page_of(folder: Path, command: str) -> Iterator[webdriver.Chrome]:
     """The page's server, started as by a command, and a browser that shows the page."""
-    words = [sys.executable, "-m", "animat.watch", str(folder), str(os.getpid())]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
+    command_line = [sys.executable, "-m", "animat.watch", str(folder), str(os.getpid())]
+    with subprocess.Popen(command_line, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         try:
             with browser_with(command, server.stdout.readline().strip()) as driver:
@@ -180,8 +180,8 @@ def main() -> None:
     if options.minutes > 0:
         found = measured["long"] = watched(options.minutes, options.browser)
         took = found["shown_after_s"]
-        words = ", ".join(f"{name} {value:.3f}" for name, value in took.items())
-        print(f"{options.minutes:g} min, from a pulse to the page (s): {words}; {found['n_shown']:,} pulses")
+        delays = ", ".join(f"{name} {value:.3f}" for name, value in took.items())
+        print(f"{options.minutes:g} min, from a pulse to the page (s): {delays}; {found['n_shown']:,} pulses")
         print(f"  {found['over_half_a_second']} after more than 0.5 s; {found['missed']} of {found['of']:,} missed")
         for minute, each in enumerate(found["memory"], 1):
             memory_mb = f"scripts {each['scripts_mb']:.1f} MB, drawing {each['drawing_mb']:.0f} MB"

@@ -114,7 +114,7 @@ def pulse(*numbers: float) -> Pulse:
         ("net_charge", pulse(160, -1, 180, 1), "expected phases that balance"),
         ("net_charge", pulse(160, -1), "expected phases that balance"),
         ("amplitude", pulse(160, -3.01, 160, 3.01), "-3 to 3 uA"),
-        ("charge_per_phase", pulse(1500, -2.5, 1500, 2.5), "-3 to 3 nC a phase"),
+        ("charge_per_phase", pulse(1500, -2.5, 1500, 2.5), "-3 to 3 nC per phase"),
         ("phase_step_us", pulse(150, -1, 150, 1), "steps of 20 us, got 150"),
         ("alternates", pulse(160, -1, 160, -1, 320, 1), "different signs"),
         ("phases_per_pulse", pulse(20, -1, 20, 1, 20, -1, 20, 1), "at most 3 phases"),

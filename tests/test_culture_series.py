@@ -252,7 +252,7 @@ def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
     with small_culture() as culture:
         found = other_culture(read_recording(file), culture)
     assert found is not None
-    assert "of virtual culture 1 with another tissue_revision, but this is virtual culture 1" in found.message
+    assert "of virtual culture 1 with a different tissue_revision, but this is virtual culture 1" in found.message
     file.unlink()
     with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):
         record(tmp_path, sessions=2)

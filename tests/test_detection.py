@@ -242,6 +242,20 @@ def test_a_window_is_not_eaten_unasked() -> None:
     assert {f.name: f.severity for f in found.findings}["blanked"] == "warning"
 
 
+@pytest.mark.parametrize("before_ms", [4.5, 10.0])
+def test_a_long_blank_before_pulses_leaves_the_spikes_outside(before_ms: float) -> None:
+    """Pulses before a piece are read with their resting voltage: the blank may begin before what is read."""
+    voltage, truth = noisy(2, 3.0)
+    times_s = np.arange(0.1, 2.9, 0.2)
+    traces = RawTraces.from_array(voltage, channels(2), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(traces, times_s, Detection(blank_ms=(before_ms, 1.5)))
+    samples = (times_s * RATE_HZ)[:, None]
+    outside = [at[np.all((at < samples - 250) | (at > samples + 80), axis=0)] for at in truth]
+    hit, missed, _ = agreement(found, outside)
+    assert missed <= 0.01 * hit
+    assert "saturated-channels" not in {finding.name for finding in found.findings}
+
+
 def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
     voltage, _ = noisy(4, 0.2)
     trace = np.ascontiguousarray(voltage.T * np.float32(0.1))

@@ -138,7 +138,7 @@ def test_few_responses_cannot_tell_whether_conditions_separate_readouts() -> Non
     left = number < np.where(responses.condition == 0, 16, 28)
     both_hz = np.stack([left, number % 2 == 0], axis=-1).astype(np.float64)
     (found,) = _readouts(replace(responses, readout_hz=both_hz))
-    assert "there are too few responses to know if they separate" in found.message
+    assert "there are too few responses to know if the conditions separate" in found.message
 
 
 def test_a_series_has_the_readouts_of_its_first_recording(recording: Recording, halves: Readouts) -> None:

@@ -156,6 +156,24 @@ def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
     assert [f.name for f in found[2:]] == ["presentation-unknown"]
 
 
+@pytest.mark.parametrize(
+    ("source", "culture"),
+    [
+        ("CL1 (device) by animat.cultures.cl1", RecordedCulture("cl1")),
+        ("CL1 (the SDK's simulator) by animat.cultures.cl1", RecordedCulture("cl1", None, is_simulated=True)),
+        ("MaxOne by animat.cultures.maxone", RecordedCulture("maxone")),
+        ("replay of recordings by animat.cultures.replay", RecordedCulture("replay")),
+        ("CL1_day3.h5", None),
+        ("MaxOne by animat.csv", None),
+        ("virtual culture.csv", None),
+    ],
+)
+def test_a_file_that_is_named_after_a_kind_of_culture_is_not_of_it(
+    source: str, culture: RecordedCulture | None
+) -> None:
+    assert from_metadata({"source": source})["culture"] == culture
+
+
 def test_two_findings_of_one_name_are_both_kept() -> None:
     noted = (Finding("columns-left-out", "note", "x of a.csv"), Finding("columns-left-out", "note", "y of b.csv"))
     assert merged(noted) == (Finding("columns-left-out", "note", "x of a.csv; y of b.csv"),)

@@ -88,8 +88,10 @@ def run(out: Path, policy: Policy, recordings: Path, *more: str) -> int:
         (["--at-min", "1"], True, ""),
         (["--at-min", "1", "--state", "{state}"], False, ""),
         pytest.param(["--at-min", "0"], False, "", marks=pytest.mark.oracle),
-        (["--at-min", "1"], False, "starts anew at 0 min, but its percentiles are of the recording at 1 min"),
-        pytest.param(["--at-min", "1", "--culture-seed", "1"], True, "starts anew at 0 min", marks=pytest.mark.oracle),
+        (["--at-min", "1"], False, "starts afresh at 0 min, but its percentiles are of the recording at 1 min"),
+        pytest.param(
+            ["--at-min", "1", "--culture-seed", "1"], True, "starts afresh at 0 min", marks=pytest.mark.oracle
+        ),
         (["--culture-seed", "2"], True, "of virtual culture 1, but this is virtual culture 2"),
     ],
 )
@@ -125,7 +127,7 @@ def test_recordings_of_no_virtual_culture_are_reported(
 ) -> None:
     write_nwb(synthetic_recording(1, patterns=40, channels=32), tmp_path / "synthetic.nwb")
     assert run(tmp_path / "session", policy_of(0), tmp_path / "synthetic.nwb") == 0
-    assert "the recordings are of no virtual culture, but this is virtual culture 1" in capsys.readouterr().err
+    assert "the recordings are not of a virtual culture, but this is virtual culture 1" in capsys.readouterr().err
 
 
 def recorded_by(series: Path, folder: Path, *pulses: Pulse | None) -> Path:

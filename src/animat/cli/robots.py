@@ -39,7 +39,7 @@ class Robots:
             parameters = " ".join(f"{key}={value}" for key, value in numbers.items())
             print(f"{name}: {robot['is']}\n  observes {observed}\n  parameters {parameters}")
             if robot["commands"] > 1:
-                print(f"  takes {robot['commands']} commands: train it with as many --readouts, or --mapping none")
+                print(f"  takes {robot['commands']} commands: use that many --readouts, or --mapping none")
             for message in (*robot["lacks"].values(), *robot["caveats"]):
                 print(f"  {message}")
         for name, why in unusable.items():

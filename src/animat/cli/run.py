@@ -50,8 +50,8 @@ class Run(StimulationOptions):
     state: Path | None = None
     """State that a virtual culture continues from; default: culture.state next to the recordings, if it exists"""
     episodes: int = 5
-    """Episodes of each policy; each control has at most as many, all controls together as many as all policies, but
-    each at least 5"""
+    """Episodes of each policy; each control has at most as many; all controls share as many as all policies have
+    together, but at least 5 each"""
     controls: Literal["all", "random", "coupling"] = "all"
     """all: random, constant, silent, shuffled and heuristic; random: only that one; coupling: all, and the best reflex,
     searched for on the simulator first, which takes a minute"""

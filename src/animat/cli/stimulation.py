@@ -21,7 +21,7 @@ class StimulationOptions:
     selection: Path | None = None
     """For a MaxOne: the file of its electrodes"""
     culture_seed: int | None = None
-    """Which virtual culture, or which patterns of a CL1; default: that of the recordings of run, else 1"""
+    """Which virtual culture, or which patterns of a CL1; default: in run that of the recordings, else 1"""
     budget_pulses: int | None = None
     """Most pulses in all, including those of live's recordings; default: unlimited, apart from the culture's
     own limits"""

@@ -18,7 +18,7 @@ from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
 
 class Controller(Protocol):
-    """Anything that chooses conditions: a `Policy`, or anything else that acts like one."""
+    """What chooses conditions: a `Policy`, or anything else that acts like one."""
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
         """The index of the condition to present, for the robot's observation in its own units."""
@@ -170,7 +170,7 @@ def agent_of(
     """
     if control.commands is not None:
         raise InvalidArgument(
-            f"control: expected one whose commands come from responses, got {control.name}, which needs a simulator"
+            f"control: expected one whose commands come from responses, got {control.name}, which only a simulator runs"
         )
     actor = control.actor
     controller: Controller

@@ -64,7 +64,7 @@ class Driver:
         self.deadline = float("inf"), "nobody"
         """Latest time on `time.monotonic()` for an answer, and from whom; a supervisor watches it."""
         self.request: Request | None = None
-        """The latest request to the culture, which may be unanswered yet; a supervisor logs it."""
+        """The latest request to the culture, answered or not; a supervisor logs it."""
         self._stop_file = stop_file
         self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
         self._account, self._clock = account, clock
@@ -335,7 +335,7 @@ class Driver:
         try:
             observed = culture.deliver(stimuli, duration_s, since_s=since_s)
         except Exception as error:
-            # The error says so; the culture's own count may include another thread's stimuli.
+            # The error says so, not the culture's own count, which may include another thread's stimuli.
             is_admitted = not isinstance(error, AnimatError) or error.is_admitted
             if not is_admitted:
                 account.take_back(stimuli)

@@ -164,7 +164,7 @@ class _Supervisor:
                 raise
             if ending is not None:
                 return self._end(thread, ending)
-            ending = self._ending or Ending("crash", "the loop's thread ended without an ending")
+            ending = self._ending or Ending("crash", "the loop's thread ended without giving a reason")
             if ending.by not in ("plan", "budget"):
                 self._halt(ending)
             return self._finish(ending)
@@ -307,7 +307,7 @@ def _header(
 
 
 def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
-    """Swap each yoked episode that precedes the first episode that it could repeat with that episode."""
+    """Swap an agent's first yoked episode with the first that it could repeat, if that comes later."""
     turns = list(turns)
     for number, agent in enumerate(agents):
         if agent.delivery != "yoked" or number not in turns:

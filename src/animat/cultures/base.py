@@ -225,7 +225,7 @@ class Culture(Openable):
         progress = progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}
         self._rehearse(schedule)
-        before = self.left_out
+        before, recorded_as = self.left_out, self.recorded_as
         start_min = self.now_s / 60
         parts: list[Block] = []
         observed: list[Observed] = []
@@ -238,7 +238,7 @@ class Culture(Openable):
                 sampling_rate_hz=self.sampling_rate_hz,
                 start_min=start_min,
                 provenance=provenance,
-                culture=self.recorded_as,
+                culture=recorded_as,
             )
 
         followed_s = 0.0

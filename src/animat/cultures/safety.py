@@ -258,8 +258,8 @@ class Guard:
             if not abs(phase.charge) <= limits.charge_per_phase:
                 raise UnsafeStimulus(
                     "charge_per_phase",
-                    f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} a phase, got "
-                    f"{phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
+                    f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} per phase, "
+                    f"got {phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
                 )
         if not abs(pulse.net_charge) <= limits.net_charge:
             raise UnsafeStimulus(

@@ -16,9 +16,10 @@ def other_culture(recording: Recording, culture: Culture) -> Finding | None:
     """A warning where a culture is not the one that was recorded; None where it is, or where that cannot be known.
 
     Percentiles belong to one culture at one time. Devices are compared by their kind, and by the names that they give
-    themselves and what is on them. A culture whose clock is before the end of its recording did not live through it:
-    it was started anew, or from an earlier state. The SDK's simulator of a CL1 starts anew whenever it is opened, and
-    a simulated culture with it. A replay may answer from any recording.
+    themselves and what is on them. A virtual culture whose clock is before its recording, or a CL1 whose clock is
+    before the recording's end, did not live through it: it was restarted, or continued from an earlier state. The
+    SDK's simulator of a CL1 restarts whenever it is opened, and a simulated culture with it. A replay may answer from
+    any recording.
 
     Args:
         recording: the one that percentiles are taken from.
@@ -42,19 +43,18 @@ def _other_virtual(recording: Recording, culture: VirtualCulture) -> str:
     recorded = recording.culture
     differ = [name for name, value in culture.settings.items() if recording.provenance.get(name) != value]
     if differ:
-        of = f"virtual culture {'?' if recorded is None else recorded.seed}"
         if recorded is None or recorded.kind != "virtual":
-            of = "no virtual culture"
-        elif "seed" not in differ:
-            of += f" with another {' and '.join(differ)}"
+            of = "not of a virtual culture"
+        else:
+            of = f"of virtual culture {recorded.seed}"
+            of += "" if "seed" in differ else f" with a different {' and '.join(differ)}"
         return (
-            f"the recordings are of {of}, but this is virtual culture {culture.seed}: percentiles differ between "
-            "cultures"
+            f"the recordings are {of}, but this is virtual culture {culture.seed}: percentiles differ between cultures"
         )
     if now_min < start_min:
         return (
-            f"the culture starts{' anew' if now_min == 0 else ''} at {now_min:.0f} min, but its percentiles are of the "
-            f"recording at {start_min:.0f} min, and they change over time: pass its state after that recording "
+            f"the culture starts{' afresh' if now_min == 0 else ''} at {now_min:.0f} min, but its percentiles are of "
+            f"the recording at {start_min:.0f} min, and they change over time: pass its state after that recording "
             "(--state)"
         )
     return ""
@@ -72,7 +72,7 @@ def _other_device(recording: Recording, culture: Culture) -> str:
     if culture.name == "cl1" and now_min < start_min + recording.duration_s / 60:
         return (
             f"the CL1's clock is at {now_min:.1f} min, before the end of the recording at {start_min:.1f} min that "
-            "percentiles are taken from: the device was started anew, as the SDK's simulator is whenever it is opened, "
+            "percentiles are taken from: the device was restarted, as the SDK's simulator is whenever it is opened, "
             "and a simulated culture with it; percentiles change over time"
         )
     return ""
@@ -88,13 +88,14 @@ def other_patterns(recording: Recording, culture: Culture) -> Finding | None:
         culture: an open culture.
     """
     tables = recording.stimuli.electrodes, culture.patterns
-    recorded, there = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)
-    strange = recorded - there - {frozenset()}
+    recorded, patterns = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)
+    strange = recorded - patterns - {frozenset()}
     if not strange:
         return None
+    are = "is not a pattern" if len(strange) == 1 else "are not patterns"
     message = (
-        f"{len(strange)} of the {len(recorded)} sets of electrodes that were stimulated in the recordings are not "
-        "patterns of this culture, which responds differently through other electrodes (a CL1's patterns are drawn by "
+        f"{len(strange)} of the {len(recorded)} sets of electrodes that were stimulated in the recordings {are} of "
+        "this culture, which responds differently through other electrodes (a CL1's patterns are drawn by "
         "--culture-seed, a MaxOne's are those of --selection)"
     )
     return Finding("other-patterns", "warning", message, float(len(strange)))

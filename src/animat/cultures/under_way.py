@@ -40,7 +40,7 @@ class PartialRecording:
         if time.monotonic() - self._written_s < EVERY_S:
             return
         # A failed write must not end the recording, which reports its own errors.
-        with suppress(Exception), atomic_write(self._path) as beside, beside.open("wb") as file:
+        with suppress(Exception), atomic_write(self._path) as temporary, temporary.open("wb") as file:
             np.savez(file, **_columns(so_far()))
         self._written_s = time.monotonic()
 

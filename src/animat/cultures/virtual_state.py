@@ -73,7 +73,7 @@ def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state
     arrays = {f"state_{name}": values for name, values in snapshot.state._asdict().items()}
     arrays |= {f"kicks_{name}": values for name, values in snapshot.kicks._asdict().items()}
     held = {name: getattr(state, name) for name in _HELD}
-    with atomic_write(path) as beside, beside.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, head=np.array(json.dumps(head)), **held, **arrays)
 
 

@@ -147,7 +147,7 @@ def run_interventions(
         InvalidArgument: for an environment without neurons.
     """
     if simulator is None or not isinstance(unwrapped(environment), Animat):
-        raise InvalidArgument("interventions: expected policies that act through neurons, got some without neurons")
+        raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")
     progress, draws = progress or Silent(), 2 if policies.greedy else DRAWS
 
     def run(control: Control) -> Episodes:

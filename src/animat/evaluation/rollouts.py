@@ -105,12 +105,12 @@ class Episodes:
     Attributes:
         returns: sum of rewards of each episode, in the task's own units, shape (actors, episodes).
         lengths: iterations of each, shape (actors, episodes).
-        terminated: whether it terminated before the episode limit, shape (actors, episodes).
+        terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
         presented: how often each condition was delivered, in all episodes together, shape (actors, conditions); no
             conditions without neurons.
         commanded: the sum of the commands that each condition led to, the same shape; with several commands separately,
             shape (actors, conditions, commands).
-        outcome: outcome of each, for a robot with a goal; shape (actors, episodes), and with a last axis of objectives.
+        outcome: of each episode, for a robot with a goal; shape (actors, episodes), and with a last axis of objectives.
     """
 
     __repr__ = briefly

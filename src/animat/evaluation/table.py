@@ -240,7 +240,7 @@ def evaluate(
     if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):
         raise InvalidArgument(f"optimum_resolution: expected a positive number, got {optimum_resolution!r}")
     if interventions and first.mapping is None:
-        raise InvalidArgument("interventions: expected policies that act through neurons, got some without neurons")
+        raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")
     body, progress = robot or first.robot, progress or Silent()
     world = _World.of(first, body, timeline, at_min)
     within = world.environment, world.simulator

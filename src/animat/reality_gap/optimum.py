@@ -17,7 +17,7 @@ RESOLUTION = 0.5
 
 
 class BackgroundOptimum:
-    """The optimal return, computed in a background thread, on another core than a loop that waits most of the time."""
+    """The optimal return, computed in a background thread, on another core than a loop without deadlines."""
 
     def __init__(self, environment: Animat[Any], simulator: NeuronSimulator) -> None:
         self._value: Future[float] = Future()
@@ -50,5 +50,5 @@ class BackgroundOptimum:
         return self._value.result()
 
     def join(self) -> None:
-        """Wait until the computation has ended: a program that exits while JAX computes in a thread is killed."""
+        """Wait until the computation has ended: a program that exits while JAX computes is killed by a signal."""
         wait([self._value])

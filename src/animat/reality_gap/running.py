@@ -51,7 +51,7 @@ from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import NeuralObservation
 
 FEWEST_OF_A_CONTROL = 5
-"""Fewest episodes of a control: enough to show (p < 0.01) that ten or more of policies outperform it."""
+"""Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
 
 
 def run_policies(
@@ -298,7 +298,7 @@ def check_conditions(first: Policy, calibration: Calibration) -> None:
     """Raise unless a calibration has the policies' conditions and readouts.
 
     Raises:
-        Mismatch: if it has not.
+        Mismatch: if it lacks them.
     """
     if first.mapping is not None:
         expect_conditions(first, calibration.conditions, calibration.readouts)

@@ -1,4 +1,4 @@
-"""Findings: problems noticed in data, always reported to the user."""
+"""Findings: what was noticed in data, always reported to the user."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FEW_IS_BAD = ("few-samples", "no-difference", "readouts-alike")
 
 @dataclass(frozen=True)
 class Finding:
-    """One problem noticed in a recording or its responses, in one sentence.
+    """One observation about a recording or its responses, in one sentence.
 
     Attributes:
         name: a short fixed name by which tests and programs identify it (`"dead-window"`).

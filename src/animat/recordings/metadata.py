@@ -1,4 +1,4 @@
-"""What a file keeps about a recording beside its arrays: text by key."""
+"""What a file keeps about a recording in addition to its arrays: text by key."""
 
 from __future__ import annotations
 
@@ -58,10 +58,12 @@ def _is_finding(key: str) -> bool:
 _KINDS = {
     "virtual culture": ("virtual", "seed"),
     "CL1": ("cl1", "pattern_seed"),
-    "MaxOne by animat": ("maxone", ""),
+    "MaxOne": ("maxone", ""),
     "replay of recordings": ("replay", ""),
 }
 """How the source in a file begins, and the kind of culture and the key of its seed that this means."""
+_OURS = " by animat.cultures."
+"""In the source of animat's own recordings; the source of any other is the name of its file, which may begin alike."""
 
 
 def _culture_of(metadata: Mapping[str, str]) -> RecordedCulture | None:
@@ -70,5 +72,6 @@ def _culture_of(metadata: Mapping[str, str]) -> RecordedCulture | None:
         if source.startswith(beginning):
             seed = metadata.get(key, "")
             known = int(seed) if seed.isdecimal() and len(seed) <= 20 else None
-            return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source)
+            if known is not None or _OURS in source:
+                return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source)
     return None

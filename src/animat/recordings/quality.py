@@ -90,7 +90,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
 
 
 DUPLICATES = 0.03, 20
-"""Share of the spikes above which duplicates are reported, and fewest."""
+"""Share of the spikes above which duplicates are reported, and the fewest that are."""
 
 
 def _duplicates(recording: Recording) -> Iterable[Finding]:

@@ -82,7 +82,7 @@ def read_recording(
     source = _read(path, stimuli_path, stimuli, part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(
-            f"{path}: expected spikes, got a response table, which only animat inspect, train and evaluate read; "
+            f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read; "
             "this needs spike times"
         )
     if start_s is not None:

@@ -73,7 +73,7 @@ class RecordedCulture:
 
     Attributes:
         kind: as `animat.cultures.kinds` names it.
-        seed: of a virtual culture, or of a CL1's patterns; None if none was drawn.
+        seed: of a virtual culture, or of a CL1's patterns; None if there is none, or it is not known.
         is_simulated: whether a simulator stands in for the device, as the CL1's SDK has one.
     """
 

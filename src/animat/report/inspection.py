@@ -88,7 +88,7 @@ def draw_inspection(
     """Draw raster, post-stimulus histogram, burst separation and response histograms into a folder.
 
     Files are named after the inspection; `file_format` is one of `FORMATS`. For a recording without stimuli only a
-    raster with its bursts is drawn, for a table of responses neither raster nor post-stimulus histogram.
+    raster with its bursts is drawn, for a response table neither raster nor post-stimulus histogram.
 
     Raises:
         InvalidFile: if a file cannot be written.

@@ -128,7 +128,7 @@ def _valley(values: Float64[np.ndarray, " values"], is_upper: Bool[np.ndarray, "
         return 0.0
     distinct, counts = np.unique(values, return_counts=True)
     within_sd = np.sqrt(np.var(values) * max(1 - separability(values, is_upper), 0.0))
-    # Silverman's width for the classes, but not below the step between possible ratios: its gaps are no valleys.
+    # Silverman's width for the classes, but not below the step between possible ratios: its gaps are not valleys.
     width = max(1.06 * within_sd * len(values) ** -0.2, 1 / n_channels)
     grid = np.linspace(distinct[0], distinct[-1], 400)
     density: np.ndarray[Any, np.dtype[np.float64]] = np.exp(-0.5 * ((grid[:, None] - distinct) / width) ** 2) @ counts

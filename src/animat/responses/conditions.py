@@ -283,7 +283,7 @@ def conditions_named(text: str) -> Conditions:
 def _with_stimuli(
     stimuli: Stimuli, index: Int64[np.ndarray, " stimuli"], conditions: Sequence[Condition]
 ) -> Assignment:
-    """An assignment whose conditions also describe their stimuli, as far as they did not yet."""
+    """An assignment whose conditions also describe their stimuli, unless they already do."""
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]
     presented = np.repeat(of, np.diff(last, prepend=-1))

@@ -1,4 +1,4 @@
-"""From a recording, or a table of responses without spike times, to its responses."""
+"""From a recording, or a response table without spike times, to its responses."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ def inspect_recording(
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus.
         UnusableData: for a recording without channels.
-        Mismatch: for another window than the one of a table.
+        Mismatch: for a window that differs from a table's.
     """
     chosen = by or default_conditions(recording.stimuli, recording.protocol)
     responses = extract_responses(recording, chosen, window_ms, burst_threshold)

@@ -26,7 +26,7 @@ REFUSING = (
     "simultaneous-stimuli",
     "several-cultures",
 )
-"""Names of the findings that make training pointless; a user may go on in spite of them."""
+"""Names of the findings that make training pointless; a user may allow them."""
 
 
 def extract_series(
@@ -41,7 +41,7 @@ def extract_series(
     """Extract the responses of recordings, to fit simulators to them.
 
     Args:
-        recordings: of one culture; tables of responses too.
+        recordings: of one culture; or response tables.
         by: the rule of the conditions; None: by frequency if it is known, by place if the protocol has places.
         window_ms: start and end of the window after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.

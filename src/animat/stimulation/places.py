@@ -110,8 +110,8 @@ def electrodes_of(
         left, right = (tuple(sorted(half[rank] for rank in evenly(len(half), SITES))) for half in sorted_halves)
         return left, right, tuple(sorted(left + right)), left[:1]
     columns, rows = CUT[places]
-    quadrants = []
+    groups = []
     for column in np.array_split(np.lexsort((electrodes, x_um)), columns):
         in_order = column[np.lexsort((electrodes[column], y_um[column]))]
-        quadrants += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
-    return tuple(quadrants)
+        groups += [tuple(sorted(electrodes[place].tolist())) for place in np.array_split(in_order, rows)]
+    return tuple(groups)

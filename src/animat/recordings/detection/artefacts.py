@@ -88,10 +88,10 @@ def without_artefacts(
     following = np.append(stimulus[1:], samples + before)
     flat, pause = max(round(FLAT_MS * per_ms), 3), round(PAUSE_MS * per_ms)
     is_held = np.zeros(len(voltage_uv), dtype=bool)
+    first = int(stimulus[0]) - before
     if rest_uv is None:
         rest_uv = np.zeros(len(voltage_uv), np.float32)
-    else:
-        first = max(int(stimulus[0]) - before, 0)
+    elif first > pause:
         is_held = _saturated_until(voltage_uv[:, :first] - rest_uv[:, None], noise_uv, settings, flat) > first - pause
         voltage_uv[is_held, :first] = rest_uv[is_held, None]
     for i, (at, next_at) in enumerate(zip(stimulus.tolist(), following.tolist(), strict=True)):

@@ -16,7 +16,7 @@ FOLLOWED_S, CLOSE_S, REST_S = 1.0, 0.025, 0.005
 trace is not yet at rest; and how much of the trace before a pulse shows its resting voltage."""
 
 REST_PULSES = 5
-"""Pulses at which the resting voltage is looked up, as an amplifier may be saturated at some of them."""
+"""Most pulses at which the resting voltage is looked up, as an amplifier may be saturated at some of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class Piece:
         rest_uv = None
         if self.rests_uv is not None:
             rests_uv = self.rests_uv[:, columns]
-            # Without samples there is no distance.
+            # A pulse without finite samples before it (NaN) is never the nearest.
             nearest = np.nan_to_num(np.abs(rests_uv - level_uv), nan=np.inf).argmin(axis=0)
             rest_uv = rests_uv[nearest, np.arange(len(nearest))]
         cleaned = without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings, rest_uv)

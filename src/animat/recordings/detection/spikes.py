@@ -23,7 +23,7 @@ BLOCK = 64
 """Channels filtered at a time: few enough to fit into the processor's cache."""
 NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
 DEAD, NOISY = 0.1, 5.0
-"""Shares of the median channel's noise: a channel below is dead, one above is noisy."""
+"""Multiples of the median channel's noise: a channel below is dead, one above is noisy."""
 
 MUCH_LOST = 0.01
 

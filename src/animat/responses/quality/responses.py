@@ -319,7 +319,11 @@ def _readouts(responses: Responses) -> Iterator[Finding]:
     if alike:
         spread, pair, between = min(alike)
         is_known = spread < LITTLE_DIFFERENCE
-        does = "the conditions hardly separate" if is_known else "there are too few responses to know if they separate"
+        does = (
+            "the conditions hardly separate"
+            if is_known
+            else "there are too few responses to know if the conditions separate"
+        )
         message = (
             f"{does} the readouts {pair}: P(x >= P50) of the first less that of the second is {between}, and a policy "
             "needs them separated to give one command without the other: record more, or at places that differ "

@@ -27,7 +27,7 @@ LEFT_OUT, LEFT_OUT_SHARE = 2, 0.02
 """Number and share of the stimuli with most spikes in the artefact's largest bin, without which it must still be an
 artefact: a burst may happen to fall there."""
 ENOUGH = 10.0
-"""Spikes expected in a stretch for its absence to count as a blank."""
+"""Spikes expected in a stretch for their absence to count as a blank."""
 
 
 def artefact_findings(
