@@ -755,7 +755,7 @@ def test_training_reports_the_memory() -> None:
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
     decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
-    assert first.startswith("memory at 0 min: a response depends on the trials before it: ")
+    assert first.startswith("memory at 0 min: a response depends on earlier trials, ")
     assert (
         f"each trial counts {decay:.2g} times as much as the one after it, and a stimulus {weight:.2g} times as"
         in first

@@ -87,8 +87,8 @@ def test_the_outlook_is_one_line() -> None:
     line = str(Outlook(26.2, (24.0, 11.0), math.inf))
     assert line == (
         "the session is planned for about 26 min of the culture's time; at the drift of the recordings the median "
-        "response will have changed by 25 % in 24 min (11 min at the earliest), beyond which adaptive thresholds may not "
-        "help; the plan is longer: ask for fewer --episodes"
+        "response will have changed by 25 % in 24 min (11 min at the earliest), beyond which adaptive thresholds may "
+        "not help; the plan is longer: ask for fewer --episodes"
     )
     assert str(Outlook(26.2, (24.0, -9.0), 20.0)).endswith("the plan is longer: ask for fewer --episodes")
     assert "in 24 min (0 min at the earliest)" in str(Outlook(26.2, (24.0, -9.0), 20.0))

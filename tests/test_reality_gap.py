@@ -794,7 +794,7 @@ class TestCommand:
             given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--episodes", "1"]
             assert main(["run", *given, "--controls", "random", "--out", str(folder / type(made).__name__)]) == 0
             said = capsys.readouterr().err
-            assert "no pattern of this culture" in said if words else "pattern" not in said
+            assert "not patterns of this culture" in said if words else "pattern" not in said
             assert (words or "") in said
 
     def test_a_spent_budget_is_reported_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
