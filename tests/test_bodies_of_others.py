@@ -331,7 +331,7 @@ def test_it_trains_evaluates_and_is_listed_on_the_command_line(
     assert "1 policy in" in capsys.readouterr().out
     before = bits(tmp_path / "out")
     assert main(["train", *arguments, "--parameters", "g=9.5", "--workers", "1", "--out", out]) == 0
-    assert bits(tmp_path / "out") == before and "was finished before" in capsys.readouterr().out
+    assert bits(tmp_path / "out") == before and "is already finished" in capsys.readouterr().out
     assert Policy.load(tmp_path / "out" / "p0.safetensors").robot.settings == (("g", 9.5),)  # type: ignore[attr-defined]
     assert main(["evaluate", out, "--episodes", "2", "--robot", "gymnasium:Pendulum-v1"]) == 0
     assert "gymnasium:Pendulum-v1, without neurons: 1 policy, 2 episodes each" in capsys.readouterr().out

@@ -175,7 +175,7 @@ def test_another_training_s_folder_is_refused_before_recordings_are_read_and_a_f
     files = {file: file.read_bytes() for file in policies.iterdir()}
     assert main(again) == 0
     printed = capsys.readouterr().out
-    assert f"this training was finished before: its policies are in {policies}" in printed
+    assert f"this training is already finished; the policies in {policies} are unchanged" in printed
     assert f"2 policies in {policies}; mean return" in printed
     assert {file: file.read_bytes() for file in policies.iterdir()} == files
 
@@ -658,7 +658,7 @@ def test_inspect_that_can_read_none_says_nothing_of_others(tmp_path: Path, capsy
         (tmp_path / f"{name}_spikes.csv").write_text("time,channel\n1,2,3\n")
     assert main(["inspect", str(tmp_path)]) == 1
     said = capsys.readouterr().err.splitlines()
-    assert said[2:] == ["animat: 2 of 2 files could not be inspected, as said above"]
+    assert said[2:] == ["animat: 2 of 2 files could not be inspected (see above)"]
 
 
 @pytest.mark.parametrize(

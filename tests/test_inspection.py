@@ -186,7 +186,7 @@ def test_conditions_that_do_not_differ_are_said_to_give_no_control() -> None:
     assert names(extract_responses(same, burst_threshold=1))["no-difference"] == "warning"
     assert "no policy can steer" in message(same, "no-difference", burst_threshold=1)
     other = answering({5: 10.0, 10: 30.0}, n=400, n_channels=60)
-    assert "P(x >= P50) is 0.0" in message(other, "difference", burst_threshold=1)
+    assert "P(x >= P50): 0.0" in message(other, "difference", burst_threshold=1)
     assert "one-condition" in names(extract_responses(same, All()))
 
 

@@ -755,13 +755,16 @@ def test_training_reports_the_memory() -> None:
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
     first, last = _memories(fit_timeline(series, kind="memory"))
     decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
-    assert first.startswith("memory at 0 min: a response depends on the trials before it: ")
-    assert f"counts {decay:.2g} times as much as the next one, and its stimulus {weight:.2g} times as" in first
+    assert first.startswith("memory at 0 min: a response depends on earlier trials, ")
+    assert (
+        f"each trial counts {decay:.2g} times as much as the one after it, and a stimulus {weight:.2g} times as"
+        in first
+    )
     n = int(np.median([np.count_nonzero(series[0].condition == c) for c in range(2)]))
     near = int(np.median([np.rint(len(series[0].rates_of(c)) ** neighbour_exponent) for c in range(2)]))
     assert first.endswith(f"draws from the {near} responses with the most similar history, out of {n} per condition")
     (message,) = _memories(fit_timeline([loaded(600, 1, slope=-60.0)], kind="memory"))
-    assert message.endswith(". The amount of stimulation in the last 1 s counts too")
+    assert ". It also depends on the amount of stimulation in the last 1 s. The simulator draws" in message
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
 

@@ -87,11 +87,11 @@ def test_the_outlook_is_one_line() -> None:
     line = str(Outlook(26.2, (24.0, 11.0), math.inf))
     assert line == (
         "the session is planned for about 26 min of the culture's time; at the drift of the recordings the median "
-        "response will have changed by 25 % in 24 min (at least 11 min), beyond which adaptive thresholds may not "
-        "help; the plan is longer: ask for fewer --episodes"
+        "response will have changed by 25 % in 24 min (11 min at the earliest), beyond which adaptive thresholds may "
+        "not help; the plan is longer: ask for fewer --episodes"
     )
     assert str(Outlook(26.2, (24.0, -9.0), 20.0)).endswith("the plan is longer: ask for fewer --episodes")
-    assert "in 24 min (at least 0 min)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
+    assert "in 24 min (0 min at the earliest)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
     assert str(Outlook(26.2, (-5.0, -9.0), math.inf)) == (
         "the session is planned for about 26 min of the culture's time; at the drift of the recordings the median "
         "response had already changed by 25 % 5 min ago, beyond which adaptive thresholds may not help; use newer "
@@ -99,7 +99,7 @@ def test_the_outlook_is_one_line() -> None:
     )
     drifted = str(Outlook(26.2, (-5.0, -9.0), 20.0))
     assert drifted.endswith("--at-min or by recording again; the plan is longer: ask for fewer --episodes")
-    assert "in more than 10 h (at least 40 min)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
+    assert "in more than 10 h (40 min at the earliest)" in str(Outlook(26.2, (math.inf, 40.0), math.inf))
     assert str(Outlook(6.0, None, 7.0)) == (
         "the session is planned for about 6 min of the culture's time; at least two recordings are needed to estimate "
         "the culture's drift; the budget of pulses lasts for about 7 min"

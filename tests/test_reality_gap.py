@@ -251,7 +251,7 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
 
     high = float(policies.predicted.max()) + 1
     assert verdict(0.001, 0.9, high).startswith("the policies outperform every control (p < 0.01; ")
-    assert verdict(0.02, 0.6, high).startswith("the policies do not outperform random (p = 0.02; ")
+    assert verdict(0.02, 0.6, high).startswith("the policies do not outperform these controls: random (p = 0.02; ")
     at = float(policies.predicted.mean())
     assert verdict(0.001, 0.9, at).endswith("larger in at least 90 % of the pairs of episodes)")
     looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
@@ -794,7 +794,7 @@ class TestCommand:
             given = [str(folder / "policies"), "--recordings", str(folder / "recordings"), "--episodes", "1"]
             assert main(["run", *given, "--controls", "random", "--out", str(folder / type(made).__name__)]) == 0
             said = capsys.readouterr().err
-            assert "no pattern of this culture" in said if words else "pattern" not in said
+            assert "not patterns of this culture" in said if words else "pattern" not in said
             assert (words or "") in said
 
     def test_a_spent_budget_is_reported_and_an_error(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,7 +120,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         "10 % of 800 responses were bursts (2 % in the recording), which the prediction leaves out",
     ),
     "trend": ({"rate_hz": falling, "returns": worse}, "13 min: responses to 80 Hz fall by "),
-    "memory": ({"rate_hz": remembering}, "the culture remembers: of the responses after one that passes the median"),
+    "memory": ({"rate_hz": remembering}, " of the responses pass the median if the previous response did, "),
     "answers": (
         {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
         "conditions lead to different mean commands than predicted: 80 Hz to ",

@@ -33,7 +33,7 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     verdict = Verdict.of(policies, {"worse": policies - 9, "like": rng.normal(0, 1, 50), "better": policies + 9})
     assert verdict.not_outperformed == ("like", "better")
     said = str(verdict)
-    assert said.startswith("the policies do not outperform like (p = ")
+    assert said.startswith("the policies do not outperform these controls: like (p = ")
     # Significantly worse than a control is not better than it.
     assert "better (p = " in said and "they are worse: their return is larger in 0 % of the pairs" in said
     assert said.count("worse") == 1
@@ -49,6 +49,6 @@ def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
     assert str(six).startswith("the policies outperform every control (p < 0.01; ")
     # The result for one control is reported even if another was broken off.
     both = Verdict.of(np.arange(20.0), {"broken off": [0.0], "better": np.arange(20) + 90.0})
-    assert str(both).startswith("the policies do not outperform better (p = ")
+    assert str(both).startswith("the policies do not outperform these controls: better (p = ")
     assert str(both).endswith("too few to show (p < 0.01) whether the policies outperform broken off")
     assert not EpisodeComparison(0.03, 1.0, 4, 4).has_enough_episodes

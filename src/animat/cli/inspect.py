@@ -125,9 +125,9 @@ class Inspect(ResponseOptions):
                     print(f"figures of the series: {', '.join(map(str, drawn))}")
                 results["figures"] = [str(figure) for figure in drawn]
         if unreadable:
-            others = "; the others were" if inspected else ""
+            others = "; the rest were inspected" if inspected else ""
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"
-            print(f"animat: {count}, as said above{others}", file=sys.stderr)
+            print(f"animat: {count} (see above){others}", file=sys.stderr)
         return results
 
 

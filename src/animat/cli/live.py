@@ -25,7 +25,7 @@ class Live(StimulationOptions):
     """Parameter shadowing on one culture as it changes: record, train, refresh, then run in closed loop."""
 
     robot: Positional[str] = "cartpole"
-    """The robot to drive: cartpole, navigation, swing-up, or your own, such as my_package.robots:Rover"""
+    """The robot to drive: cartpole, navigation, swing-up, shuttle, or your own, such as my_package.robots:Rover"""
     mapping: str = "9-thresholds"
     """From responses to motor commands: 1-threshold, 9-thresholds, linear, or your own, such as
     my_package.mappings:Steep"""

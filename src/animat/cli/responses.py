@@ -23,11 +23,13 @@ class ResponseOptions:
 
     conditions: str | None = None
     """What the agent chooses from: frequency, interval:5,10+-25%, electrode, pattern, "frequency x electrode", all;
-    default: by frequency, and by place where places were recorded"""
+    default: by frequency, and by place where places were recorded; with policies: as in their training"""
     window_ms: tuple[float, float] | None = None
-    """Start and end of the response window after a stimulus, in ms; default: 2 10"""
+    """Start and end of the response window after a stimulus, in ms; default: 2 10; with policies: as in their
+    training"""
     burst_threshold: float | None = None
-    """Share of active channels above which a response is a burst; 1 keeps all; default: where two groups separate"""
+    """Share of active channels above which a response is a burst; 1 keeps all; default: where two groups separate;
+    with policies: as in their training"""
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,12 @@ class SimulatorOptions(ResponseOptions):
 
     simulator: Literal["histogram", "empirical", "memory"] | None = None
     """memory: draw a response that was measured after a similar history, the default except for recordings in blocks;
-    histogram: the paper's; empirical: draw any measured value"""
+    histogram: the paper's; empirical: draw any measured value; default with policies: as in their training"""
     bins: int | None = None
-    """Bins of a histogram; default: 20"""
+    """Bins of a histogram; default: 20; with policies: as in their training"""
     range_hz: float | None = None
-    """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: edges at percentiles of each recording"""
+    """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: edges at percentiles of each recording;
+    with policies: as in their training"""
     allow: tuple[str, ...] = ()
     """Findings to allow, by name, such as dead-window"""
 

@@ -23,8 +23,7 @@ class StimulationOptions:
     culture_seed: int | None = None
     """Which virtual culture, or which patterns of a CL1; default: in run that of the recordings, else 1"""
     budget_pulses: int | None = None
-    """Most pulses in all, including those of live's recordings; default: unlimited, apart from the culture's
-    own limits"""
+    """Most pulses in all, in live including those of the recordings; default: no limit but the culture's own"""
     budget_per_electrode: int | None = None
     """Most pulses on any one electrode"""
     thresholds: Literal["adaptive", "fixed"] = "adaptive"
@@ -41,7 +40,7 @@ class StimulationOptions:
     """How many times a pause and six trials of each condition precede the first episode, so that thresholds adapt;
     default: 10 with one pulse and adaptive thresholds, else 0"""
     patience_s: float = 10.0
-    """Seconds beyond the expected time that a culture may take to respond before the session ends"""
+    """Seconds beyond the expected time that a culture, robot or agent may take before the session ends"""
 
     def _expect_culture_seed(self) -> None:
         """Raise for a negative seed, under the option's name: later it would be called `seed`, as the policies' is."""

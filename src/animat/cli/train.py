@@ -131,7 +131,7 @@ class Train(SimulatorOptions):
                 callbacks=() if on_row is None else (on_row,),
             )
         if was_finished:
-            print(f"this training was finished before: its policies in {self.out} are unchanged")
+            print(f"this training is already finished; the policies in {self.out} are unchanged")
         return self._report(trained, timeline)
 
     def _training(self) -> tuple[Training, str | Readouts]:
@@ -300,10 +300,13 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
             decay, weight, _, load_s = memory = simulator.memory
             near, total = (int(np.median(counts)) for counts in (simulator.nearest, simulator.followers))
             text = (
-                f"a response depends on the trials before it: each counts {decay:.2g} times as much as the next one, "
-                f"and its stimulus {weight:.2g} times as much as its response. The simulator draws from the {near} "
-                f"responses with the most similar history, out of {total} per condition"
+                f"a response depends on earlier trials, where each trial counts {decay:.2g} times as much as the one "
+                f"after it, and a stimulus {weight:.2g} times as much as its response"
             )
             if load_s:
-                text += f". The amount of stimulation in the last {load_s:g} s counts too"
+                text += f". It also depends on the amount of stimulation in the last {load_s:g} s"
+            text += (
+                f". The simulator draws from the {near} responses with the most similar history, out of {total} per "
+                "condition"
+            )
             yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else text}"

@@ -65,9 +65,16 @@ def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Ite
 
     differing = [name for name in trained if rule(name, trained[name]) != rule(name, given.get(name))]
     if differing:
-        values = ", ".join(f"{_LABELS.get(name, name)} {trained[name]}, here {given.get(name)}" for name in differing)
+        values = ", ".join(
+            f"{_LABELS.get(name, name)} {_or_default(trained[name])}, here {_or_default(given.get(name))}"
+            for name in differing
+        )
         message = f"the policies were trained on simulators that were fitted differently: {values}"
         yield Finding("other-simulator", "warning", message)
+
+
+def _or_default(value: Any) -> Any:
+    return "by default" if value is None else value
 
 
 _LABELS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}

@@ -95,7 +95,11 @@ class Verdict:
             for name, each in self.controls.items()
             if not each.is_outperformed and each.has_enough_episodes
         ]
-        parts = [f"the policies do not outperform {', '.join(not_outperformed)}"] if not_outperformed else []
+        parts = (
+            [f"the policies do not outperform these controls: {', '.join(not_outperformed)}"]
+            if not_outperformed
+            else []
+        )
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
             parts.append(

@@ -58,7 +58,7 @@ def _when(likely: float, least: float) -> str:
     by = f"by {100 * LARGE:.0f} %"
     if likely <= 0:
         return f"had already changed {by} {_duration(-likely)} ago"
-    return f"will have changed {by} in {_duration(likely)} (at least {_duration(max(0.0, least))})"
+    return f"will have changed {by} in {_duration(likely)} ({_duration(max(0.0, least))} at the earliest)"
 
 
 def _duration(minutes: float) -> str:

@@ -27,6 +27,8 @@ REFUSING = (
     "several-cultures",
 )
 """Names of the findings that make training pointless; a user may allow them."""
+_NOTHING_TO_FIT = ("no-condition", "empty-condition")
+"""Those after which no simulator can be fitted, even if they are allowed."""
 
 
 def extract_series(
@@ -76,10 +78,10 @@ def extract_series(
             raise type(error)(f"{error} (the recording at {in_min(recording.start_min)})") from error
         for finding in (*recording_findings(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
-                raise UnusableData(
-                    f"the recording at {in_min(recording.start_min)}: {finding.message} (to allow it: "
-                    f"--allow {finding.name}, or in a study simulators.allow)"
-                )
+                remedy = f" (to allow it: --allow {finding.name}, or in a study simulators.allow)"
+                if finding.name in _NOTHING_TO_FIT:
+                    remedy = ""
+                raise UnusableData(f"the recording at {in_min(recording.start_min)}: {finding.message}{remedy}")
         series.append(responses)
     return series
 

@@ -14,7 +14,7 @@ from animat.robots.wheeled import Wheeled
 @register_robot
 @record
 class Wheels(Wheeled):
-    """`Wheeled` with four round obstacles around the start, and goals anywhere in the arena."""
+    """A wheeled robot with four round obstacles around the start, and goals anywhere in the arena."""
 
     obstacles: Obstacles = ((0.3, 0.3, 0.08), (0.72, 0.35, 0.06), (0.35, 0.72, 0.06), (0.7, 0.7, 0.08))
 

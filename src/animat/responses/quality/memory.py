@@ -52,8 +52,8 @@ def memory_findings(responses: Responses) -> Iterator[Finding]:
     if abs(after_one - after_none) <= CERTAIN * error:
         return
     message = (
-        f"the culture remembers: of the responses after one that passes the median {100 * after_one:.0f} % pass it "
-        f"too, of the others {100 * after_none:.0f} %, within conditions; histogram simulators ignore this, memory "
+        f"the culture remembers: {100 * after_one:.0f} % of the responses pass the median if the previous response "
+        f"did, {100 * after_none:.0f} % if it did not (within conditions); histogram simulators ignore this, memory "
         f"simulators do not{' (fitted to recordings with --order mixed)' if responses.is_blocked else ''}"
     )
     yield Finding("memory", "note", message, after_one - after_none)

@@ -255,7 +255,7 @@ def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
         )
         yield Finding("many-bursts", "warning", message, share)
     else:
-        message = f"{dropped} (above {responses.threshold:.3f} of the channels active; {values})"
+        message = f"{dropped} (more than {100 * responses.threshold:.1f} % of the channels active; {values})"
         yield Finding("bursts", "note", message, share)
 
 
@@ -277,11 +277,11 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     spread = highest[1] - lowest[1]
     listed = some_of([f"{p:.2f} for {label}" for label, p in known])
     reach = (
-        f"with one threshold the choice moves the mean command from {2 * lowest[1] - 1:+.2f} to "
-        f"{2 * highest[1] - 1:+.2f} (of -1 to +1)"
+        f"with one threshold the choice of a condition moves the mean command from {2 * lowest[1] - 1:+.2f} to "
+        f"{2 * highest[1] - 1:+.2f} on a scale from -1 to +1, and the rest is chance"
     )
     differ = "hardly differ" if spread < SMALL_DIFFERENCE else f"differ by {spread:.2f} at most"
-    message = f"the conditions {differ}: P(x >= P50) is {listed}; {reach}, the rest is chance"
+    message = f"the conditions {differ} in P(x >= P50): {listed}; {reach}"
     if spread < SMALL_DIFFERENCE:
         message += ", so no policy can steer a robot much better than at random: stimulate in ways that differ more"
         yield Finding("no-difference", "warning", message, spread)

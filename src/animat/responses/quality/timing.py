@@ -137,7 +137,7 @@ def _artefact_finding(
         f"the window begins at {window_ms[0]:g} ms, inside it"
         + ("" if is_elsewhere else f": begin it at {to_ms:g} ms or later (--window-ms)")
         if reaches
-        else f"the window from {window_ms[0]:g} ms on does not hold them"
+        else f"the window from {window_ms[0]:g} ms on does not contain them"
     )
     message = (
         f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
