@@ -330,7 +330,7 @@ def test_an_optimum_without_conditions_of_few_responses_gives_no_score(monkeypat
     held = replace(fit_histogram(lucky.only([0, 1, 2, 3])), percentiles=timeline.at(0.0).percentiles)
     assert found.optimum.value == best_return(Animat(SHORT, Thresholds(1), 4), held, resolution=0.25, episodes=0).value
     assert {row["normalised_score"] for row in found.to_dict()["rows"]} == {None}
-    assert "no score, as the optimal return is without conditions" in found.to_text()
+    assert "no score, as the optimal return leaves out conditions" in found.to_text()
 
 
 @pytest.mark.oracle
