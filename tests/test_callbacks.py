@@ -102,6 +102,7 @@ def test_without_tensorboard_x_the_extra_is_named(
     words = ["train", "cartpole", "--mapping", "none", "--out", str(out), "--tensorboard", str(tmp_path / "runs")]
     assert main(words) == 1
     (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("animat: --tensorboard: expected the package tensorboardX, which is not installed: ")
     assert "pip install 'animat[tensorboard]'" in line
     assert not out.exists() and not (tmp_path / "runs").exists()
 

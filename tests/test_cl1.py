@@ -118,7 +118,7 @@ def pulse(*numbers: float) -> Pulse:
         ("phase_step_us", pulse(150, -1, 150, 1), "steps of 20 us, got 150"),
         ("alternates", pulse(160, -1, 160, -1, 320, 1), "different signs"),
         ("phases_per_pulse", pulse(20, -1, 20, 1, 20, -1, 20, 1), "at most 3 phases"),
-        ("kind", BALANCED_PULSE, "expected current pulses"),
+        ("kind", BALANCED_PULSE, "pulse: expected a current pulse, .* got a voltage pulse"),
     ],
 )
 def test_what_the_sdk_would_refuse_or_not_look_at_is_refused_by_the_guard(limit: str, bad: Pulse, words: str) -> None:
@@ -355,7 +355,9 @@ def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons,
 
 def test_without_the_sdk_the_error_says_where_it_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cl", None)
-    with pytest.raises(DeviceFailed, match="cl-sdk") as failed:
+    with pytest.raises(
+        DeviceFailed, match=r"culture: expected .* cl-sdk for a cl1, .* pip install 'animat\[cl1\]'"
+    ) as failed:
         CL1Culture().open()
     assert "\n" not in str(failed.value)
 

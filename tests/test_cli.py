@@ -389,12 +389,61 @@ BAD = {
     "unknown conditions": (nothing, [*TRAIN, "{recordings}", "--conditions", "colour"], ["conditions", "colour"]),
     "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["--window-ms: expected"]),
     "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
-    "unknown parameter": (nothing, [*TRAIN, "{recordings}", "--parameters", "wheels=3"], ["cartpole", "wheels"]),
+    "unknown parameter": (
+        nothing,
+        [*TRAIN, "{recordings}", "--parameters", "wheels=3"],
+        ["--parameters: cartpole: expected", "wheels"],
+    ),
     "a parameter called name": (nothing, [*TRAIN, "{recordings}", "--parameters", "name=3"], ["cartpole", "'name'"]),
     "no channels": (
         arrays(spike_time_s=np.zeros(0), spike_channel=np.zeros(0, np.int64), channel_label=None),
         ["inspect", "{folder}/bad.npz"],
         ["bad.npz", "channels: expected at least one"],
+    ),
+    "a parameter out of range": (
+        nothing,
+        [*TRAIN, "{recordings}", "--parameters", "pole_mass_kg=-1"],
+        ["animat: --parameters: cartpole: pole_mass_kg: expected at least 1e-09, got -1"],
+    ),
+    "readouts of no name": (
+        nothing,
+        [*TRAIN, "{recordings}", "--readouts", "thirds"],
+        ["animat: --readouts: expected all, halves, quadrants or a file of groups", "got thirds, which is not a file"],
+    ),
+    "places of no name": (
+        nothing,
+        ["record", "--places", "middle"],
+        [
+            "animat: --places: expected halves, quadrants, corners or a file of groups",
+            "got middle, which is not a file",
+        ],
+    ),
+    "a condition below 0": (
+        nothing,
+        ["inspect", "{recordings}", "--conditions", "interval:-5"],
+        ["animat: --conditions: interval: expected positive frequencies in Hz, got -5"],
+    ),
+    "no recordings": (nothing, ["inspect"], ["animat: recordings: expected at least one file or folder"]),
+    "a band from high to low": (
+        nothing,
+        ["convert", "{recordings}/recording_0_min.nwb", "--out", "{folder}/a.nwb", "--raw", "--band-hz", "3000", "100"],
+        ["animat: --band-hz: expected 0 < low < high in Hz, got 3000 to 100"],
+    ),
+    "a threshold below 0": (
+        nothing,
+        ["convert", "{recordings}/recording_0_min.nwb", "--out", "{folder}/a.nwb", "--raw", "--threshold", "-1"],
+        ["animat: --threshold: expected more than 0, got -1"],
+    ),
+    "a cluster elsewhere": (nothing, ["cluster", "remote"], ["animat: where: expected local, got 'remote'; see"]),
+    "two protocols": (
+        nothing,
+        ["record", "--protocol", "{folder}/a.json", "--paper"],
+        ["animat: --protocol: expected it without --paper, which is another protocol; leave one out"],
+    ),
+    "a file for the folder of figures": (
+        lambda folder, *_: (folder / "taken").write_text("x"),
+        ["inspect", "{recordings}", "--out", "{folder}/taken"],
+        ["taken: expected a folder, got a file; choose another --out"],
     ),
     "parameter without a number": (nothing, [*TRAIN, "{recordings}", "--parameters", "force_n"], ["--parameters"]),
     "a misspelt setting": (
@@ -546,12 +595,12 @@ BAD = {
     "a file for a folder": (
         lambda folder, *_: (folder / "taken").write_text("x"),
         ["record", "--out", "{folder}/taken"],
-        ["taken: cannot be created or read: it is not a folder; choose another --out"],
+        ["taken: expected a folder, got a file; choose another --out"],
     ),
     "a file for the folder of a cluster's address": (
         lambda folder, *_: (folder / "taken").write_text("x"),
         ["cluster", "local", "--file", "{folder}/taken/cluster.json"],
-        ["taken: cannot be written: ", "taken is not a folder; choose another --file"],
+        ["taken: expected a folder, got a file; choose another --file"],
     ),
     "a training's description that somebody edited": (
         lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),
@@ -658,7 +707,7 @@ def test_inspect_that_can_read_none_says_nothing_of_others(tmp_path: Path, capsy
         (tmp_path / f"{name}_spikes.csv").write_text("time,channel\n1,2,3\n")
     assert main(["inspect", str(tmp_path)]) == 1
     said = capsys.readouterr().err.splitlines()
-    assert said[2:] == ["animat: 2 of 2 files could not be inspected (see above)"]
+    assert said[2:] == ["animat: 2 of 2 files could not be inspected"]
 
 
 @pytest.mark.parametrize(
@@ -695,7 +744,10 @@ def test_inspect_refuses_its_options_before_the_files(
         ("reproduce --seed -1", "--seed: expected at least 0, got -1"),
         ("live --policies 0", "--policies: expected a whole number from 1"),
         ("train unicycle", "robot: expected one of arm"),  # No option: it has its place.
-        ("train --out policies --mapping none", "policies: cannot be written"),  # A file, not the option.
+        (
+            "train --out policies --mapping none",
+            "policies: expected a folder, got a file; choose another --out",
+        ),  # A file, not the option.
     ],
 )
 def test_an_error_of_an_argument_begins_with_its_option(

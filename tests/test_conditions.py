@@ -146,7 +146,7 @@ def test_the_tolerance_can_be_typed_or_left_out() -> None:
         ("speed", "expected one of all, frequency"),
         ("all:1", "expected one of all, frequency"),
         ("frequency:5,x", "expected numbers"),
-        ("frequency:-5", "expected positive frequencies in Hz, got -5"),
+        ("frequency:-5", "conditions: frequency: expected positive frequencies in Hz, got -5"),
         ("frequency:5,5", "expected each frequency once"),
         ("frequency:nan", "expected positive"),
         ("interval", "expected at least one frequency"),

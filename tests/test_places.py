@@ -76,7 +76,9 @@ def test_invalid_places_are_refused_and_their_file_is_named(given_: object, tmp_
         match=r"places\.json: places: expected JSON such as .*, got malformed text: .* line 1 column 8",
     ):
         read_places(str(file))
-    with pytest.raises(InvalidFile, match=r"nothing\.json: no such file"):
+    with pytest.raises(
+        InvalidFile, match=r"places: expected halves, .* or a file of groups .*nothing\.json, which is not a file"
+    ):
         read_places(str(tmp_path / "nothing.json"))
 
 

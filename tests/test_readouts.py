@@ -214,7 +214,7 @@ def test_a_file_of_no_readouts_is_named(text: str, expected: str, tmp_path: Path
     with pytest.raises(InvalidFile) as raised:
         read_readouts(tmp_path / "groups.json")
     assert f"groups.json: readouts{expected}" in str(raised.value) and "\n" not in str(raised.value)
-    with pytest.raises(InvalidFile, match="named readouts are all, halves and quadrants"):
+    with pytest.raises(InvalidFile, match="readouts: expected all, halves, quadrants or a file of groups"):
         read_readouts("thirds")
 
 

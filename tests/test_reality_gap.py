@@ -833,7 +833,7 @@ class TestCommand:
             (["--bins", "0"], "--bins: expected"),
             (["--bins", "10", "--simulator", "memory"], "--bins: expected none, as a simulator of kind memory has no"),
             (["--range-hz", "9", "--simulator", "empirical"], "--range-hz: expected none"),
-            (["--out", "/dev/null"], "expected a folder for the session, got a file"),
+            (["--out", "/dev/null"], "expected a folder for the session, got a file; choose another --out"),
         ],
     )
     def test_bad_settings_are_one_line_before_a_culture_is_opened(
@@ -856,10 +856,27 @@ class TestCommand:
         assert "q0: expected the same conditions as p0" in capsys.readouterr().err
         assert not (folder / "new").exists()
 
+    def test_recordings_of_another_kind_of_culture_have_an_unsuitable_pulse(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert self.command(folder, "--culture", "cl1") == 1
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert "--recordings: expected a pulse that suits a cl1, got another (pulse: expected a current pulse" in said
+        assert "record on that culture first, with animat record --culture cl1" in said
+        assert not (folder / "session").exists()
+
+    def test_a_maxone_needs_a_selection(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert self.command(folder, "--culture", "maxone") == 1
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert said == "animat: --selection: expected a file of electrodes for a culture of kind 'maxone', got none"
+
     def test_other_mistakes_are_one_line_too(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--state", "nowhere.state") == 1
         assert "state: expected none for a culture of kind 'replay'" in capsys.readouterr().err
         assert main(["recover", str(folder / "nowhere")]) == 1
+        assert "nowhere: expected the folder of a session, got no such file" in capsys.readouterr().err
+        assert main(["recover", str(folder)]) == 1
+        assert "expected the folder of a session, got a folder without session.log" in capsys.readouterr().err
 
 
 def test_a_cl1_is_stimulated_through_the_patterns_that_it_was_recorded_with(recordings: list[Recording]) -> None:
@@ -884,9 +901,9 @@ def test_another_kind_of_culture_is_another_word(tmp_path: Path, recordings: lis
         assert pulse.kind == limits.kind
         assert abs(pulse.net_charge) <= limits.net_charge
         assert all(abs(phase.charge) <= limits.charge_per_phase for phase in pulse.phases)
-    with pytest.raises(InvalidArgument, match="a file of electrodes for a maxone"):
+    with pytest.raises(InvalidArgument, match=r"selection: expected a file of electrodes for .*'maxone', got none"):
         culture_of("maxone")
-    with pytest.raises(InvalidArgument, match="none for others"):
+    with pytest.raises(InvalidArgument, match=r"selection: expected none for a culture of kind 'virtual', got .*json"):
         culture_of("virtual", selection=tmp_path / "electrodes.json")
     with pytest.raises(InvalidArgument, match="expected one of"):
         culture_of("human")  # type: ignore[arg-type]

@@ -547,7 +547,7 @@ def test_folders_are_read_in_the_order_of_the_cultures_clock(tmp_path: Path) -> 
 def test_recordings_with_the_same_start_and_empty_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match=r"expected a folder of recordings .* found none in it"):
         read_recordings(tmp_path)
-    with pytest.raises(InvalidArgument, match="paths: expected at least one file"):
+    with pytest.raises(InvalidArgument, match="recordings: expected at least one file or folder"):
         read_recordings([])
     path = npz(tmp_path, **SPIKES, **STIMULI)
     with pytest.raises(InvalidFile, match=r"both start at 0 min; leave one out"):

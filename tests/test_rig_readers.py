@@ -118,7 +118,7 @@ def test_maxwell_is_read_without_groups_or_mapping(tmp_path: Path) -> None:
 
 def test_maxwell_without_spikes_says_what_to_do(tmp_path: Path) -> None:
     path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=None, recorded=[3])
-    with pytest.raises(InvalidFile, match=r"expected spikes at /wells/well000/rec0000/spikes.*animat convert"):
+    with pytest.raises(InvalidFile, match=r"expected spikes at /wells/well000/rec0000/spikes.*animat convert --raw"):
         read_recording(path)
 
 
@@ -214,7 +214,7 @@ def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
     assert np.isnan(recording.stimuli.frequency_hz).all()
     assert len(read_recording(write_cl1(tmp_path / "b.h5", spikes=[(5, 1)], stims=None)).stimuli) == 0
     path = write_cl1(tmp_path / "c.h5", spikes=None, stims=[(1, 2)], samples=np.zeros((10, 64), "<i2"))
-    with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert"):
+    with pytest.raises(InvalidFile, match=r"expected spikes at /spikes.*include_spikes=False.*animat convert --raw"):
         read_recording(path)
 
 

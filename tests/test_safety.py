@@ -266,7 +266,11 @@ WIDE = replace(SIMULATED_LIMITS, stimuli_per_s=10, stimuli_per_electrode_s=5, st
         ("phase_us", [one(Pulse((Phase(20, amplitude_mv=-1),)))], "phases of 50 to 1000 us, got 20"),
         ("charge_per_phase", [one(Pulse((Phase(1000, amplitude_mv=-300),)))], "-200 to 200 mV ms per phase, got -300"),
         ("net_charge", [one(Pulse((Phase(500, amplitude_mv=-60),)))], "balance to within 25 mV ms, got -30"),
-        ("kind", [one(Pulse((Phase(500, amplitude_ua=-1),)))], "expected voltage pulses, got a current pulse"),
+        (
+            "kind",
+            [one(Pulse((Phase(500, amplitude_ua=-1),)))],
+            "pulse: expected a voltage pulse, which this kind of culture takes, got a current pulse",
+        ),
         ("electrodes_at_once", [one(electrodes=())], "expected 1 to 32 electrodes, got 0"),
         ("sites", [one(electrodes=(99,))], "got electrode 99"),
         ("sites", [one(electrodes=(10, 10))], "each electrode once"),

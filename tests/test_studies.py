@@ -862,7 +862,7 @@ COMPARED = (
             + "]",
             "policies: expected at most 20,000 in a study, got 22,000",
         ),
-        ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2.0, got 3.0"),
+        ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2, got 3"),
         ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
         ("[culture]\nchannels = 32", "channels: no such setting in [culture]; expected some of kind, files"),
         (f"policies = {'9' * 5000}", "expected TOML, got malformed text: Exceeds the limit (4300 digits)"),

@@ -425,7 +425,7 @@ def test_a_policy_says_where_it_came_from(tmp_path: Path) -> None:
         ({"commands": ()}, "commands: expected at least 1"),
         ({"commands": ()}, "commands: expected at least 1 command to pick from, or None for any, got none"),
         ({"mapping": "none"}, "mapping: expected None without neurons, mapping=None in Python, got 'none'"),
-        ({"commands": (0.5, 2.0)}, "commands: expected at most 1, got 2.0"),
+        ({"commands": (0.5, 2.0)}, "commands: expected at most 1, got 2"),
         ({"lessons": (3,)}, "lessons: expected Lesson, got 3"),
         ({"algorithm": 3}, "algorithm: expected SAC, got 3"),
     ],

@@ -220,4 +220,7 @@ def test_the_command_says_what_is_wrong(
     assert "--port: expected a free port from 1 to 65,535" in capsys.readouterr().err
     monkeypatch.setattr("animat.watch.serving.find_spec", lambda name: None)
     assert main(["watch", str(tmp_path)]) == 1
-    assert "pip install 'animat[watch]'" in capsys.readouterr().err
+    expected = "expected starlette and uvicorn to be installed, got none: pip install 'animat[watch]'\n"
+    assert capsys.readouterr().err == f"animat: watch: {expected}"
+    assert main(["record", "--out", str(tmp_path), "--watch"]) == 1
+    assert capsys.readouterr().err == f"animat: --watch: {expected}"

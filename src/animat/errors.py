@@ -44,10 +44,11 @@ class UnsafeStimulus(AnimatError):
 
     Attributes:
         limit: the name of the limit, a field of `animat.cultures.safety.Limits` or `"sites"`, `"overlap"`, `"stopped"`.
+            The message begins with it, or with another `argument`.
     """
 
-    def __init__(self, limit: str, message: str) -> None:
-        super().__init__(f"{limit}: {message}; nothing was delivered")
+    def __init__(self, limit: str, message: str, argument: str | None = None) -> None:
+        super().__init__(f"{argument or limit}: {message}; nothing was delivered")
         self.limit = limit
 
 

@@ -8,9 +8,16 @@ from typing import Any
 from animat.errors import AnimatError
 
 
-def expect_extra(module: str, *, package: str, extra: str, what: str) -> Any:
-    """Import a module that an extra installs; raise AnimatError, saying how to install it, if it is missing."""
+def install_command(extra: str) -> str:
+    """The command that installs an extra, for messages."""
+    return f"pip install 'animat[{extra}]'"
+
+
+def expect_extra(module: str, *, package: str, extra: str, argument: str) -> Any:
+    """Import a module that an extra installs; the AnimatError if it is missing names the argument that needs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise AnimatError(f"{what} needs {package}, which is not installed: pip install 'animat[{extra}]'") from error
+        raise AnimatError(
+            f"{argument}: expected the package {package}, which is not installed: {install_command(extra)}"
+        ) from error

@@ -38,7 +38,7 @@ def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = Non
 def expect_no_file(folder: Path, what: str) -> None:
     """Raise InvalidFile if the folder for something is a file."""
     if folder.exists() and not folder.is_dir():
-        raise InvalidFile(f"{folder}: expected a folder for {what}, got a file")
+        raise InvalidFile(f"{folder}: expected a folder for {what}, got a file; choose another --out")
 
 
 def is_folder(path: Path) -> bool:

@@ -173,7 +173,11 @@ def _expected(mistake: ErrorDetails) -> str:
         last = mistake["loc"][-1]
         return "to be given, got nothing" if isinstance(last, str) else f"at least {last + 1} values"
     words = _EXPECTED.get(mistake["type"], mistake["msg"])
-    return f"{words.format(**mistake.get('ctx', {}))}, got {shown(mistake['input'])}"
+    expected, given = words.format(**mistake.get("ctx", {})), shown(mistake["input"])
+    if mistake["type"].startswith(("greater", "less")):
+        # On the command line whole numbers, too, become floats.
+        expected, given = expected.removesuffix(".0"), given.removesuffix(".0")
+    return f"{expected}, got {given}"
 
 
 def _key(key: str) -> str:

@@ -79,6 +79,8 @@ def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_
         with tempfile.TemporaryFile(dir=existing):
             free = shutil.disk_usage(existing).free
     except OSError as error:
+        if folder.exists() and not folder.is_dir():
+            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another {option}") from error
         what = f"{existing} is not a folder" if existing.is_file() else (error.strerror or str(error))
         raise InvalidFile(f"{folder}: cannot be written: {what}; choose another {option}") from error
     if free < room_bytes:
@@ -110,8 +112,11 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
             expect_writable(folder)
         descriptors = [os.open(folder, os.O_RDONLY)]
     except OSError as error:
-        what = "it is not a folder" if folder.exists() and not folder.is_dir() else error.strerror or error
-        raise InvalidFile(f"{folder}: cannot be created or read: {what}; choose another --out") from error
+        if folder.exists() and not folder.is_dir():
+            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out") from error
+        raise InvalidFile(
+            f"{folder}: cannot be created or read: {error.strerror or error}; choose another --out"
+        ) from error
     try:
         if _is_locked(folder, descriptors[0]):
             _expect_same(folder, descriptors[0])

@@ -39,6 +39,7 @@ from animat.cli.watch import Watch
 from animat.ctrl_c import interruptible
 from animat.devices import stay_on_cores
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
+from animat.plain_file import is_folder
 
 Command = (
     Annotated[Record, subcommand("record")]
@@ -122,14 +123,13 @@ def _run(arguments: list[str]) -> int:
         _print_notes(error)
         return 1
     except KeyboardInterrupt as error:
-        kept = (
-            ""
-            if isinstance(command, Inspect | Validate | Convert | Evaluate | Replay | ClusterCommand | Watch)
-            else "; finished work is kept"
-        )
+        kept = ""
+        # The others finish their work only at their end.
+        if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile | Run | Live):
+            kept = "; finished work is kept" if is_folder(command.out) and any(command.out.iterdir()) else ""
         again = (
             "; run it again to resume"
-            if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile)
+            if kept and isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile)
             else "; a session cannot be resumed: start a new one in another folder"
             if isinstance(command, Run) and (command.out / "session.log").exists()
             else ""
@@ -231,7 +231,12 @@ def _parse(arguments: list[str]) -> Command:
         lines = [line.strip("│╭╮╰╯ ") for line in output.getvalue().splitlines()[1:]]
         parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
         message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
-        raise InvalidArgument(f"{message.removeprefix('Error parsing ')}{see}") from None
+        message = message.removeprefix("Error parsing ")
+        if message.startswith("{"):
+            # The choices of a positional argument, in place of its name.
+            named = next(field.name for field in fields if "Positional" in str(field.type))
+            message = f"{named}: {message.partition(': ')[2]}"
+        raise InvalidArgument(f"{message}{see}") from None
     _expect_known(unknown, options, see)
     return command
 
@@ -280,7 +285,12 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
     spec = constructors.ConstructorRegistry.get_primitive_spec(constructors.PrimitiveTypeInfo.make(kind, set()))
     if option.type is not bool and isinstance(spec, constructors.PrimitiveConstructorSpec):
         among = sorted(spec.metavar.strip("{}").split(","))
-        expected = f"one of {', '.join(among)}" if spec.choices else _NUMBERS.get(spec.metavar.strip("{}"))
+        choices = ", ".join(among)
+        expected = (
+            (f"one of {choices}" if len(among) > 1 else choices)
+            if spec.choices
+            else _NUMBERS.get(spec.metavar.strip("{}"))
+        )
 
         def read(words: list[str]) -> Any:
             with contextlib.suppress(ValueError):

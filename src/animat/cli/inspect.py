@@ -127,7 +127,7 @@ class Inspect(ResponseOptions):
         if unreadable:
             others = "; the rest were inspected" if inspected else ""
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"
-            print(f"animat: {count} (see above){others}", file=sys.stderr)
+            print(f"animat: {count}{others}", file=sys.stderr)
         return results
 
 

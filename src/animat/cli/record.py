@@ -73,7 +73,8 @@ class Record:
         if self.seed < 0:
             raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
-        options += ["--paper"] if self.paper else []
+        if self.protocol is not None and self.paper:
+            raise InvalidArgument("--protocol: expected it without --paper, which is another protocol; leave one out")
         if options and self.protocol is not None:
             raise InvalidArgument(f"--protocol: expected it alone, got {', '.join(options)} too; put them in the file")
         protocol = self._protocol()

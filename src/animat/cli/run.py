@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from animat.cli.responses import policies_for, simulator_settings
 from animat.cli.stimulation import StimulationOptions, expect_no_fault
-from animat.errors import InvalidArgument, Mismatch, in_min
+from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, in_min
 from animat.plain_file import expect_no_file
 from animat.writing import exclusive_lock
 
@@ -222,7 +222,14 @@ class Run(StimulationOptions):
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
         # Checked again once it is open: some devices report their amplitude step only then.
-        Guard(culture.limits, ()).check_pulse(pulse)
+        try:
+            Guard(culture.limits, ()).check_pulse(pulse)
+        except UnsafeStimulus as error:
+            source = "--recordings" if calibrating.protocol or not self.protocol else "--protocol"
+            raise Mismatch(
+                f"{source}: expected a pulse that suits a {self.culture}, got another ({error}): record on that "
+                f"culture first, with animat record --culture {self.culture}, and train on those recordings"
+            ) from error
         if state is not None:
             print(f"the culture continues from {state}", file=sys.stderr)
         return culture

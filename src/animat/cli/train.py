@@ -143,7 +143,14 @@ class Train(SimulatorOptions):
         from animat.robots.registry import robot_named
         from animat.training.specification import Training
 
-        robot = robot_named(self.robot, **read_numbers("--parameters", self.parameters))
+        parameters = read_numbers("--parameters", self.parameters)
+        try:
+            robot = robot_named(self.robot, **parameters)
+        except InvalidArgument as error:
+            # The message about an unknown robot begins otherwise.
+            if not parameters or not str(error).startswith(f"{self.robot}: "):
+                raise
+            raise InvalidArgument(f"--parameters: {error}") from error
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]

@@ -18,7 +18,7 @@ from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE
 from animat.closed_loop.tick import Ending, Tick, TickTable
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.folder_kinds import expect_no_other
-from animat.plain_file import expect_no_file
+from animat.plain_file import expect_no_file, is_absent, is_folder
 from animat.progress import Progress
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
@@ -156,7 +156,10 @@ def read_session(path: str | os.PathLike[str]) -> Session:
         InvalidFile: if the log is missing or not that of a session, or its header is invalid.
     """
     path = Path(path)
-    file = path / LOG_FILE if path.is_dir() else path
+    file = path / LOG_FILE if is_folder(path) else path
+    if is_absent(file):
+        found = f"a folder without {LOG_FILE}" if file != path else "no such file or folder"
+        raise InvalidFile(f"{path}: expected the folder of a session, got {found}")
     log = read_log(file)
     read_header(file, log.header)
     ending = Ending("crash", "no ending was written: the program was killed, or is still running")

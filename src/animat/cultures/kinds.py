@@ -45,10 +45,10 @@ def culture_of(
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
     if state is not None and kind != "virtual":
         raise InvalidArgument(f"state: expected none for a culture of kind {kind!r}, got {state}")
-    if (selection is not None) != (kind == "maxone"):
-        raise InvalidArgument(
-            f"selection: expected a file of electrodes for a maxone and none for others, got {selection} for {kind!r}"
-        )
+    if selection is None and kind == "maxone":
+        raise InvalidArgument("selection: expected a file of electrodes for a culture of kind 'maxone', got none")
+    if selection is not None and kind != "maxone":
+        raise InvalidArgument(f"selection: expected none for a culture of kind {kind!r}, got {selection}")
     if kind == "virtual":
         from animat.cultures.virtual import VirtualCulture
 

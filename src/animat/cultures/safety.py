@@ -210,7 +210,11 @@ class Guard:
         """
         limits = self.limits
         if pulse.kind != limits.kind:
-            raise UnsafeStimulus("kind", f"expected {limits.kind} pulses, got a {pulse.kind} pulse ({pulse})")
+            raise UnsafeStimulus(
+                "kind",
+                f"expected a {limits.kind} pulse, which this kind of culture takes, got a {pulse.kind} pulse ({pulse})",
+                argument="pulse",
+            )
         if len(pulse.phases) > limits.phases_per_pulse:
             raise UnsafeStimulus(
                 "phases_per_pulse",

@@ -192,7 +192,7 @@ def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_pat
     if sessions < 1:
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
     if not 0 < interval_min < float("inf"):
-        raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min}")
+        raise InvalidArgument(f"interval_min: expected more than 0 minutes, got {interval_min:g}")
     if sessions > 1 and sessions * interval_min > LONGEST_MIN:
         raise InvalidArgument(
             f"sessions, interval_min: expected recordings within a year, got {shown(sessions)} every "

@@ -32,7 +32,7 @@ _CONNECT_S = 60
 
 def expect_distributed() -> Any:
     """Import Dask's package for clusters; raises AnimatError if it is not installed."""
-    return expect_extra("distributed", package="Dask", extra="cluster", what="a cluster")
+    return expect_extra("distributed", package="Dask", extra="cluster", argument="cluster")
 
 
 @final

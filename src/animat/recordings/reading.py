@@ -209,7 +209,7 @@ def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
     listed = [paths] if isinstance(paths, str | os.PathLike) else paths
     files = [file for path in listed for file in _files(Path(path))]
     if not files:
-        raise InvalidArgument("paths: expected at least one file or folder of recordings, got none")
+        raise InvalidArgument("recordings: expected at least one file or folder of recordings, got none")
     return files
 
 

@@ -27,7 +27,7 @@ class TensorBoard:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        board = expect_extra("tensorboardX", package="tensorboardX", extra="tensorboard", what="TensorBoard")
+        board = expect_extra("tensorboardX", package="tensorboardX", extra="tensorboard", argument="tensorboard")
         self._make, self._folder = board.SummaryWriter, Path(folder)
         self._writers: dict[str, Any] = {}
 

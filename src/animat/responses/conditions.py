@@ -250,9 +250,16 @@ def conditions_named(text: str) -> Conditions:
     Raises:
         InvalidArgument: for anything else.
     """
+    try:
+        return _parse(text)
+    except InvalidArgument as error:
+        raise InvalidArgument(f"conditions: {error}") from error
+
+
+def _parse(text: str) -> Conditions:
     first, is_product, second = text.partition(" x ")
     if is_product and " x " not in second:
-        when, where = conditions_named(first), conditions_named(second)
+        when, where = _parse(first), _parse(second)
         if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
             return ByBoth(when, where)
     if is_product:
@@ -339,4 +346,4 @@ def _integers(text: str, listed: str, separator: str) -> tuple[int, ...]:
 
 
 def _invalid(text: str, expected: str) -> InvalidArgument:
-    return InvalidArgument(f"conditions: expected {expected}; got {text!r}")
+    return InvalidArgument(f"expected {expected}; got {text!r}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float64
 from pydantic import Field
 
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown, some_of
-from animat.plain_file import read_plain_text
+from animat.plain_file import is_absent, read_plain_text
 from animat.recordings.recording import Channels
 from animat.records import in_file, json_data, read_record, record
 from animat.responses.windows import Spiking, spikes_in
@@ -156,6 +157,11 @@ def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
     """The same, or the name of a file with such JSON; raises InvalidFile if it cannot be read."""
     if text == "all" or text in CUT or str(text).lstrip().startswith("{"):
         return readouts_named(str(text))
+    if is_absent(Path(text)):
+        raise InvalidFile(
+            f"readouts: expected all, {', '.join(CUT)} or a file of groups of electrodes, got {text}, which is not a "
+            "file"
+        )
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:

@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 from pydantic import Field
 
 from animat.errors import InvalidArgument, first_line, shown
+from animat.extras import install_command
 from animat.records import Flag, Number, Whole, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Iterations, Quantity
 from animat.robots.host import LONGEST_KEPT, Body, HostRobot, time_limit
@@ -243,7 +244,7 @@ def _reason(error: Exception | SystemExit) -> str:
     message = first_line(error)
     is_missing = type(error).__name__ == "DependencyNotInstalled" or isinstance(error, ImportError)
     if is_missing and "mujoco" in message.lower():
-        return f'{message.partition(",")[0]}: pip install "animat[mujoco]"'
+        return f"{message.partition(',')[0]}: {install_command('mujoco')}"
     return message
 
 

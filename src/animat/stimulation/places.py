@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidArgument, InvalidFile, shown
-from animat.plain_file import read_plain_text
+from animat.plain_file import is_absent, read_plain_text
 from animat.records import in_file, json_data
 from animat.tables import evenly
 
@@ -57,6 +58,10 @@ def read_places(text: str | os.PathLike[str]) -> Places:
     """
     if text in NAMED:
         return str(text)
+    if is_absent(Path(text)):
+        raise InvalidFile(
+            f"places: expected {', '.join(NAMED)} or a file of groups of electrodes, got {text}, which is not a file"
+        )
     try:
         written = read_plain_text(text, _MOST_BYTES)
     except InvalidFile as error:

@@ -95,7 +95,8 @@ class Protocol:
 
     def __post_init__(self) -> None:
         if len(set(self.frequencies_hz)) < len(self.frequencies_hz):
-            raise InvalidArgument(f"frequencies_hz: expected each once, got {self.frequencies_hz}")
+            listed = ", ".join(f"{hz:g}" for hz in self.frequencies_hz)
+            raise InvalidArgument(f"frequencies_hz: expected each once, got {listed}")
         object.__setattr__(self, "places", check_places(self.places))
         of_each = self.trials * self.pulses * max(1, self.n_places)
         pulses = len(self.frequencies_hz) * of_each

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument
 from animat.plain_file import read_plain_text
-from animat.records import Number, Whole, json_data, read_record, record
+from animat.records import Number, Whole, in_file, json_data, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity
@@ -150,11 +150,8 @@ class Selection:
         Raises:
             InvalidFile: if the file is missing, damaged, or not a selection.
         """
-        text = read_plain_text(path, _MOST_BYTES)
-        try:
-            return Selection.from_dict(json_data(text, "selection"))
-        except InvalidArgument as error:
-            raise InvalidFile(f"{path}: expected an electrode selection in JSON: {error}") from error
+        with in_file(path):
+            return Selection.from_dict(json_data(read_plain_text(path, _MOST_BYTES), "selection"))
 
 
 def select_electrodes(

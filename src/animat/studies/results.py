@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from animat.errors import InvalidArgument, InvalidFile
+from animat.extras import install_command
 from animat.records import read_record
 from animat.writing import atomic_write, write_whole
 
@@ -70,7 +71,7 @@ def write_named_records(path: Path, named: Iterable[tuple[str, Any]], kind: type
     return write_table(path, head, ((first, *astuple(row)) for first, row in named))
 
 
-MISSING = "fastparquet is not installed: pip install 'animat[parquet]'"
+MISSING = f"fastparquet is not installed: {install_command('parquet')}"
 
 
 def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name: str) -> bool:

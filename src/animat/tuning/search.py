@@ -108,4 +108,4 @@ def _distribution(name: str, among: Range | tuple[Value, ...]) -> BaseDistributi
 
 def expect_optuna() -> Any:
     """Import Optuna; raises AnimatError if it is not installed."""
-    return expect_extra("optuna", package="Optuna", extra="tune", what="tuning")
+    return expect_extra("optuna", package="Optuna", extra="tune", argument="tune")

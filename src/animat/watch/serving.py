@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import AnimatError, InvalidArgument
+from animat.extras import install_command
 from animat.watch.discovery import find
 
 _NEEDS = ("starlette", "uvicorn")
@@ -29,7 +30,9 @@ _LINGER_S = 60.0
 def expect_installed() -> None:
     """Raise AnimatError, with the command to install them, if the page's requirements are missing."""
     if missing := [name for name in _NEEDS if find_spec(name) is None]:
-        raise AnimatError(f"the page needs {' and '.join(missing)}: pip install 'animat[watch]'")
+        raise AnimatError(
+            f"watch: expected {' and '.join(missing)} to be installed, got none: {install_command('watch')}"
+        )
 
 
 def serve(folder: Path, port: int, announce: Callable[[str], None], *, parent: int | None = None) -> None:

@@ -23,6 +23,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.pace import Pace
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
+from animat.extras import install_command
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
 from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.array import ElectrodeArray
@@ -324,8 +325,8 @@ def _sdk() -> ModuleType:
         import cl
     except ImportError as error:
         raise DeviceFailed(
-            "cl: expected the vendor's package cl-sdk, got none: on Python 3.12 or later `pip install cl-sdk` "
-            "(its licence is CC BY-NC 4.0); on a CL1 it is preinstalled"
+            "culture: expected the vendor's package cl-sdk for a cl1, which is not installed: on Python 3.12 or later "
+            f"{install_command('cl1')} (its licence is CC BY-NC 4.0); on a CL1 it is preinstalled"
         ) from error
     sdk: ModuleType = cl
     return sdk

@@ -79,7 +79,7 @@ class ZmqSpikes:
             import zmq
         except ImportError as error:
             raise DeviceFailed(
-                "zmq: expected the package pyzmq to read a MaxOne, got none: pip install pyzmq"
+                "culture: expected the package pyzmq to read a maxone, which is not installed: pip install pyzmq"
             ) from error
         self._frame, self._failed, self.lost_frames = -1, None, 0
         self._spikes.clear()

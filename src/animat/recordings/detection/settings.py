@@ -41,6 +41,7 @@ class Detection:
 
     def __post_init__(self) -> None:
         if self.band_hz is not None and not self.band_hz[0] < self.band_hz[1]:
-            raise InvalidArgument(f"band_hz: expected 0 < low < high in Hz, got {self.band_hz}")
+            low, high = self.band_hz
+            raise InvalidArgument(f"band_hz: expected 0 < low < high in Hz, got {low:g} to {high:g}")
         if not self.blank_ms[1] <= self.recovery_ms:
-            raise InvalidArgument(f"recovery_ms: expected from blank_ms to 1 s, got {self.recovery_ms}")
+            raise InvalidArgument(f"recovery_ms: expected from blank_ms to 1 s, got {self.recovery_ms:g}")

@@ -57,7 +57,7 @@ def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
         if spikes and not file.has("spikes"):
             raise InvalidFile(
                 f"{path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
-                "them in its raw traces with animat convert"
+                "them in its raw traces with animat convert --raw"
             )
         rate_hz = _rate_hz(file, findings)
         frame = file.read("spikes", "timestamp") if spikes else np.empty(0, np.int64)

@@ -51,7 +51,7 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -
             raise InvalidFile(
                 f"{path}: expected spikes in /{UNITS}, found none"
                 + (
-                    f": it holds traces ({', '.join(raw[:4])}); find spikes in them with animat convert"
+                    f": it holds traces ({', '.join(raw[:4])}); find spikes in them with animat convert --raw"
                     if raw
                     else " and no traces either"
                 )

@@ -102,7 +102,7 @@ class _Contents:
         if spikes and not file.has(self.spikes_at):
             raise InvalidFile(
                 f"{file.path}: expected spikes at /{self.spikes_at}, found none: the rig kept raw traces only, or "
-                "nothing; detect spikes in them with animat convert"
+                "nothing; detect spikes in them with animat convert --raw"
             )
         spike_frame = file.read(self.spikes_at, "frameno") if spikes else np.empty(0, np.int64)
         spike_channel = file.read(self.spikes_at, "channel") if spikes else np.empty(0, np.int64)

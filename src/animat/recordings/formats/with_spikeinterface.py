@@ -17,15 +17,13 @@ import numpy as np
 from jaxtyping import Float32
 
 from animat.errors import InvalidArgument, InvalidFile
+from animat.extras import install_command
 from animat.recordings.columns import PlainColumns
 from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels, Recording
 
-MISSING = (
-    "expected the package SpikeInterface, which is not installed: .venv/bin/pip install -c constraints.txt '.[raw]'"
-)
 REFUSED = ("binary",)
 """Trace readers that need more than a file."""
 
@@ -94,7 +92,9 @@ def _reader(name: str) -> Callable[..., Any]:
     try:
         extractors = importlib.import_module("spikeinterface.extractors")
     except ImportError as error:
-        raise InvalidArgument(f"reader: {MISSING}") from error
+        raise InvalidArgument(
+            f"reader: expected the package SpikeInterface, which is not installed: {install_command('raw')}"
+        ) from error
     # Excludes readers of sortings and events, and of SpikeInterface's own saved objects.
     of_traces = list(extractors.recording_extractor_full_dict.values())
     readers = {n[5:]: getattr(extractors, n) for n in dir(extractors) if n.startswith("read_")}

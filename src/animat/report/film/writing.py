@@ -12,6 +12,7 @@ from pathlib import Path
 from PIL import Image
 
 from animat.errors import InvalidArgument, InvalidFile
+from animat.extras import install_command
 from animat.progress import Progress, Silent
 from animat.report.film.frame import HEIGHT_PX, WIDTH_PX, Frames
 from animat.report.film.robot import pictures_of
@@ -43,7 +44,8 @@ def check_film(path: str | os.PathLike[str]) -> None:
             import imageio_ffmpeg  # noqa: F401
         except ImportError as error:
             raise InvalidArgument(
-                f'{path}: an MP4 needs imageio-ffmpeg: pip install "animat[film]"; or end the name in .gif'
+                f"{path}: expected the package imageio-ffmpeg for an MP4, which is not installed: "
+                f"{install_command('film')}, or end the name in .gif"
             ) from error
 
 
