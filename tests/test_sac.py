@@ -253,7 +253,7 @@ def test_settings_refuse_counts_below_one(name: str) -> None:
     ],
 )
 def test_settings_refuse_rates_and_shares_that_cannot_be(name: str, value: float) -> None:
-    with pytest.raises(InvalidArgument, match=f"^{name}: expected .+, got {value}"):
+    with pytest.raises(InvalidArgument, match=f"^{name}: expected .+, got {value:g}"):
         replace(SAC(), **{name: value})
 
 

@@ -544,7 +544,10 @@ def test_the_figure_names_its_axes(known: Validation) -> None:
     ("options", "message"),
     [
         (["--conditions", "all"], "conditions: expected two or more, so that there is something to predict from"),
-        (["--conditions", "frequency:5,7"], "(to allow it: --allow empty-condition"),
+        (
+            ["--conditions", "frequency:5,7"],
+            "condition 7 Hz: no stimulus; leave it out or choose other conditions (--conditions)",
+        ),
         (["--seed", "-1"], "--seed: expected 0 or more, got -1"),
     ],
 )
