@@ -22,6 +22,8 @@ from animat.recordings.raw import RawTraces
 BLOCK = 64
 """Channels filtered at a time: few enough to fit into the processor's cache."""
 NOISE_PIECES, NOISE_PIECE_S = 15, 0.2
+LEVEL_STEP = 20
+"""Every so many samples are enough for the median of the voltage."""
 DEAD, NOISY = 0.1, 5.0
 """Multiples of the median channel's noise: a channel below is dead, one above is noisy."""
 
@@ -109,7 +111,10 @@ def _noise_and_level_uv(
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
             rows = piece.rows(columns)
-            first, level_uv = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin]), np.median(rows, 1)
+            first, level_uv = (
+                median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin]),
+                np.median(rows[:, ::LEVEL_STEP], 1),
+            )
             if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
