@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.formats.nwb import recording_name, write_nwb
-from animat.recordings.recording import Channels, Recording
+from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
@@ -104,6 +104,7 @@ class SyntheticCulture:
             start_min=float(start_min),
             presentation=Presentation("blocked", 1),
             provenance={"source": SOURCE, "seed": str(self.seed)},
+            culture=RecordedCulture("synthetic", self.seed),
         )
 
     def _electrodes(self) -> tuple[Channels, Int64[np.ndarray, "patterns electrodes"]]:

@@ -246,7 +246,7 @@ def test_text_that_the_file_cannot_hold_is_refused(
     import dataclasses
 
     with pytest.raises(InvalidArgument, match=message):
-        write_nwb(dataclasses.replace(synthetic, provenance=provenance), tmp_path / "a.nwb")
+        write_nwb(dataclasses.replace(synthetic, provenance=provenance, culture=None), tmp_path / "a.nwb")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -64,7 +64,13 @@ class Channels:
         return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
 
 
-_CULTURES = {"virtual": "virtual culture", "replay": "replay of recordings", "cl1": "CL1", "maxone": "MaxOne"}
+_CULTURES = {
+    "virtual": "virtual culture",
+    "replay": "replay of recordings",
+    "cl1": "CL1",
+    "maxone": "MaxOne",
+    "synthetic": "synthetic culture",
+}
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def extract_series(
     recordings = expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
     cultures = [each.culture for each in recordings if isinstance(each, Recording)]
-    seeds = {str(culture.seed) for culture in cultures if culture and culture.kind == "virtual"}
+    seeds = {str(culture.seed) for culture in cultures if culture and culture.kind in ("virtual", "synthetic")}
     if len(seeds) > 1 and "several-cultures" not in allow:
         raise UnusableData(
             f"recordings: expected those of one culture, got simulated ones with seeds {', '.join(sorted(seeds))}; "

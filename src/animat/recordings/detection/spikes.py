@@ -111,10 +111,8 @@ def _noise_and_level_uv(
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
         for columns in blocks(channels):
             rows = piece.rows(columns)
-            first, level_uv = (
-                median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin]),
-                np.median(rows[:, ::LEVEL_STEP], 1),
-            )
+            level_uv = np.median(rows[:, ::LEVEL_STEP], axis=1)
+            first = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin])
             if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
                 blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
