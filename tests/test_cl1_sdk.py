@@ -84,9 +84,9 @@ with CL1Culture(record_to="rec") as culture:
     np.testing.assert_array_equal(np.rint(np.diff(got) * 25_000), np.diff(np.rint(asked * 25_000)))
     assert "SDK's simulator" in found["said"]["source"]
     (file,) = (tmp_path / "rec").glob("*.h5")
-    from animat.recordings.formats.cl1 import read_cl1
+    from animat.recordings.formats.hdf5_formats import read_hdf5
 
-    own = read_cl1(file)
+    own = read_hdf5(file)
     assert own.stimuli.electrodes.tolist() == [sorted(row) for row in found["electrodes"]]
     assert own.stimuli.frequency_hz.tolist() == found["hz"]
     np.testing.assert_array_equal(
@@ -220,9 +220,9 @@ tell(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
     found = told(script, tmp_path)
     assert found["episodes"] == 2
     (file,) = (tmp_path / "rig").glob("*.h5")
-    from animat.recordings.formats.cl1 import read_cl1
+    from animat.recordings.formats.hdf5_formats import read_hdf5
 
-    own = read_cl1(file).stimuli
+    own = read_hdf5(file).stimuli
     # The SDK's index repeats itself after a hundred entries (1.0.0): the rest is not told, and nothing untrue.
     known = ~np.isnan(own.frequency_hz)
     assert len(known) == len(found["hz"]) and np.all(known[:100])

@@ -12,7 +12,8 @@ import pytest
 
 from animat.errors import InvalidFile
 from animat.recordings import hdf5_subprocess
-from animat.recordings.formats.nwb import read_nwb, write_nwb
+from animat.recordings.formats.hdf5_formats import read_hdf5
+from animat.recordings.formats.nwb import write_nwb
 from damaging import KINDS
 from synthetic_recordings import synthetic_recording
 
@@ -65,8 +66,8 @@ def test_a_damaged_part_is_not_reported_as_missing(where: str, tmp_path: Path) -
     with path.open("r+b") as file:
         file.seek(begins)
         file.write(b"\xff" * 8)
-    with pytest.raises(InvalidFile, match=r"recording\.nwb: expected a complete NWB recording, but it is .*damaged"):
-        read_nwb(path)
+    with pytest.raises(InvalidFile, match=r"recording\.nwb: expected a complete HDF5 recording, but it is .*damaged"):
+        read_hdf5(path)
 
 
 @pytest.mark.oracle

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from animat.errors import InvalidArgument, InvalidFile
-from animat.recordings.formats.nwb import read_nwb, write_nwb
+from animat.recordings.formats.hdf5_formats import read_hdf5
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.protocol import Presentation
@@ -103,7 +104,7 @@ def test_a_recording_of_205_000_spikes_on_1024_channels_reads_back_equal(tmp_pat
         duration_s=101.0,
     )
     write_nwb(recording, tmp_path / "a.nwb")
-    assert read_nwb(tmp_path / "a.nwb").equals(recording)
+    assert read_hdf5(tmp_path / "a.nwb").equals(recording)
 
 
 def test_pynwb_reads_the_same_spikes_electrodes_and_stimuli(synthetic: Recording, tmp_path: Path) -> None:
@@ -191,9 +192,7 @@ def test_a_truncated_file_is_refused_in_one_line(synthetic: Recording, tmp_path:
     write_nwb(synthetic, path)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(
-        InvalidFile, match=r"a\.nwb: expected a complete (NWB|HDF5) recording, but it is cut off"
-    ) as caught:
+    with pytest.raises(InvalidFile, match=r"a\.nwb: expected a complete HDF5 recording, but it is cut off") as caught:
         read_recording(path)
     assert "\n" not in str(caught.value)
 
@@ -207,7 +206,7 @@ def test_damage_anywhere_in_the_file_raises_our_error_or_is_harmless(synthetic: 
     for start in rng.integers(8, len(content) - 64, 60).tolist():
         path.write_bytes(content[:start] + rng.bytes(64) + content[start + 64 :])
         try:
-            read_nwb(path)
+            read_hdf5(path)
         except InvalidFile as error:
             assert "\n" not in str(error)
 
@@ -233,7 +232,7 @@ def test_a_file_of_a_later_format_version_is_refused(synthetic: Recording, tmp_p
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
         file["processing/ecephys/animat_recording/format_version"][0] = 2
     with pytest.raises(InvalidFile, match="expected format version 1 or older, got 2: update animat"):
-        read_nwb(tmp_path / "a.nwb")
+        read_hdf5(tmp_path / "a.nwb")
 
 
 @pytest.mark.parametrize(
@@ -283,7 +282,7 @@ def test_a_full_disk_leaves_the_old_file_intact(synthetic: Recording, tmp_path: 
     assert "a.nwb: cannot be written: File too large; any previous file is unchanged" in done.stdout
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["a.nwb"]
-    assert read_nwb(path).equals(synthetic)
+    assert read_hdf5(path).equals(synthetic)
 
 
 WRITE_BESIDE_A_HALF_WRITTEN_CACHE = """
@@ -313,7 +312,7 @@ def test_a_cache_that_another_process_is_writing_is_not_read(tmp_path: Path) -> 
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert len(read_nwb(tmp_path / "a.nwb").channels) > 0
+    assert len(read_hdf5(tmp_path / "a.nwb").channels) > 0
 
 
 @pytest.mark.parametrize(

@@ -507,7 +507,7 @@ def test_files_that_are_not_recordings_are_refused_in_one_line(tmp_path: Path) -
     (tmp_path / "a_stimuli.csv").write_text("1\n")
     for path, message in {
         "none.nwb": "no such file",
-        "a.npy": "expected NPZ .* got NPY",
+        "a.npy": "got NPY, which holds one array; save several by name with numpy.savez",
         "empty.nwb": "got an empty file",
         "b.nwb": "expected HDF5 in a file with this name, got something else",
         "b.bin": "expected a recording .NWB, MaxWell, CL1, NPZ or CSV., got an unknown kind of file",

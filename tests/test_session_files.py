@@ -24,7 +24,8 @@ from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
 from animat.closed_loop.session_data import LOG_FILE
 from animat.errors import InvalidFile, UnusableData
-from animat.recordings.formats.nwb import read_nwb, write_nwb
+from animat.recordings.formats.hdf5_formats import read_hdf5
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.nwb_spikes import SpikeCounts
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import Stimuli
@@ -72,13 +73,13 @@ def test_a_killed_session_is_recovered_to_the_bits_that_it_would_have_written(tm
         leftover.write_text("half of it")
     recovered = recover_session(killed)
     expected = as_logged(killed)
-    recording = read_nwb(recovered.recording_file)
+    recording = read_hdf5(recovered.recording_file)
     np.testing.assert_array_equal(recording.spike_times_s, expected["spike_times_s"])
     np.testing.assert_array_equal(recording.spike_channels, expected["spike_channels"])
     for name in ("time_s", "frequency_hz", "pattern", "electrodes", "presentation"):
         np.testing.assert_array_equal(getattr(recording.stimuli, name), expected[name])
     assert recovered.ticks_file.read_bytes() == session.ticks_file.read_bytes()
-    assert read_nwb(recovered.recording_file).equals(read_nwb(session.recording_file))
+    assert read_hdf5(recovered.recording_file).equals(read_hdf5(session.recording_file))
     assert recovered.to_dict() == session.to_dict()
     assert recovered.episodes == session.episodes
     # What the killed program was writing is gone, and nothing else.
@@ -154,7 +155,7 @@ def test_memory_does_not_grow_with_the_session(tmp_path: Path, monkeypatch: pyte
         recover_session(tmp_path / str(ticks) / "long")
         peaks[ticks] = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-    recording = read_nwb(tmp_path / "3000" / "long" / "session.nwb")
+    recording = read_hdf5(tmp_path / "3000" / "long" / "session.nwb")
     assert (len(recording.stimuli), len(recording.spike_times_s)) == (3_000, 120_000)
     # A pulse is some ten columns of 8 bytes, each there more than once; the log holds 1,400 bytes of each tick, and as
     # objects these are 8,000.
@@ -187,7 +188,7 @@ def test_spikes_in_blocks_are_written_as_they_are_in_one_piece(tmp_path: Path, d
         counts.add(*block)
     empty = replace(recording, spike_times_s=nothing, spike_channels=nothing.astype(np.int64))
     write_nwb(empty, tmp_path / "a.nwb", blocks, counts)
-    assert read_nwb(tmp_path / "a.nwb").equals(recording)
+    assert read_hdf5(tmp_path / "a.nwb").equals(recording)
 
 
 @pytest.mark.parametrize(

@@ -44,15 +44,12 @@ def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[An
 MOST_PADDED = 50_000_000
 
 
-def fits_padded(lists: Sequence[Sequence[int]]) -> bool:
-    """Whether lists of whole numbers can be padded without filling the memory (one long row) or losing digits."""
-    most = max([1, *map(len, lists)]) * len(lists)
-    return most <= MOST_PADDED and all(abs(number) < 2**53 for row in lists for number in row)
-
-
 def padded(lists: Sequence[Sequence[int]]) -> Int64[np.ndarray, "lists longest"]:
-    """Lists of electrodes as one table, padded with `UNKNOWN`."""
-    table = np.full((len(lists), max([1, *map(len, lists)])), UNKNOWN, dtype=np.int64)
+    """Lists of electrodes as one table, padded with `UNKNOWN`; refuses a long list among many: memory would fill."""
+    width = max([1, *map(len, lists)])
+    if width * len(lists) > MOST_PADDED:
+        raise UnusableData(f"stimulus_electrodes: expected a few electrodes per stimulus, got {width} in one row")
+    table = np.full((len(lists), width), UNKNOWN, dtype=np.int64)
     for row, electrodes in zip(table, lists, strict=True):
         row[: len(electrodes)] = electrodes
     return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -22,14 +23,12 @@ from animat.recordings.raw import RawTraces
 from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
 
-DURATION = re.compile(
-    r"P(?=.)(\d+(\.\d+)?Y)?(\d+(\.\d+)?M)?(\d+(\.\d+)?W)?(\d+(\.\d+)?D)?"
-    r"(T(?=\d)(\d+(\.\d+)?H)?(\d+(\.\d+)?M)?(\d+(\.\d+)?S)?)?",
-    re.ASCII,
-)
+_DATE, _TIME = ("".join(rf"(?:(\d+(?:\.\d+)?){unit})?" for unit in units) for units in ("YMWD", "HMS"))
+DURATION = re.compile(rf"P(?=.){_DATE}(?:T(?=\d){_TIME})?", re.ASCII)
 """ISO 8601: P, years, months, weeks and days, and after a T hours, minutes and seconds; at least one of them."""
-
-DAYS = {"Y": 365.25, "M": 365.25 / 12, "W": 7.0, "D": 1.0}
+DAY_S = 86_400.0
+UNITS_S = (365.25 * DAY_S, 365.25 / 12 * DAY_S, 7 * DAY_S, DAY_S, 3600.0, 60.0, 1.0)
+"""The length of each of these, with mean years and months."""
 PERSON = re.compile(r"\s*[^,;]+,\s*[^,;]+")
 SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
 """Genus, species and optionally subspecies, or an address in NCBI's taxonomy."""
@@ -74,12 +73,12 @@ class Origin:
             expected = "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy"
             raise InvalidArgument(f"species: expected {expected}, got {self.species!r}")
         if self.age is not None:
-            first, _, last = self.age.partition("/")
             # One duration, or two of a range, whose end may be open.
-            if not all(map(DURATION.fullmatch, (first, last) if last else (first,))):
+            lengths_s = [_length_s(age) for age in self.age.removesuffix("/").split("/", 1)]
+            if any(map(math.isnan, lengths_s)):
                 expected = "an ISO 8601 duration such as P42D (days), P6W or P3M"
                 raise InvalidArgument(f"age: expected {expected}, got {self.age!r}")
-            if last and _days(last) < _days(first):
+            if lengths_s != sorted(lengths_s):
                 raise InvalidArgument(f"age: expected a range with the younger age first, got {self.age!r}")
         if self.experimenter is not None and not all(map(PERSON.fullmatch, self.experimenter.split(";"))):
             expected = "Last, First, several separated by semicolons"
@@ -158,12 +157,11 @@ def convert_recording(
     return recording
 
 
-def _days(age: str) -> float:
-    """The length in days of an ISO 8601 duration that matches `DURATION`, with mean months and years."""
-    date, _, time = age[1:].partition("T")
-    days = sum(float(number) * DAYS[unit] for number, unit in re.findall(r"([\d.]+)([YMWD])", date))
-    seconds = {"H": 3600.0, "M": 60.0, "S": 1.0}
-    return days + sum(float(n) * seconds[unit] for n, unit in re.findall(r"([\d.]+)([HMS])", time)) / 86_400
+def _length_s(age: str) -> float:
+    """The length of an ISO 8601 duration; NaN for other text."""
+    if (match := DURATION.fullmatch(age)) is None:
+        return math.nan
+    return sum(float(number or 0) * unit_s for number, unit_s in zip(match.groups(), UNITS_S, strict=True))
 
 
 def _without_zone(recording: Recording) -> Iterator[Finding]:
@@ -215,11 +213,7 @@ def read_traces(
 def _with_detected_spikes(
     traces: RawTraces, base: Recording, settings: Detection | None, progress: Progress | None
 ) -> Recording:
-    """The recording with spikes detected in its raw traces instead of its own, and the settings in its provenance.
-
-    Args:
-        base: channels (those of the traces), stimuli, span and provenance.
-    """
+    """The recording with spikes detected in its raw traces instead of its own, and the settings in its provenance."""
     from animat.recordings.detection.spikes import detect_spikes
 
     settings = settings or Detection()

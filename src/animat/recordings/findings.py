@@ -43,11 +43,15 @@ class Finding:
         return cls(**{"message" if name == "sentence" else name: value for name, value in data.items()})
 
 
-def left_out_finding(what: str, names: Sequence[str], file: str = "", missing: Sequence[str] = ()) -> Finding:
-    """The finding on unknown keys or columns of a file, each with the missing one whose name is similar."""
+def left_out_findings(
+    what: str, names: Sequence[str], file: str = "", missing: Sequence[str] = ()
+) -> tuple[Finding, ...]:
+    """The finding on unknown keys or columns of a file, if any, each with the missing one whose name is similar."""
+    if not names:
+        return ()
     listed = ", ".join(f"{name} ({near[2:]})" if (near := did_you_mean(name, missing)) else name for name in names)
     message = f"unknown {what}{f' of {file}' if file else ''} were left out: {listed}"
-    return Finding(f"{what}-left-out", "note", message, float(len(names)))
+    return (Finding(f"{what}-left-out", "note", message, float(len(names))),)
 
 
 def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:

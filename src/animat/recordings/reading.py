@@ -18,11 +18,12 @@ from animat.recordings.formats.csv import read_csv
 from animat.recordings.formats.hdf5 import DAMAGE, first_line
 from animat.recordings.formats.npz import read_npz
 from animat.recordings.formats.response_files import (
-    is_response_csv,
     is_response_npz,
-    read_response_csv,
+    is_response_table,
     read_response_npz,
+    read_response_table,
 )
+from animat.recordings.formats.text_table import read_text_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -31,15 +32,16 @@ S = TypeVar("S", Recording, Recording | ResponseTable)
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 ZIP = b"PK"
-NPY = b"\x93NUMPY"
 PICKLE = "a Python pickle, which is never read; save plain arrays with numpy.savez"
 OTHERS = {
     **{bytes([0x80, protocol]): PICKLE for protocol in range(2, 6)},
     b"\xff\xfe": "text in UTF-16; save it as CSV in UTF-8",
     b"\xfe\xff": "text in UTF-16; save it as CSV in UTF-8",
     b"MATLAB": "a MATLAB file; save its columns as CSV or NPZ",
+    b"\x93NUMPY": "NPY, which holds one array; save several by name with numpy.savez",
 }
 """First bytes of files that are often mistaken for recordings, and what to do with them."""
+GZIP = b"\x1f\x8b"
 HDF5_NAMES = (".nwb", ".h5", ".hdf5")
 TEXT_NAMES = (".csv", ".csv.gz", ".tsv", ".txt")
 IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz", "*_responses.csv", "*_responses.csv.gz")
@@ -96,39 +98,26 @@ def read_recording(
 def read_source(
     path: str | os.PathLike[str], *, stimuli: str | None = None, part: str | None = None
 ) -> Recording | ResponseTable:
-    """Read any source of responses: a recording, or a response table without spikes.
-
-    Args:
-        stimuli, part: as in `read_recording`.
-
-    Raises:
-        InvalidFile, InvalidArgument: as in `read_recording`.
-    """
+    """Read any source of responses: a recording, or a response table without spikes; see `read_recording`."""
     return _read(Path(path), None, stimuli, part)
 
 
 def _read(
     path: Path, stimuli_path: str | os.PathLike[str] | None, stimuli: str | None, part: str | None
 ) -> Recording | ResponseTable:
-    magic = first_bytes(path)
-    if magic.startswith((HDF5, ZIP)) and stimuli_path is not None:
+    begin = first_bytes(path)
+    if begin.startswith((HDF5, ZIP)) and stimuli_path is not None:
         raise InvalidArgument(
             f"stimuli_path: expected only with CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
         )
-    if (stimuli is not None or part is not None) and not magic.startswith(HDF5):
+    if (stimuli is not None or part is not None) and not begin.startswith(HDF5):
         raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
-        if magic.startswith(HDF5):
+        if begin.startswith(HDF5):
             return read_hdf5_in_subprocess(path, part=part, stimuli=stimuli)
-        if read_table := _response_reader(path, magic):
-            return read_table(path)
-        if magic.startswith(ZIP):
-            return read_npz(path)
-        if magic.startswith(NPY):
-            raise InvalidFile(f"{path}: expected NPZ (several arrays by name), got NPY (one array)")
-        if kind := _other_kind(path, magic):
-            raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
-        return _read_text(path, stimuli_path)
+        if begin.startswith(ZIP):
+            return read_response_npz(path) if is_response_npz(path) else read_npz(path)
+        return _read_text(path, begin, stimuli_path)
     except (UnusableData, InvalidArgument) as error:
         # These name the column but not the file.
         raise InvalidFile(f"{path}: {error}") from error
@@ -137,25 +126,19 @@ def _read(
         raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
 
 
-def _response_reader(path: Path, magic: bytes) -> Callable[[Path], ResponseTable] | None:
-    """The reader of a response table; None for any other file."""
-    if magic.startswith(ZIP):
-        return read_response_npz if is_response_npz(path) else None
-    is_text = not magic.startswith((HDF5, NPY)) and not _other_kind(path, magic)
-    if not is_text or path.suffix.lower() in HDF5_NAMES:
-        return None
+def _read_text(path: Path, begin: bytes, stimuli_path: str | os.PathLike[str] | None) -> Recording | ResponseTable:
+    # Text in UTF-16 is full of zeros, and a pickle need not have any.
+    known = next((kind for magic, kind in OTHERS.items() if begin.startswith(magic)), None)
+    is_binary = b"\0" in begin and not begin.startswith(GZIP)
+    has_hdf5_name = path.suffix.lower() in HDF5_NAMES
+    if (known or is_binary) and not has_hdf5_name:
+        kind = known or "an unknown kind of file"
+        raise InvalidFile(f"{path}: expected a recording (NWB, MaxWell, CL1, NPZ or CSV), got {kind}")
     try:
-        return read_response_csv if is_response_csv(path) else None
-    except InvalidFile:
-        # The full reader gives a better error.
-        return None
-
-
-def _read_text(path: Path, stimuli_path: str | os.PathLike[str] | None) -> Recording:
-    try:
-        return read_csv(path, stimuli_path=stimuli_path)
+        table = read_text_table(path)
+        return read_response_table(table) if is_response_table(table) else read_csv(table, stimuli_path)
     except InvalidFile as error:
-        if path.suffix.lower() not in HDF5_NAMES or stimuli_path is not None:
+        if not has_hdf5_name or stimuli_path is not None:
             raise
         raise InvalidFile(
             f"{path}: expected HDF5 in a file with this name, got something else (perhaps text, or a server's error "
@@ -230,26 +213,15 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _other_kind(path: Path, magic: bytes) -> str | None:
-    """The kind of a file that is not text; None for text, gzipped files and HDF5 names, which have their own errors."""
-    if path.suffix.lower() in HDF5_NAMES or magic.startswith(b"\x1f\x8b"):
-        return None
-    with path.open("rb") as file:
-        is_binary = b"\0" in file.read(4096)
-    # Text in UTF-16 is full of zeros, and a pickle need not have any.
-    known = next((kind for begin, kind in OTHERS.items() if magic.startswith(begin)), None)
-    return known or ("an unknown kind of file" if is_binary else None)
-
-
 def first_bytes(path: Path) -> bytes:
     """A file's first bytes, which identify its format; raises InvalidFile if it is not a file, or empty."""
     if is_folder(path):
         raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders")
     try:
         with expect_plain_file(path).open("rb") as file:
-            magic = file.read(len(HDF5))
+            begin = file.read(4096)
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not magic:
+    if not begin:
         raise InvalidFile(f"{path}: expected a recording (NWB, NPZ or CSV), got an empty file")
-    return magic
+    return begin

@@ -1,19 +1,4 @@
-"""Removal of the artefacts that stimuli leave in raw traces, at the least cost to the responses.
-
-Each channel is treated in three steps around a stimulus:
-
-1. *Blanking*: from 0.5 ms before to 1.5 ms after the pulse a straight line replaces the trace. No spikes are searched
-   for there.
-2. *Saturation*: a saturated channel, usually near a stimulated electrode, stays blanked until its amplifier recovers.
-   If its rail is known, it is saturated at the rail. Otherwise it is saturated while the trace stays still for 0.4 ms,
-   far from where it was before the pulse. The negative peak of a spike in coarse steps stays still for less. A channel
-   that is still saturated 20 ms after the pulse (`recovery_ms`) is followed until it recovers, or to the next pulse.
-3. *Recovery*: a exp(-t / tau) + b is fitted to the trace afterwards, with tau from about 0.2 to 16 ms, and the
-   exponential is subtracted. The fit is robust against spikes. Nothing is blanked.
-
-Some amplifiers do not recover exponentially. What then remains shows up as spikes at a fixed time after the stimuli,
-and `animat.responses.quality.timing` reports it.
-"""
+"""Removal of the artefacts that stimuli leave in raw traces, at the least cost to the responses."""
 
 from __future__ import annotations
 
@@ -47,13 +32,13 @@ class Cleaned:
 
     Attributes:
         voltage_uv: shape (channels, samples).
-        is_blank: samples in which no spikes are searched for, shape (channels, samples); None if nothing is blanked.
+        is_blank: samples in which no spikes are searched for, shape (channels, samples).
         saturated: number of saturated channels after each stimulus in the stretch, shape (stimuli,).
         longest_ms: time after each stimulus until which the last of them was blanked, shape (stimuli,).
     """
 
     voltage_uv: Float32[np.ndarray, "channels samples"]
-    is_blank: Bool[np.ndarray, "channels samples"] | None
+    is_blank: Bool[np.ndarray, "channels samples"]
     saturated: Int64[np.ndarray, " stimuli"]
     longest_ms: Float32[np.ndarray, " stimuli"]
 
@@ -68,6 +53,11 @@ def without_artefacts(
 ) -> Cleaned:
     """Remove artefacts from a stretch of traces, in place.
 
+    A straight line replaces each channel's trace around a pulse, and then as long as its amplifier is saturated. It is
+    followed to the next pulse if it still is so after `recovery_ms`. From the trace afterwards a exp(-t / tau) is
+    subtracted, with tau from about 0.2 to 16 ms. What some amplifiers leave, as they recover in another way,
+    `animat.responses.quality.timing` reports.
+
     Args:
         voltage_uv: recorded traces, one row per channel; changed.
         stimulus: sample of each pulse, ascending; pulses outside the stretch count if their artefacts reach into it.
@@ -79,12 +69,12 @@ def without_artefacts(
     """
     samples = voltage_uv.shape[1]
     saturated, longest_ms = np.zeros(len(stimulus), np.int64), np.zeros(len(stimulus), np.float32)
+    is_blank = np.zeros(voltage_uv.shape, dtype=bool)
     if not len(stimulus):
-        return Cleaned(voltage_uv, None, saturated, longest_ms)
+        return Cleaned(voltage_uv, is_blank, saturated, longest_ms)
     per_ms = rate_hz * 1e-3
     before, after = (round(ms * per_ms) for ms in settings.blank_ms)
     follow = round(settings.recovery_ms * per_ms)
-    is_blank = np.zeros(voltage_uv.shape, dtype=bool)
     following = np.append(stimulus[1:], samples + before)
     flat, pause = max(round(FLAT_MS * per_ms), 3), round(PAUSE_MS * per_ms)
     is_held = np.zeros(len(voltage_uv), dtype=bool)
@@ -137,10 +127,8 @@ def _saturated_until(
 ) -> Int64[np.ndarray, " channels"]:
     """The number of samples until each channel's amplifier has recovered from saturation.
 
-    If its rail is not known, it is saturated where `flat` samples in a row are far from rest and hardly differ.
-
-    Args:
-        pause: samples without saturation after which a later saturation is ignored; None: none is ignored.
+    If its rail is not known, it is saturated where `flat` samples in a row are far from rest and hardly differ: the
+    negative peak of a spike in coarse steps stays still for less. Saturation after a `pause` without it is ignored.
     """
     until = np.zeros(len(trace_uv), np.int64)
     size_uv, rail_uv = np.abs(trace_uv), settings.saturation_uv

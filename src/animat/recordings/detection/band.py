@@ -8,25 +8,10 @@ import numpy as np
 from jaxtyping import Float32
 from scipy import fft, signal
 
-from animat.errors import InvalidArgument
-
 ORDER = 3
 MARGIN_S = 0.05
 """Margin that a piece needs on both sides: the transform is circular, and the resulting transient at its ends decays by
 e in 3 ms at 100 Hz."""
-
-
-def check_band(band_hz: tuple[float, float], rate_hz: float) -> None:
-    """Refuse a band beyond the Nyquist frequency.
-
-    Raises:
-        InvalidArgument: if its upper end is not below half the sampling rate.
-    """
-    if band_hz[1] >= rate_hz / 2:
-        raise InvalidArgument(
-            f"band_hz: expected less than half the sampling rate of {rate_hz:g} Hz, got {band_hz[1]:g} Hz: "
-            f"choose a lower upper end, such as {0.4 * rate_hz:g}"
-        )
 
 
 def band_pass(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Int64
 
 from animat.recordings.detection.artefacts import Cleaned, without_artefacts
 from animat.recordings.detection.settings import Detection
@@ -21,13 +21,11 @@ REST_PULSES = 5
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Raw traces of samples `start` to `stop`, with `margin` samples more on both sides.
+    """Raw traces of samples `start` to `stop` of a recording, with `margin` samples more on both sides.
 
     Attributes:
-        start, stop: samples of the recording.
-        margin: samples on either side; beyond the ends of the recording its first or last sample is repeated.
-        lead: samples before the first margin, from just before the last pulse. They are only needed for the removal of
-            artefacts.
+        margin: beyond the ends of the recording its first or last sample is repeated.
+        lead: samples before the first margin, from just before the last pulse, only for the removal of artefacts.
         voltage_uv: finite voltages, shape (lead + samples + 2 margin, channels).
         is_lost: samples that were not finite and are interpolated, of the same shape; None if there are none.
         stimulus: samples of the pulses in the piece, counted from the first row of `voltage_uv`.
@@ -62,12 +60,7 @@ class Piece:
     ) -> Cleaned:
         """Some of the channels, one per row, without artefacts and without the lead; lost samples are blank.
 
-        Args:
-            columns: the channels.
-            noise_uv: standard deviation of their noise.
-            level_uv: their usual voltage. It is closer to that of an amplifier at rest than to that of a saturated one.
-            rate_hz: sampling rate.
-            settings: how long to blank.
+        Their usual voltage `level_uv` is closer to that of an amplifier at rest than to that of a saturated one.
         """
         rows = np.array(self.voltage_uv[:, columns].T, order="C")
         rest_uv = None
@@ -77,14 +70,11 @@ class Piece:
             nearest = np.nan_to_num(np.abs(rests_uv - level_uv), nan=np.inf).argmin(axis=0)
             rest_uv = rests_uv[nearest, np.arange(len(nearest))]
         cleaned = without_artefacts(rows, self.stimulus, noise_uv, rate_hz, settings, rest_uv)
-        is_blank = cleaned.is_blank
-        if self.is_lost is not None:
-            lost = self.is_lost[:, columns].T
-            is_blank = lost if is_blank is None else is_blank | lost
+        is_blank = cleaned.is_blank if self.is_lost is None else cleaned.is_blank | self.is_lost[:, columns].T
         return replace(
             cleaned,
             voltage_uv=np.ascontiguousarray(cleaned.voltage_uv[:, self.lead :]),
-            is_blank=None if is_blank is None else is_blank[:, self.lead :],
+            is_blank=is_blank[:, self.lead :],
         )
 
     def rows(self, columns: slice) -> Float32[np.ndarray, "channels samples"]:
@@ -95,23 +85,16 @@ class Piece:
     def lost(self) -> Int64[np.ndarray, " channels"]:
         """The number of samples of each channel between `start` and `stop` that are not finite."""
         first = self.lead + self.margin
-        inside = slice(first, first + self.stop - self.start)
-        n_channels = self.voltage_uv.shape[1]
-        return (
-            np.zeros(n_channels, np.int64) if self.is_lost is None else np.count_nonzero(self.is_lost[inside], axis=0)
-        )
+        if self.is_lost is None:
+            return np.zeros(self.voltage_uv.shape[1], np.int64)
+        return np.asarray(np.count_nonzero(self.is_lost[first : first + self.stop - self.start], axis=0))
 
 
 def read_piece(traces: RawTraces, stimulus: Int64[np.ndarray, " stimuli"], start: int, stop: int, margin: int) -> Piece:
     """Read a piece, with a lead if there was a pulse in the second before.
 
     An amplifier may be saturated since an even earlier pulse, so resting voltages are read before some of these.
-
-    Args:
-        traces: of the recording.
-        stimulus: sample of every pulse of the recording, ascending.
-        start, stop: samples of the recording.
-        margin: samples on either side.
+    `stimulus` is the sample of every pulse of the recording, ascending.
     """
     begin = start - margin
     followed, close, rest = (round(seconds * traces.sampling_rate_hz) for seconds in (FOLLOWED_S, CLOSE_S, REST_S))
@@ -158,11 +141,3 @@ def _finite(
         lost = is_lost[:, column]
         voltage_uv[lost, column] = 0.0 if lost.all() else np.interp(at[lost], at[~lost], voltage_uv[~lost, column])
     return voltage_uv
-
-
-def stimulus_samples(
-    traces: RawTraces, stimulus_time_s: Float64[np.ndarray, " stimuli"]
-) -> Int64[np.ndarray, " stimuli"]:
-    """The sample at which each pulse starts, ascending; simultaneous pulses are one."""
-    at = np.rint((np.asarray(stimulus_time_s, np.float64) - traces.start_s) * traces.sampling_rate_hz)
-    return np.unique(at).astype(np.int64)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
-from animat.recordings.detection.band import MARGIN_S, band_pass, check_band
+from animat.recordings.detection.band import MARGIN_S, band_pass
 from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
-from animat.recordings.detection.pieces import Piece, read_piece, stimulus_samples
+from animat.recordings.detection.pieces import read_piece
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
@@ -70,16 +70,21 @@ def detect_spikes(
         InvalidArgument: for a band that does not lie below half the sampling rate.
         InvalidFile: if samples cannot be read.
     """
-    settings, progress = settings or Detection(), progress or Silent()
-    if settings.band_hz is not None:
-        check_band(settings.band_hz, traces.sampling_rate_hz)
-    stimulus = stimulus_samples(traces, np.empty(0) if stimulus_time_s is None else stimulus_time_s)
+    settings, progress, rate_hz = settings or Detection(), progress or Silent(), traces.sampling_rate_hz
+    if settings.band_hz is not None and settings.band_hz[1] >= rate_hz / 2:
+        raise InvalidArgument(
+            f"band_hz: expected less than half the sampling rate of {rate_hz:g} Hz, got {settings.band_hz[1]:g} Hz: "
+            f"choose a lower upper end, such as {0.4 * rate_hz:g}"
+        )
+    times_s = np.asarray([] if stimulus_time_s is None else stimulus_time_s, np.float64)
+    # Simultaneous pulses are one.
+    stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
     workers = workers or len(os.sched_getaffinity(0))
     noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
     sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, level_uv, settings, workers, progress)
     order = np.lexsort((channel, sample))
     return DetectedSpikes(
-        time_s=traces.start_s + sample[order] / traces.sampling_rate_hz,
+        time_s=traces.start_s + sample[order] / rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
         findings=(*_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturation, settings)),
@@ -115,8 +120,8 @@ def _noise_and_level_uv(
             first = median_noise_uv(_filtered(rows, settings, rate_hz)[:, margin:-margin])
             if len(piece.stimulus) or piece.is_lost is not None:
                 cleaned = piece.cleaned(columns, first, level_uv, rate_hz, settings)
-                blank = None if cleaned.is_blank is None else cleaned.is_blank[:, margin:-margin]
-                first = median_noise_uv(_filtered(cleaned.voltage_uv, settings, rate_hz)[:, margin:-margin], blank)
+                filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+                first = median_noise_uv(filtered[:, margin:-margin], cleaned.is_blank[:, margin:-margin])
             medians_uv[:, columns] = first, level_uv
         return medians_uv
 
@@ -149,46 +154,35 @@ def _detect(
     apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
     depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
 
-    def of_block(piece: Piece, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
-        filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
-        if cleaned.is_blank is not None:
-            filtered[cleaned.is_blank] = 0.0
-        end = margin + piece.stop - piece.start
-        row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
-        # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
-        saturation = np.column_stack([cleaned.saturated * piece.owned, cleaned.longest_ms])
-        return sample - margin + piece.start, row + columns.start, saturation
-
-    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
+    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, int, np.ndarray, np.ndarray]:
         piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
-        found = [of_block(piece, columns) for columns in blocks(len(noise_uv))]
-        saturation = np.zeros((len(piece.stimulus), 2))
-        for _, _, more in found:
-            saturation[:, 0] += more[:, 0]
-            saturation[:, 1] = np.maximum(saturation[:, 1], more[:, 1])
-        where = piece.first_stimulus, piece.lost
-        return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found]), saturation, *where
+        samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
+        for columns in blocks(len(noise_uv)):
+            cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
+            filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+            if cleaned.is_blank.any():
+                filtered[cleaned.is_blank] = 0.0
+            end = margin + piece.stop - piece.start
+            row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
+            samples.append(sample - margin + piece.start)
+            channels.append(row + columns.start)
+            # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
+            saturation[:, 0] += cleaned.saturated * piece.owned
+            saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
+        return np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost
 
     samples, channels = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     saturations, lost = np.zeros((len(stimulus), 2)), np.zeros(len(noise_uv), np.int64)
-    starts = deque(range(0, traces.samples, length))
-    n, done = len(starts), 0
+    starts = range(0, traces.samples, length)
     with ThreadPoolExecutor(workers) as pool:
-        # No more pieces than threads at a time, as waiting pieces take memory.
-        running: deque[Future[tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]]] = deque()
-        while starts or running:
-            while starts and len(running) < workers:
-                running.append(pool.submit(of_piece, starts.popleft()))
-            sample, channel, saturation, first, lost_in_it = running.popleft().result()
+        for done, (sample, channel, first, saturation, lost_in_it) in enumerate(pool.map(of_piece, starts), start=1):
             samples.append(sample)
             channels.append(channel)
             its = saturations[first : first + len(saturation)]
             its[:, 0] += saturation[:, 0]
             its[:, 1] = np.maximum(its[:, 1], saturation[:, 1])
             lost += lost_in_it
-            done += 1
-            progress.update(done, n, f"{sum(map(len, samples)):,} spikes")
+            progress.update(done, len(starts), f"{sum(map(len, samples)):,} spikes")
     return np.concatenate(samples), np.concatenate(channels), saturations, lost
 
 

@@ -1,21 +1,14 @@
-"""Reads spikes and stimuli of Cortical Labs CL1 recordings (H5). Raw traces: `traces`.
+"""Reads spikes and stimuli of Cortical Labs CL1 recordings (H5).
 
-    /spikes(timestamp, channel, samples), /stims(timestamp, channel)      frames from the start of the recording
+    /spikes(timestamp, channel), /stims(timestamp, channel)      frames from the start of the recording
     attributes of /: frames_per_second, channel_count, duration_frames, start_timestamp, created_utc
-    /samples (frames, channels), int16, if raw traces were kept
     /data_stream/animat_stimuli/{index(timestamp, start_index, end_index), data}      stimulus parameters from animat
 
-The rig stores no amplitude, frequency or pattern: animat's driver writes them to a separate data stream, one text per
-request (`animat.recordings.formats.stimulus_text`), which applies to the pulses from its timestamp on until the next.
-Pulses with the same timestamp on several channels are one stimulus. Attributes that are dictionaries are pickles: they
-are never opened. A channel is an electrode on this rig, so its number is used for both. Of its 64 channels, ground and
-reference are not electrodes: they do not count, as in animat's own recordings, and spikes on them are left out.
+An entry of the data stream applies to the pulses from its timestamp on until the next.
 """
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +17,7 @@ from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
-from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
+from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.stimulus_text import LONGEST, stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import padded
@@ -36,69 +29,61 @@ _LARGEST_CHANNEL_COUNT = 4096
 
 def is_cl1(file: Hdf5File) -> bool:
     """Whether a file is laid out as the CL1's are."""
-    if {"timestamp", "channel"} <= set(file.fields("spikes")) or {"timestamp", "channel"} <= set(file.fields("stims")):
+    if any({"timestamp", "channel"} <= set(file.fields(table)) for table in ("spikes", "stims")):
         return True
     return file.attribute("/", "uV_per_sample_unit") is not None and file.has("samples")
 
 
-def read_cl1(path: str | os.PathLike[str], *, spikes: bool = True) -> Recording:
-    """Read spikes and stimuli of a CL1 recording.
+def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
+    """Read spikes and stimuli of an open CL1 recording.
 
     Args:
         spikes: whether to read spikes, which must exist; otherwise only stimuli, for raw traces.
 
     Raises:
-        InvalidFile: if the file is missing, damaged or lacks spikes.
+        InvalidFile: if the file lacks spikes.
         UnusableData: if a column is invalid.
     """
-    path = Path(path)
     findings: list[Finding] = []
-    with hdf5_file(path, "CL1 recording") as file:
-        if spikes and not file.has("spikes"):
-            raise InvalidFile(
-                f"{path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
-                "them in its raw traces with animat convert --raw"
-            )
-        rate_hz = _rate_hz(file, findings)
-        frame = file.read("spikes", "timestamp") if spikes else np.empty(0, np.int64)
-        channel = file.read("spikes", "channel") if spikes else np.empty(0, np.int64)
-        n_channels = file.attribute("/", "channel_count")
-        if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
-            findings.append(
-                Finding(
-                    "channel-count-missing",
-                    "note",
-                    f"the number of channels is not in the file: assumed to be {CHANNELS}",
-                )
-            )
-            n_channels = CHANNELS
-        stimulus_frame, columns = _stimuli(file)
-        start = _first_frame(file, frame, stimulus_frame)
-        columns |= _parameters(file, stimulus_frame, findings)
-        frames = file.attribute("/", "duration_frames")
-        created = file.attribute("/", "created_utc")
-    if len(channel) and int(channel.max()) >= n_channels:
-        n_channels = int(channel.max()) + 1
+    if spikes and not file.has("spikes"):
+        raise InvalidFile(
+            f"{file.path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
+            "them in its raw traces with animat convert --raw"
+        )
+    rate_hz = _rate_hz(file, findings)
+    frame, channel = (
+        file.read("spikes", column) if spikes else np.empty(0, np.int64) for column in ("timestamp", "channel")
+    )
+    n_channels = file.attribute("/", "channel_count")
+    if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
+        message = f"the number of channels is not in the file: assumed to be {CHANNELS}"
+        findings.append(Finding("channel-count-missing", "note", message))
+        n_channels = CHANNELS
+    n_channels = max(n_channels, int(channel.max(initial=0)) + 1)
+    # A channel is an electrode on this rig, so its number is used for both.
     electrodes = np.array(SITES if n_channels == CHANNELS else range(n_channels), dtype=np.int64)
+    stimulus_frame, columns = _stimuli(file)
+    columns |= _parameters(file, stimulus_frame, findings)
+    start = _first_frame(file, frame, stimulus_frame)
     on_electrode = np.isin(channel, electrodes)
     if stray := int(np.count_nonzero(~on_electrode)):
-        names = ", ".join(
-            f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in np.unique(channel[~on_electrode]).tolist()
-        )
+        strays = np.unique(channel[~on_electrode]).tolist()
+        names = ", ".join(f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in strays)
         message = (
             f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are not electrodes, and are left out"
         )
         findings.append(Finding("spikes-not-on-electrodes", "note", message, float(stray)))
-    frame, channel = frame[on_electrode], channel[on_electrode]
-    spike_time_s, stimulus_time_s = (frame - start) / rate_hz, (stimulus_frame - start) / rate_hz
+    spike_time_s, stimulus_time_s = (frame[on_electrode] - start) / rate_hz, (stimulus_frame - start) / rate_hz
+    frames = file.attribute("/", "duration_frames")
     if isinstance(frames, int) and frames > 0:
         columns |= recorded_span(frames, rate_hz, spike_time_s, stimulus_time_s)
-    provenance = {"source": path.name, "format": "CL1"}
+    provenance = {"source": file.path.name, "format": "CL1"}
+    created = file.attribute("/", "created_utc")
     if isinstance(created, str) and created and created.isprintable():
         provenance["recorded_at"] = created
     return PlainColumns(
         spike_time_s=spike_time_s,
-        spike_channel=channel,
+        spike_channel=channel[on_electrode],
         stimulus_time_s=stimulus_time_s,
         channel_label=electrodes,
         channel_electrode=electrodes,
@@ -112,9 +97,8 @@ def _rate_hz(file: Hdf5File, findings: list[Finding]) -> float:
         rate = file.attribute("/", name)
         if isinstance(rate, int | float) and 0 < rate < 1e9:
             return float(rate)
-    findings.append(
-        Finding("sampling-missing", "warning", "the sampling rate is not in the file: assumed to be 25 kHz")
-    )
+    message = "the sampling rate is not in the file: assumed to be 25 kHz"
+    findings.append(Finding("sampling-missing", "warning", message))
     return USUAL_RATE_HZ
 
 
@@ -134,14 +118,12 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
     """First frame of each stimulus, and its electrodes."""
     if not file.has("stims"):
         return np.empty(0, np.int64), {}
-    frame = file.read("stims", "timestamp").astype(np.int64)
-    channel = file.read("stims", "channel").astype(np.int64)
+    frame, channel = (file.read("stims", column).astype(np.int64) for column in ("timestamp", "channel"))
     frames, which = np.unique(frame, return_inverse=True)
-    lists: list[list[int]] = [[] for _ in frames]
-    for stimulus, electrode in zip(which.reshape(-1).tolist(), channel.tolist(), strict=True):
-        if electrode not in lists[stimulus]:
-            lists[stimulus].append(electrode)
-    return frames, {"stimulus_electrodes": padded([sorted(electrodes) for electrodes in lists])}
+    electrodes: list[set[int]] = [set() for _ in frames]
+    for stimulus, electrode in zip(which.tolist(), channel.tolist(), strict=True):
+        electrodes[stimulus].add(electrode)
+    return frames, {"stimulus_electrodes": padded([sorted(pulsed) for pulsed in electrodes])}
 
 
 def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:
@@ -149,12 +131,11 @@ def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> di
     at = f"data_stream/{STIMULUS_STREAM}"
     if not len(stimulus) or not file.has(f"{at}/index") or not file.has(f"{at}/data"):
         return {}
-    frame = file.read(f"{at}/index", "timestamp").astype(np.int64)
-    starts = file.read(f"{at}/index", "start_index").astype(np.int64)
-    ends = file.read(f"{at}/index", "end_index").astype(np.int64)
+    index = [file.read(f"{at}/index", column).astype(np.int64) for column in ("timestamp", "start_index", "end_index")]
+    frame, starts, ends = index
     data = file.read(f"{at}/data").astype(np.uint8).tobytes()
     # Some versions of the SDK write the first rows of the index again and again: nothing is known from there on.
-    _, first = np.unique(np.stack([frame, starts, ends]), axis=1, return_index=True)
+    _, first = np.unique(np.stack(index), axis=1, return_index=True)
     n_valid = int(np.setdiff1d(np.arange(len(frame)), first).min(initial=len(frame)))
     is_lost = stimulus > frame[:n_valid].max(initial=-1) if n_valid < len(frame) else np.zeros(len(stimulus), bool)
     if lost := int(np.count_nonzero(is_lost)):

@@ -1,16 +1,4 @@
-"""CSV: spikes in `NAME_spikes.csv[.gz]`, and stimuli in `NAME_stimuli.csv[.gz]` in the same folder.
-
-Both have a header line and columns separated by commas, semicolons or tabs (`animat.recordings.formats.text_table`); a
-stimulus file may also be a single column of times without a header. Column names are those of
-`animat.recordings.columns.PlainColumns`, or short ones:
-
-    spikes     spike_time_s, time_s or time (seconds); spike_channel, channel or unit (a number or a name)
-    stimuli    stimulus_time_s, time_s or time (seconds); and, if known, stimulus_frequency_hz or frequency_hz,
-               stimulus_pattern or pattern, stimulus_presentation or presentation,
-               stimulus_electrodes or electrodes (several separated by spaces)
-
-Other columns are left out, with a finding. There is no channel table: the channels are those that fired.
-"""
+"""CSV: spikes in `NAME_spikes.csv[.gz]`, stimuli in `NAME_stimuli.csv[.gz]`, columns as in docs/recordings.md."""
 
 from __future__ import annotations
 
@@ -21,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, did_you_mean
+from animat.errors import InvalidFile, did_you_mean, some_of
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding, left_out_finding
-from animat.recordings.formats.text_table import TextTable, folded, is_number, read_text_table
+from animat.recordings.findings import Finding
+from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
-from animat.tables import fits_padded, padded
+from animat.tables import padded
 
 SPIKE_COLUMNS = {
     "spike_time_s": ("spike_time_s", "time_s", "time"),
@@ -45,11 +33,10 @@ NAMES = ("spike_channel", "stimulus_pattern")
 SUFFIXES = (".csv", ".csv.gz")
 
 
-def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[str] | None = None) -> Recording:
-    """Read a recording from a file of spikes and one of stimuli.
+def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = None) -> Recording:
+    """Make a recording from a table of spikes and a file of stimuli.
 
     Args:
-        path: the spikes.
         stimuli_path: the stimuli; by default `NAME_stimuli.csv` or `NAME_stimuli.csv.gz` next to `NAME_spikes.csv` (or
             next to `NAME.csv`). If there is none, the recording has no stimuli, with a finding.
 
@@ -57,37 +44,33 @@ def read_csv(path: str | os.PathLike[str], *, stimuli_path: str | os.PathLike[st
         InvalidFile: if a file is missing, damaged or lacks a required column, or the two seem to be swapped.
         UnusableData: if a column is invalid.
     """
-    path = Path(path)
+    path = table.path
     if stimuli_path is None and _stem(path).endswith("_stimuli"):
         raise InvalidFile(f"{path}: expected a spike file, got the stimuli that belong to one; name the spike file")
     stimuli = stimuli_beside(path) if stimuli_path is None else Path(stimuli_path)
     provenance = {"source": path.name, "format": "CSV"}
-    columns, findings = _columns(read_text_table(path), SPIKE_COLUMNS)
-    if not len(columns["spike_time_s"]):
+    columns, findings = _columns(table, SPIKE_COLUMNS), table.findings
+    if not table.rows:
         raise InvalidFile(f"{path}: expected one line per spike, got only a header")
     if stimuli is None:
         columns["stimulus_time_s"] = np.empty(0)
         looked_for = " or ".join(file.name for file in _stimuli_beside(path))
         message = (
-            f"{path.name} has {len(columns['spike_time_s']):,} spikes but no stimuli, so there are no responses to "
-            f"learn from: {looked_for} was looked for; rename the stimulus file accordingly"
+            f"{path.name} has {len(table.rows):,} spikes but no stimuli, so there are no responses to learn from: "
+            f"{looked_for} was looked for; rename the stimulus file accordingly"
         )
-        findings.append(Finding("no-stimuli", "refuse", message))
+        findings = [*findings, Finding("no-stimuli", "refuse", message)]
     else:
-        stimulus_columns, stimulus_findings = _columns(read_text_table(stimuli, "stimulus_time_s"), STIMULUS_COLUMNS)
-        columns |= stimulus_columns
-        findings += stimulus_findings
+        stimulus_table = read_text_table(stimuli, "stimulus_time_s")
+        columns |= _columns(stimulus_table, STIMULUS_COLUMNS)
+        findings = [*findings, *stimulus_table.findings]
         provenance["stimuli"] = stimuli.name
     return PlainColumns(**columns).to_recording(provenance, tuple(findings))
 
 
 def read_stimuli_csv(path: Path) -> dict[str, Any]:
-    """The stimulus columns of `PlainColumns` in a stimulus file; unknown columns are left out.
-
-    Raises:
-        InvalidFile: if the file is missing, damaged or lacks the times.
-    """
-    return _columns(read_text_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)[0]
+    """The stimulus columns of `PlainColumns` in a stimulus file; unknown columns are left out."""
+    return _columns(read_text_table(path, "stimulus_time_s"), STIMULUS_COLUMNS)
 
 
 def stimuli_beside(path: Path) -> Path | None:
@@ -104,20 +87,16 @@ def _stem(path: Path) -> str:
     return path.name.removesuffix(".gz").removesuffix(".csv")
 
 
-def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[dict[str, Any], list[Finding]]:
-    """The known columns of a file under our names, and the findings."""
-    place = {}
+def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    """The known columns of a table under our names."""
+    places = {name: place for name, names in known.items() if (place := table.place(names)) is not None}
     for name, names in known.items():
-        column = table.place(names)
-        if column is not None:
-            place[name] = column
-        elif name in REQUIRED:
+        if name in REQUIRED and name not in places:
             # It may be a response table in which one of these is misspelt.
             others = ("channel", "count", "rate_hz") if name == "spike_time_s" else ()
-            found_names = ", ".join(repr(head)[1:-1][:40] for head in table.header[:12])
-            found_names += ", ..." if len(table.header) > 12 else ""
+            found = some_of([repr(head)[1:-1][:40] for head in table.header], 12)
             raise InvalidFile(
-                f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {found_names}"
+                f"{table.path}, line 1: expected a column named {' or '.join(names)}, found {found}"
                 f"{_advice(table, name) or nearest(table, (*names, *others))}"
             )
     heads = [head for head in table.header if folded(head) in known.get("spike_channel", ())]
@@ -126,12 +105,9 @@ def _columns(table: TextTable, known: Mapping[str, tuple[str, ...]]) -> tuple[di
             f"{table.path}, line 1: expected one column of {' or '.join(known['spike_channel'])}, got "
             f"{' and '.join(heads)}: remove one (each unit is a channel)"
         )
-    columns = {name: plain_column(table, i, name) for name, i in place.items()}
-    left_out = [name for i, name in enumerate(table.header) if i not in place.values()]
-    if left_out:
-        missing = [alias for name, names in known.items() if name not in place for alias in names]
-        table.findings.append(left_out_finding("columns", left_out, table.path.name, missing))
-    return columns, table.findings
+    columns = {name: plain_column(table, place, name) for name, place in places.items()}
+    table.note_left_out([alias for name, names in known.items() if name not in places for alias in names])
+    return columns
 
 
 def _advice(table: TextTable, missing: str) -> str:
@@ -160,11 +136,7 @@ def nearest(table: TextTable, missing: Sequence[str]) -> str:
 
 
 def plain_column(table: TextTable, place: int, name: str) -> Column:
-    """One column of spikes or stimuli by its name in `PlainColumns`: numbers, or text if it may hold names.
-
-    Raises:
-        InvalidFile: for a cell that is neither, with its line.
-    """
+    """One column of spikes or stimuli by its name in `PlainColumns`: numbers, or text if it may hold names."""
     if name == "stimulus_electrodes":
         return _electrodes(table, place)
     if name not in NAMES:
@@ -180,7 +152,7 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
         missing = "expected a channel for each spike"
         raise table.wrong(cells.index(""), f"{name}: {missing}, got {cells.count('')} without one, here the first")
     try:
-        numbers = np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+        numbers = as_numbers(cells)
     except ValueError:
         return np.array(cells, dtype=np.str_)
     if name == "spike_channel" and np.any(wrong := numbers % 1 > 0):
@@ -199,9 +171,4 @@ def _electrodes(table: TextTable, place: int) -> Column:
             raise table.wrong(
                 row, f"stimulus_electrodes: expected whole numbers separated by spaces, got {cell[:40]!r}"
             ) from error
-    if not fits_padded(lists):
-        width = max(map(len, lists))
-        raise InvalidFile(
-            f"{table.path}: stimulus_electrodes: expected a few electrodes per stimulus, got {width} in one line"
-        )
     return padded(lists)

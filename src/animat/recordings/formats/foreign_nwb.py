@@ -1,11 +1,4 @@
-"""NWB from other programs, read with plain h5py: units as channels, and stimuli wherever they are.
-
-    /units                  spike_times and its index; electrodes (rows of the electrodes table), if there are any
-    /general/extracellular_ephys/electrodes      rel_x, rel_y or x, y; label, channel_name or electrode_name
-    stimuli                 see `animat.recordings.formats.nwb_stimuli`
-
-Every unit becomes a channel, including silent ones; a unit on several electrodes takes the position of its first.
-"""
+"""NWB from other programs, read with plain h5py: units as channels, and stimuli wherever they are."""
 
 from __future__ import annotations
 
@@ -14,28 +7,25 @@ from typing import Any
 import h5py
 import numpy as np
 
-from animat.errors import InvalidFile, UnusableData
+from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, count_out_of_order, unsorted_finding
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
-from animat.recordings.formats.nwb_layout import SUBJECT
+from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE, SUBJECT, UNITS_TABLE
 from animat.recordings.formats.nwb_stimuli import read_stimuli
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
-UNITS = "units"
-ELECTRODES = "general/extracellular_ephys/electrodes"
 POSITIONS = (("rel_x", "rel_y"), ("x", "y"))
-UNIT_LABELS = ("unit_name", "label", "cluster_id")
-ELECTRODE_LABELS = ("label", "channel_name", "electrode_name")
+UNIT_LABELS = ("unit_name", "label", "cluster_id", "id")
+ELECTRODE_LABELS = ("label", "channel_name", "electrode_name", "id")
 TEXTS = ("experiment_description", "session_description", "institution", "lab")
 
 
-def read_foreign_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -> Recording:
-    """Read a recording written by another program.
+def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True) -> Recording:
+    """Read an open file of another program; every unit becomes a channel, at its first electrode's position.
 
     Args:
-        file: open.
         stimuli: the name of the stimuli, if the file has several candidates.
         spikes: whether to read units, which must exist; otherwise only channels and stimuli, for raw traces.
 
@@ -43,13 +33,12 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -
         InvalidFile: if the file holds no units, or several candidates for stimuli and none is chosen.
         UnusableData: if a column is invalid.
     """
-    path, findings = file.path, list[Finding]()
-    columns: dict[str, Any]
+    findings: list[Finding] = []
     if spikes:
-        if not file.has(f"{UNITS}/spike_times"):
-            raw = [n for n in file.names("acquisition") if file.has(f"acquisition/{n}/data")]
+        if not file.has(f"{UNITS_TABLE}/spike_times"):
+            raw = [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]
             raise InvalidFile(
-                f"{path}: expected spikes in /{UNITS}, found none"
+                f"{file.path}: expected spikes in /{UNITS_TABLE}, found none"
                 + (
                     f": it holds traces ({', '.join(raw[:4])}); find spikes in them with animat convert --raw"
                     if raw
@@ -60,43 +49,21 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, spikes: bool = True) -
     else:
         columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **_electrodes(file)}
     columns |= read_stimuli(file, stimuli, findings)
-    provenance = {"source": path.name, "format": "NWB of another program", **_origin(file)}
+    provenance = {"source": file.path.name, "format": "NWB of another program", **_origin(file)}
     if spikes:
         provenance["channels"] = "units"
-    resolution = file.attribute(f"{UNITS}/spike_times", "resolution")
+    resolution = file.attribute(f"{UNITS_TABLE}/spike_times", "resolution")
     if isinstance(resolution, float) and 1e-9 < resolution < 1:
         columns["sampling_rate_hz"] = 1 / resolution
-    try:
-        return PlainColumns(**columns).to_recording(provenance, tuple(findings))
-    except UnusableData as error:
-        # The file is not damaged; its contents are invalid.
-        raise InvalidFile(f"{path}: {error}") from error
-
-
-def ragged(file: Hdf5File, at: str, n_values: int) -> Column:
-    """How many values each row of a ragged column has.
-
-    Raises:
-        InvalidFile: if the index does not divide the values.
-    """
-    ends = file.read(f"{at}_index").astype(np.int64).reshape(-1)
-    counts = np.diff(ends, prepend=0)
-    if np.any(counts < 0) or (int(ends[-1]) if len(ends) else 0) != n_values:
-        raise InvalidFile(f"{file.path}: /{at}_index does not divide the {n_values:,} values of /{at}: damaged")
-    return counts
+    return PlainColumns(**columns).to_recording(provenance, tuple(findings))
 
 
 def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
-    time_s = file.read(f"{UNITS}/spike_times").reshape(-1)
-    if file.has(f"{UNITS}/spike_times_index"):
-        counts = ragged(file, f"{UNITS}/spike_times", len(time_s))
-    else:
-        counts = np.ones(len(time_s), np.int64)
+    """The spikes, and the units as channel columns."""
+    time_s = file.read(f"{UNITS_TABLE}/spike_times").reshape(-1)
+    counts = _row_lengths(file, f"{UNITS_TABLE}/spike_times", len(time_s))
     n = len(counts)
-    names = next((f"{UNITS}/{name}" for name in (*UNIT_LABELS, "id") if file.has(f"{UNITS}/{name}")), None)
-    labels = np.arange(n).astype(np.str_) if names is None else file.read(names).reshape(-1).astype(np.str_)
-    if len(labels) != n or len(np.unique(labels)) != n:
-        labels = np.arange(n).astype(np.str_)
+    labels = _labels(file, UNITS_TABLE, UNIT_LABELS, n)
     # Units follow each other; spikes count as out of order only within a unit.
     if early := sum(map(count_out_of_order, np.split(time_s, np.cumsum(counts)[:-1]))):
         findings.append(unsorted_finding("spikes", early, len(time_s)))
@@ -106,13 +73,11 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
         "spike_channel": np.repeat(labels, counts)[order],
         "channel_label": labels,
     }
-    row = _electrode_of_unit(file, n)
-    table = _electrodes(file)
+    row, table = _electrode_of_unit(file, n), _electrodes(file)
     n_electrodes = len(table.get("channel_label", ()))
     if row is None or not n_electrodes:
-        findings.append(
-            Finding("units-without-electrodes", "note", "the units name no electrodes: positions are unknown")
-        )
+        message = "the units name no electrodes: positions are unknown"
+        findings.append(Finding("units-without-electrodes", "note", message))
         return columns
     known = (row >= 0) & (row < n_electrodes)
     electrode, xy_um = np.full(n, UNKNOWN), np.full((n, 2), np.nan)
@@ -123,12 +88,11 @@ def _units(file: Hdf5File, findings: list[Finding]) -> dict[str, Any]:
 
 def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
     """The first row of the electrodes table that each unit refers to, -1 for none; None without such a column."""
-    if not file.has(f"{UNITS}/electrodes"):
+    at = f"{UNITS_TABLE}/electrodes"
+    if not file.has(at):
         return None
-    rows = file.read(f"{UNITS}/electrodes").astype(np.int64).reshape(-1)
-    if not file.has(f"{UNITS}/electrodes_index"):
-        return rows if len(rows) == n else None
-    counts = ragged(file, f"{UNITS}/electrodes", len(rows))
+    rows = file.read(at).astype(np.int64).reshape(-1)
+    counts = _row_lengths(file, at, len(rows))
     if len(counts) != n:
         return None
     first = np.full(n, UNKNOWN)
@@ -139,25 +103,34 @@ def _electrode_of_unit(file: Hdf5File, n: int) -> Column | None:
 
 def _electrodes(file: Hdf5File) -> dict[str, Any]:
     """The electrodes table as channel columns; empty if there is none."""
-    if not file.has(f"{ELECTRODES}/id"):
+    at = ELECTRODES_TABLE
+    if not file.has(f"{at}/id"):
         return {}
-    number = file.read(f"{ELECTRODES}/id").astype(np.int64).reshape(-1)
+    number = file.read(f"{at}/id").astype(np.int64).reshape(-1)
     n = len(number)
-    labels = number.astype(np.str_)
-    for name in ELECTRODE_LABELS:
-        if file.has(f"{ELECTRODES}/{name}"):
-            names = file.read(f"{ELECTRODES}/{name}").reshape(-1).astype(np.str_)
-            if len(names) == n == len(np.unique(names)):
-                labels = names
-                break
     xy_um = np.full((n, 2), np.nan)
     for pair in POSITIONS:
-        if all(file.has(f"{ELECTRODES}/{axis}") for axis in pair):
-            axes = [file.read(f"{ELECTRODES}/{axis}").astype(np.float64).reshape(-1) for axis in pair]
+        if all(file.has(f"{at}/{axis}") for axis in pair):
+            axes = [file.read(f"{at}/{axis}").astype(np.float64).reshape(-1) for axis in pair]
             if all(len(axis) == n for axis in axes):
                 xy_um = np.column_stack(axes)
                 break
+    labels = _labels(file, at, ELECTRODE_LABELS, n)
     return {"channel_label": labels, "channel_electrode": np.maximum(number, UNKNOWN), "channel_xy_um": xy_um}
+
+
+def _row_lengths(file: Hdf5File, at: str, n_values: int) -> Column:
+    return file.row_lengths(at, n_values) if file.has(f"{at}_index") else np.ones(n_values, np.int64)
+
+
+def _labels(file: Hdf5File, at: str, columns: tuple[str, ...], n: int) -> Column:
+    """The first of a table's columns that names each of its n rows differently; without one, rows are numbered."""
+    for column in columns:
+        if file.has(f"{at}/{column}"):
+            labels = file.read(f"{at}/{column}").reshape(-1).astype(np.str_)
+            if len(labels) == n == len(np.unique(labels)):
+                return labels
+    return np.arange(n).astype(np.str_)
 
 
 def _origin(file: Hdf5File) -> dict[str, str]:

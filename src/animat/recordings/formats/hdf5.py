@@ -1,10 +1,4 @@
-"""Reads untrusted HDF5 files so that a damaged or hostile one causes an error and nothing else.
-
-A file is data, never instructions: links to other files are not followed (external links, external storage, virtual
-datasets), pickles are never opened, and data that claims to be larger than the file can hold is refused before memory
-is allocated. Links inside a file are followed, as MaxWell's files need them. If a file has several candidates, one is
-chosen by name (`choose`).
-"""
+"""Reads untrusted HDF5 files so that a damaged or hostile one causes an error and nothing else."""
 
 from __future__ import annotations
 
@@ -18,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from animat.errors import AnimatError, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, some_of
 
 Column = np.ndarray[Any, Any]
 
@@ -36,22 +30,16 @@ DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticE
 class Hdf5File:
     """An open file in which every access is checked.
 
-    Attributes:
-        path: of the file, for messages.
-        file: the open file, for accesses that are checked elsewhere.
+    Nothing is unpickled, no other file is opened, and data that claims to be larger than the file can hold is refused
+    before memory is allocated. Links inside the file are followed, as MaxWell's files need them.
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
-        self.path = path
-        self.file = file
+        self.path, self.file = path, file
         self._bytes = path.stat().st_size
 
     def node(self, where: str) -> h5py.Group | h5py.Dataset | None:
-        """The group or dataset at a path, None if there is none; links inside the file are followed, others refused.
-
-        Raises:
-            InvalidFile: for a link to another file, or circular links.
-        """
+        """The group or dataset at a path, None if there is none; refuses links to other files, and circular ones."""
         parts = deque(part for part in where.split("/") if part)
         node: Any = self.file["/"]
         hops = 0
@@ -87,8 +75,7 @@ class Hdf5File:
     @property
     def root_names(self) -> str:
         """The first names at the root, for messages."""
-        names = self.names("/")
-        return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "nothing"
+        return some_of(self.names("/"), 5) or "nothing"
 
     def has(self, where: str) -> bool:
         """Whether there is a group or dataset at a path."""
@@ -100,11 +87,7 @@ class Hdf5File:
         return tuple(node.dtype.names or ()) if isinstance(node, h5py.Dataset) else ()
 
     def dataset(self, where: str) -> h5py.Dataset:
-        """A dataset whose values are in the file itself.
-
-        Raises:
-            InvalidFile: if there is none, or its values are in other files.
-        """
+        """A dataset; refused if there is none, or its values are in other files."""
         node = self.node(where)
         if not isinstance(node, h5py.Dataset):
             raise InvalidFile(f"{self.path}: expected a dataset at {where}, found {'a group' if node else 'nothing'}")
@@ -122,12 +105,7 @@ class Hdf5File:
         return node
 
     def read(self, where: str, field: str | None = None) -> Column:
-        """All values of a dataset, or of one column of a table; text is returned as `str`.
-
-        Raises:
-            InvalidFile: if there is none, its type is not numbers or text, or it claims more values than the
-                file can hold.
-        """
+        """All values of a dataset, or of one column of a table: numbers, or text as `str`; others are refused."""
         dataset = self.dataset(where)
         dtype = dataset.dtype
         name = where if field is None else f"{where}/{field}"
@@ -139,8 +117,7 @@ class Hdf5File:
         if not text and (dtype.kind not in "iufb" or dtype.shape):
             raise InvalidFile(f"{self.path}: expected numbers or text at {name}, got {dtype}")
         self._check_size(name, dataset, dtype)
-        missing = unavailable_filters(dataset)
-        if missing:
+        if missing := unavailable_filters(dataset):
             raise InvalidFile(f"{self.path}: {name} is compressed by {missing}: {PLUGIN_ADVICE}")
         values = np.asarray(dataset[()] if field is None else dataset.fields(field)[()])
         return _as_text(values) if text else values
@@ -177,6 +154,14 @@ class Hdf5File:
         value = value.item() if isinstance(value, np.generic) else value
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
+    def row_lengths(self, where: str, n_values: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """How many values each row of a ragged column of NWB has; refuses an index that does not divide them."""
+        ends = self.read(f"{where}_index").astype(np.int64).reshape(-1)
+        lengths = np.diff(ends, prepend=0)
+        if np.any(lengths < 0) or (int(ends[-1]) if len(ends) else 0) != n_values:
+            raise InvalidFile(f"{self.path}: /{where}_index does not divide the {n_values:,} values of it: damaged")
+        return lengths
+
     def _check_size(self, name: str, dataset: h5py.Dataset, dtype: np.dtype[Any]) -> None:
         if dataset.shape is None:
             raise InvalidFile(f"{self.path}: expected values at {name}, got an empty dataspace")
@@ -199,29 +184,27 @@ def unavailable_filters(dataset: h5py.Dataset) -> str:
     names = []
     for code, _, _, name in map(created.get_filter, range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(code):
-            text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
-            text = text.partition("\0")[0].strip()
+            text = name.decode("utf-8", "replace").partition("\0")[0].strip()
             names.append(f"filter {code}" + (f" ({text})" if text.isprintable() and text else ""))
     return ", ".join(names)
 
 
 @contextmanager
-def hdf5_file(path: Path, what: str) -> Iterator[Hdf5File]:
-    """Open a file for checked reading; any error inside becomes an `InvalidFile` that names the file.
-
-    Args:
-        what: the kind of file for messages, such as "NWB recording".
-    """
+def hdf5_file(path: Path) -> Iterator[Hdf5File]:
+    """Open a file for checked reading; any error about its contents becomes an `InvalidFile` that names the file."""
     try:
         with h5py.File(path, "r") as file:
             yield Hdf5File(path, file)
-    except InvalidFile:
+    except (InvalidFile, InvalidArgument):
         raise
     except FileNotFoundError as error:
         raise InvalidFile(f"{path}: no such file") from error
-    except (*DAMAGE, AnimatError) as error:
+    except UnusableData as error:
+        # The file is not damaged; its contents are invalid.
+        raise InvalidFile(f"{path}: {error}") from error
+    except DAMAGE as error:
         raise InvalidFile(
-            f"{path}: expected a complete {what}, but it is cut off or damaged ({first_line(error)}); "
+            f"{path}: expected a complete HDF5 recording, but it is cut off or damaged ({first_line(error)}); "
             "copy or record it again"
         ) from error
 
@@ -232,6 +215,11 @@ def first_line(error: BaseException) -> str:
     return (line if line.isprintable() else "".join(c for c in line if c.isprintable()))[:200] or type(error).__name__
 
 
+def is_positive(value: Any) -> bool:
+    """Whether a value from a file is a positive, finite number."""
+    return isinstance(value, int | float) and 0 < value < math.inf
+
+
 def _as_text(values: Column) -> Column:
     flat = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.reshape(-1).tolist()]
     if sum(map(len, flat)) > LARGEST_VALUES or max(map(len, flat), default=0) * len(flat) > LARGEST_VALUES:
@@ -240,27 +228,18 @@ def _as_text(values: Column) -> Column:
     return np.array(flat, dtype=np.str_).reshape(values.shape)
 
 
-LISTED = 8
-
-
 def choose(
     what: str, option: str, names: Iterable[str], asked: str | None, describe: Callable[[str], str] = lambda name: name
 ) -> str:
-    """The requested name, or the only one.
+    """The name that was asked for, or the only one; other cases are refused, with a list of the names.
 
     Args:
         what: what is chosen and where, such as `rig.h5: part`.
         option: the option that chooses it, such as `--part`.
-        names: the candidates, at least one.
-        asked: the requested name, if any.
-        describe: how a name is listed in messages.
-
-    Raises:
-        InvalidFile: listing the candidates, if the name is not one of them, or none is requested and there are several.
+        describe: how a name is listed.
     """
     candidates = list(names)
-    listed = ", ".join(describe(name)[:80] for name in candidates[:LISTED])
-    listed += ", ..." if len(candidates) > LISTED else ""
+    listed = some_of([describe(name)[:80] for name in candidates])
     if asked is not None:
         if asked in candidates:
             return asked

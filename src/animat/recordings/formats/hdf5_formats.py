@@ -12,16 +12,19 @@ from animat.recordings.formats.maxwell import is_maxwell, read_maxwell
 from animat.recordings.formats.nwb import is_nwb, read_nwb
 from animat.recordings.recording import Recording
 
-Format = Literal["NWB", "MaxWell", "CL1"]
 
-
-def format_of(file: Hdf5File) -> Format | None:
-    """The format of an open file, None if it is unknown."""
+def format_of(file: Hdf5File) -> Literal["NWB", "MaxWell", "CL1"]:
+    """The format of an open file; refuses an unknown one."""
     if is_nwb(file):
         return "NWB"
     if is_maxwell(file):
         return "MaxWell"
-    return "CL1" if is_cl1(file) else None
+    if is_cl1(file):
+        return "CL1"
+    raise InvalidFile(
+        f"{file.path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.root_names}); save its "
+        "columns as NPZ or CSV"
+    )
 
 
 def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
@@ -35,17 +38,12 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
         InvalidFile: if the file is damaged, of an unknown format, or holds no recording.
         InvalidArgument: for a choice that the file's format does not offer.
     """
-    with hdf5_file(path, "HDF5 recording") as file:
+    with hdf5_file(path) as file:
         kind = format_of(file)
-        if kind is None:
-            raise InvalidFile(
-                f"{path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.root_names}); save its "
-                "columns as NPZ or CSV"
-            )
-    if part is not None and kind != "MaxWell":
-        raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for a {kind} file")
-    if stimuli is not None and kind == "CL1":
-        raise InvalidArgument(f"stimuli: expected only for NWB and MaxWell files, got {stimuli!r} for a {kind} file")
-    if kind == "NWB":
-        return read_nwb(path, stimuli=stimuli)
-    return read_maxwell(path, part=part, stimuli=stimuli) if kind == "MaxWell" else read_cl1(path)
+        if part is not None and kind != "MaxWell":
+            raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for a {kind} file")
+        if stimuli is not None and kind == "CL1":
+            raise InvalidArgument(f"stimuli: expected only for NWB and MaxWell files, got {stimuli!r} for a CL1 file")
+        if kind == "NWB":
+            return read_nwb(file, stimuli)
+        return read_maxwell(file, part, stimuli) if kind == "MaxWell" else read_cl1(file)

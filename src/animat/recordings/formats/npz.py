@@ -1,15 +1,7 @@
-"""NPZ: one compressed numpy archive of plain columns, the simplest way to provide a recording.
-
-Keys are those of `animat.recordings.columns.PlainColumns`; `spike_time_s`, `spike_channel` and `stimulus_time_s` are
-required. Other accepted names are `stim_...` for `stimulus_...`; for spike-sorted data `spike_unit` for `spike_channel`
-and `unit_...` for `channel_...` (each unit is then a channel); `stim_tag` for `stimulus_pattern`. If units have
-positions but no electrodes, `mapping_electrode` and `mapping_xy_um` (the array's routing) give the electrode at each
-position, and `mapping_channel` is not needed. Any other key is left out, with a finding.
-"""
+"""NPZ: one numpy archive of plain columns, the simplest way to provide a recording; keys as in docs/recordings.md."""
 
 from __future__ import annotations
 
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -19,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, UnusableData, did_you_mean
+from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import left_out_finding
+from animat.recordings.findings import left_out_findings
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
@@ -29,9 +21,7 @@ from animat.tables import UNKNOWN
 REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
 UNPACKED_BYTES, UNPACKED_RATIO = 2**26, 20
-TEXTS = ("presentation_order",)
-WHOLE = ("presentation_pulses",)
-SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", *WHOLE, *TEXTS)
+SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", "presentation_pulses", "presentation_order")
 OTHER_NAMES = {
     "stim_tag": "stimulus_pattern",
     "spike_unit": "spike_channel",
@@ -43,20 +33,15 @@ SPREADSHEET = "[Content_Types].xml"
 ROUTING = ("mapping_electrode", "mapping_xy_um")
 
 
-def read_npz(path: str | os.PathLike[str]) -> Recording:
+def read_npz(path: Path) -> Recording:
     """Read a recording from a numpy archive of plain columns; nothing in it is ever unpickled.
-
-    Args:
-        path: the file, as written by `numpy.savez` or `numpy.savez_compressed`.
 
     Raises:
         InvalidFile: if the file is missing, damaged, holds pickled objects, or lacks a required key.
         UnusableData: if a column is invalid.
     """
-    path = Path(path)
     columns, routing, left_out = load_columns(path)
-    missing = [key for key in REQUIRED if key not in columns]
-    if missing:
+    if missing := [key for key in REQUIRED if key not in columns]:
         keys = [*columns, *routing, *left_out]
         if any(key.startswith("state_") for key in keys):
             raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture")
@@ -67,10 +52,9 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
                 f"found only counts ({', '.join(counts[:4])}); provide the times, or counts per stimulus and channel "
                 "as a response table (response_count)"
             )
-        listed = ", ".join(keys[:12]) + (", ..." if len(keys) > 12 else "") if keys else "none"
         raise InvalidFile(
-            f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found {listed}"
-            + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
+            f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found "
+            f"{some_of(keys, 12) or 'none'}" + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
         )
     provenance = {"source": path.name, "format": "NPZ"}
     if columns.pop("sorted_units", False):
@@ -78,20 +62,14 @@ def read_npz(path: str | os.PathLike[str]) -> Recording:
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
         columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
-    findings = (
-        (left_out_finding("keys", left_out, missing=[key for key in KEYS if key not in columns]),) if left_out else ()
-    )
+    findings = left_out_findings("keys", left_out, missing=[key for key in KEYS if key not in columns])
     return PlainColumns(**columns).to_recording(provenance, findings)
 
 
 def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
     """The contents of an archive: values under our names, the array's routing, and the keys that were left out.
 
-    Args:
-        others: known keys in addition to those of a recording.
-
-    Raises:
-        InvalidFile: if the file is missing, damaged, or holds pickled objects.
+    Keys in `others` are known in addition to those of a recording.
     """
     columns: dict[str, Any] = {}
     routing: dict[str, Column] = {}
@@ -106,7 +84,7 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
                 if name in columns:
                     raise InvalidFile(f"{path}: expected {name} once, got it under two names (one is {key})")
                 if name in SINGLE:
-                    columns[name] = _single(path, key, _array(archive, key))
+                    columns[name] = _single(f"{path}: {key}", name, _array(archive, key))
                 elif name in KEYS or key in others:
                     columns[name] = _array(archive, key)
                 elif key in ROUTING:
@@ -148,23 +126,19 @@ def _array(archive: Mapping[str, Column], key: str) -> Column:
     return np.char.decode(array, "utf-8", "replace") if array.dtype.kind == "S" else array
 
 
-def _single(path: Path, key: str, array: Column) -> Any:
+def _single(what: str, name: str, array: Column) -> str | float:
     """The single value of an array, a number or text."""
     if array.size != 1:
-        raise InvalidFile(f"{path}: {key}: expected one value, got shape {array.shape}")
+        raise InvalidFile(f"{what}: expected one value, got shape {array.shape}")
     value = array.reshape(-1)[0].item()
-    name = OTHER_NAMES.get(key, key)
-    if name in TEXTS:
-        if isinstance(value, str):
-            return value
-        raise InvalidFile(f"{path}: {key}: expected text, got {value!r}")
-    if not isinstance(value, int | float):
-        raise InvalidFile(f"{path}: {key}: expected a number, got {value!r}")
-    if name in WHOLE:
+    is_text = name == "presentation_order"
+    if not isinstance(value, str if is_text else int | float):
+        raise InvalidFile(f"{what}: expected {'text' if is_text else 'a number'}, got {value!r}")
+    if name == "presentation_pulses":
         if not float(value).is_integer():
-            raise InvalidFile(f"{path}: {key}: expected a whole number, got {value!r}")
-        return int(value)
-    return float(value)
+            raise InvalidFile(f"{what}: expected a whole number, got {value!r}")
+        value = int(value)
+    return value  # type: ignore[no-any-return]
 
 
 def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) -> Column:

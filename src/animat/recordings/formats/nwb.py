@@ -1,10 +1,4 @@
-"""NWB, animat's own format on disk: written with pynwb as whole columns, read with plain h5py.
-
-NWB's fields for the origin of a recording are filled from these keys of `Recording.provenance`, all optional:
-`recorded_at` (ISO 8601; UTC unless it names a zone), `session_description`, `experiment_description`, `experimenter`
-(`Last, First`, several separated by semicolons), `lab`, `institution`, `keywords` (separated by commas), and for the
-subject `subject_id`, `species` (Latin), `sex`, `age` (ISO 8601 duration), `subject_description`.
-"""
+"""NWB, animat's own format on disk: written with pynwb as whole columns, read with plain h5py."""
 
 from __future__ import annotations
 
@@ -12,7 +6,6 @@ import io
 import os
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, TypeVar
 
 import h5py
@@ -20,9 +13,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.compilation import pynwb_importable
-from animat.errors import InvalidArgument, InvalidFile, UnusableData
-from animat.recordings.formats.foreign_nwb import ragged, read_foreign_nwb
-from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
+from animat.errors import InvalidFile, UnusableData
+from animat.recordings.formats.foreign_nwb import read_foreign_nwb
+from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import (
     ELECTRODES_TABLE,
     FORMAT_VERSION,
@@ -34,6 +27,7 @@ from animat.recordings.formats.nwb_layout import (
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Channels, Recording
+from animat.records import in_file
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN
@@ -52,6 +46,8 @@ def write_nwb(
     counts: SpikeCounts | None = None,
 ) -> None:
     """Write a recording as one NWB file, complete or absent.
+
+    NWB's fields for its origin are filled from `Recording.provenance`, by the keys in docs/recordings.md.
 
     Args:
         path: the file; parent folders are created, and an old file is replaced only by a complete new one.
@@ -140,28 +136,22 @@ class _Disk(io.RawIOBase):
             return size or 0
 
 
-def read_nwb(path: str | os.PathLike[str], *, stimuli: str | None = None) -> Recording:
-    """Read a recording written by `write_nwb`, which equals the original, or by another program.
-
-    Args:
-        stimuli: for another program's file, the name of the stimuli if there are several candidates.
-
-    Raises:
-        InvalidFile: if the file is missing, damaged, not NWB, or from another program and without spikes.
-    """
-    with hdf5_file(Path(path), "NWB recording") as file:
-        return _read(file, stimuli)
-
-
 def is_nwb(file: Hdf5File) -> bool:
     """Whether a file declares itself as NWB."""
     return "nwb_version" in file.file.attrs
 
 
-def _read(file: Hdf5File, stimuli: str | None) -> Recording:
+def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
+    """Read a recording written by `write_nwb`, which equals the original, or by another program.
+
+    Args:
+        file: open.
+        stimuli: for another program's file, the name of the stimuli if there are several candidates.
+
+    Raises:
+        InvalidFile: if the file is of a newer version, or from another program and without spikes.
+    """
     path = file.path
-    if not is_nwb(file):
-        raise InvalidFile(f"{path}: expected NWB, got another HDF5 file (it holds: {file.root_names})")
     if not file.has(RECORDING_TABLE):
         return read_foreign_nwb(file, stimuli)
     if stimuli is not None:
@@ -175,24 +165,21 @@ def _read(file: Hdf5File, stimuli: str | None) -> Recording:
     if file.has(PROVENANCE_TABLE):
         keys, values = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))
         texts = dict(zip(keys, values, strict=True))
-    try:
-        text_fields = from_metadata(texts)
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error
     order, pulses = _cell(file, "presentation_order", str), _cell(file, "presentation_pulses", int)
     times, channels = _spikes(file)
-    return Recording(
-        spike_times_s=times,
-        spike_channels=channels,
-        channels=_channels(file),
-        stimuli=_stimuli(file, _cell(file, "stimulus_electrode_columns", int)),
-        sampling_rate_hz=_cell(file, "sampling_rate_hz", float),
-        start_s=_cell(file, "start_s", float),
-        duration_s=_cell(file, "duration_s", float),
-        start_min=_cell(file, "start_min", float),
-        presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
-        **text_fields,
-    )
+    with in_file(path):
+        return Recording(
+            spike_times_s=times,
+            spike_channels=channels,
+            channels=_channels(file),
+            stimuli=_stimuli(file, _cell(file, "stimulus_electrode_columns", int)),
+            sampling_rate_hz=_cell(file, "sampling_rate_hz", float),
+            start_s=_cell(file, "start_s", float),
+            duration_s=_cell(file, "duration_s", float),
+            start_min=_cell(file, "start_min", float),
+            presentation=Presentation(order, pulses) if order else None,  # type: ignore[arg-type]
+            **from_metadata(texts),
+        )
 
 
 def _cell(file: Hdf5File, name: str, kind: Callable[[Any], T]) -> T:
@@ -203,7 +190,7 @@ def _spikes(file: Hdf5File) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.nd
     if not file.has(UNITS_TABLE):
         return np.empty(0), np.empty(0, dtype=np.int64)
     times = file.read(f"{UNITS_TABLE}/spike_times")
-    counts = ragged(file, f"{UNITS_TABLE}/spike_times", len(times))
+    counts = file.row_lengths(f"{UNITS_TABLE}/spike_times", len(times))
     channels = np.repeat(np.arange(len(counts)), counts)
     # By channel: a stable sort leaves simultaneous spikes in the order of their channels, as Recording requires.
     order = np.argsort(times, kind="stable")
@@ -220,7 +207,7 @@ def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
     time_s = file.read(f"{STIMULI_TABLE}/start_time")
     if file.has(f"{STIMULI_TABLE}/electrode_ids"):
         flat = file.read(f"{STIMULI_TABLE}/electrode_ids")
-        lengths = ragged(file, f"{STIMULI_TABLE}/electrode_ids", len(flat))
+        lengths = file.row_lengths(f"{STIMULI_TABLE}/electrode_ids", len(flat))
     else:
         flat, lengths = np.empty(0, np.int64), np.zeros(len(time_s), np.int64)
     if not 0 <= columns <= LARGEST_VALUES // max(len(lengths), 1):

@@ -1,21 +1,8 @@
-"""Finds the stimuli in NWB files from other programs; if there are several candidates, lists them to choose from.
-
-What can be stimuli, and which rows or samples are pulses:
-
-    TimeIntervals          every row, at start_time
-    IntervalSeries         every positive entry, at its timestamp
-    other series           with timestamps: every entry that is not 0 (or all, if all are 0); text: every entry
-                           sampled at a rate: wherever it leaves 0 by more than half of its largest magnitude, for the
-                           first time in 1 ms
-
-/stimulus/presentation is searched first; if that is empty, /intervals, /acquisition and /processing, and there only
-names that mention stimuli, pulses or triggers. A name given by the user is looked for in all of them.
-"""
+"""Finds the stimuli in NWB files from other programs; if there are several candidates, lists them to choose from."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import h5py
@@ -24,8 +11,8 @@ import numpy as np
 from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding
-from animat.recordings.formats.hdf5 import Hdf5File, choose
-from animat.tables import fits_padded, padded
+from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
+from animat.tables import padded
 
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")
@@ -44,7 +31,6 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     """The stimulus columns of `PlainColumns`; an empty column of times if the file has no stimuli.
 
     Args:
-        file: open.
         asked: the name of the stimuli if the user gave one: a path, or its last part.
         findings: new findings are added to it.
 
@@ -61,6 +47,7 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
 
 
 def _place(file: Hdf5File, asked: str | None, findings: list[Finding]) -> str | None:
+    """Where the stimuli are: where asked, in /stimulus/presentation, or elsewhere under a name that mentions them."""
     first = [f"{FIRST}/{name}" for name in file.names(FIRST)]
     elsewhere = [f"{room}/{name}" for room in ELSEWHERE for name in file.names(room)]
     elsewhere += [f"processing/{m}/{name}" for m in file.names("processing") for name in file.names(f"processing/{m}")]
@@ -115,30 +102,21 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     """The electrodes of each of n rows, from whole numbers or text ("7 9"); None if they are neither."""
     dataset = file.dataset(at)
     if dataset.dtype.kind in "SO" and dataset.shape == (n,):
-        return _parse_electrodes([str(text) for text in file.read(at).tolist()])
+        try:
+            return padded([[int(word) for word in cell.replace(",", " ").split()] for cell in file.read(at).tolist()])
+        except (ValueError, OverflowError):
+            return None
     if dataset.dtype.kind not in "iu":
         return None
     values = file.read(at).astype(np.int64)
     if file.has(f"{at}_index"):
-        ends = file.read(f"{at}_index").astype(np.int64).reshape(-1).tolist()
-        if len(ends) != n or any(a > b for a, b in zip([0, *ends], ends, strict=False)):
-            return None
-        flat = values.reshape(-1).tolist()
-        return padded([flat[a:b] for a, b in zip([0, *ends], ends, strict=False)])
+        lengths = file.row_lengths(at, values.size)
+        return padded(np.split(values.reshape(-1), np.cumsum(lengths))[:-1]) if len(lengths) == n else None
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
 
 
-def _parse_electrodes(cells: Sequence[str]) -> Column | None:
-    """Electrode numbers separated by spaces or commas, padded; None if a cell holds anything else."""
-    try:
-        lists = [[int(word) for word in cell.replace(",", " ").split()] for cell in cells]
-    except (ValueError, OverflowError):
-        return None
-    return padded(lists) if fits_padded(lists) else None
-
-
 def _of_series(file: Hdf5File, at: str) -> Column:
-    """Start times of all pulses of a series."""
+    """The time of each pulse of a series: each entry that is not 0 (all if all are 0), or each onset if sampled."""
     if file.has(f"{at}/timestamps"):
         time_s = file.read(f"{at}/timestamps").reshape(-1)
         node = file.node(f"{at}/data")
@@ -150,13 +128,16 @@ def _of_series(file: Hdf5File, at: str) -> Column:
         is_pulse = data > 0 if file.attribute(at, "neurodata_type") == "IntervalSeries" else data != 0
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
-    if not isinstance(rate_hz, int | float) or not rate_hz > 0 or not isinstance(start_s, int | float):
+    if not is_positive(rate_hz) or not isinstance(start_s, int | float):
         raise InvalidFile(f"{file.path}: expected the rate of /{at} in Hz at its starting_time, got {rate_hz}")
     return start_s + _onsets(file, f"{at}/data", float(rate_hz)) / rate_hz
 
 
 def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
-    """The samples at which a sampled stimulus leaves 0, read in blocks, as it may be as long as the recording."""
+    """The samples at which a stimulus leaves 0 by more than half of its largest magnitude, for the first time in 1 ms.
+
+    They are read in blocks, as they may be as many as the recording's.
+    """
     dataset = file.dataset(at)
     if dataset.ndim != 1 or dataset.dtype.kind not in "iuf" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
         raise InvalidFile(f"{file.path}: expected one column of numbers at /{at}, got {dataset.dtype} {dataset.shape}")

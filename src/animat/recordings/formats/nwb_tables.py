@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 from hdmf.backends.hdf5.h5_utils import H5DataIO
@@ -65,18 +66,16 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
     module = nwb.create_processing_module(name="ecephys", description="Data of the recording for the package animat.")
     module.add(_recording_table(recording))
     if texts:
+        columns = [_column("key", "keyword", list(texts)), _column("words", "text", list(texts.values()))]
+        description = "Where the recording came from, and findings made when it was read."
         module.add(
-            DynamicTable(
-                name="animat_provenance",
-                description="Where the recording came from, and findings made when it was read.",
-                id=np.arange(len(texts)),
-                columns=[
-                    VectorData(name="key", description="keyword", data=list(texts)),
-                    VectorData(name="words", description="text", data=list(texts.values())),
-                ],
-            )
+            DynamicTable(name="animat_provenance", description=description, id=np.arange(len(texts)), columns=columns)
         )
     return nwb
+
+
+def _column(name: str, description: str, data: Any) -> VectorData:
+    return VectorData(name=name, description=description, data=data)
 
 
 def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
@@ -90,13 +89,13 @@ def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
     nwb.electrodes = ElectrodesTable(
         id=np.arange(rows),
         columns=[
-            VectorData(name="location", description="where the electrode is", data=["in vitro"] * rows),
-            VectorData(name="group", description="the array", data=[group] * rows),
-            VectorData(name="group_name", description="the array", data=["array"] * rows),
-            VectorData(name="rel_x", description="x on the array, um; NaN: unknown", data=channels.x_um),
-            VectorData(name="rel_y", description="y on the array, um; NaN: unknown", data=channels.y_um),
-            VectorData(name="label", description="the rig's own name of the channel", data=labels),
-            VectorData(name="electrode_id", description="electrode on the array; -1: unknown", data=channels.electrode),
+            _column("location", "where the electrode is", ["in vitro"] * rows),
+            _column("group", "the array", [group] * rows),
+            _column("group_name", "the array", ["array"] * rows),
+            _column("rel_x", "x on the array, um; NaN: unknown", channels.x_um),
+            _column("rel_y", "y on the array, um; NaN: unknown", channels.y_um),
+            _column("label", "the rig's own name of the channel", labels),
+            _column("electrode_id", "electrode on the array; -1: unknown", channels.electrode),
         ],
     )
 
@@ -104,14 +103,10 @@ def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
 def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> None:
     """The units table, one row per channel, so that silent channels are kept."""
     rows = len(recording.channels)
-    ends = np.cumsum(spike_counts).astype(np.int64)
     room = H5DataIO(shape=(int(spike_counts.sum()),), dtype=np.dtype(np.float64))
-    times = VectorData(name="spike_times", description="spike times, s", data=room)
-    observed = VectorData(
-        name="obs_intervals",
-        description="from the start to the end of the recording, s",
-        data=np.tile([recording.start_s, recording.stop_s], (rows, 1)).reshape(rows, 2),
-    )
+    times = _column("spike_times", "spike times, s", room)
+    span_s = np.tile([recording.start_s, recording.stop_s], (rows, 1))
+    observed = _column("obs_intervals", "from the start to the end of the recording, s", span_s)
     electrodes = DynamicTableRegion(
         name="electrodes", description="row in the electrodes table", data=np.arange(rows), table=nwb.electrodes
     )
@@ -122,7 +117,7 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
         id=np.arange(rows),
         columns=[
             times,
-            VectorIndex(name="spike_times_index", data=ends, target=times),
+            VectorIndex(name="spike_times_index", data=np.cumsum(spike_counts).astype(np.int64), target=times),
             observed,
             VectorIndex(name="obs_intervals_index", data=one_each, target=observed),
             electrodes,
@@ -135,28 +130,24 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
 
 
 def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
-    # A row keeps its electrodes up to the last known one, so that padding between known ones is kept too.
-    known, columns = stimuli.electrodes != UNKNOWN, stimuli.electrodes.shape[1]
-    lengths = np.zeros(len(stimuli), np.int64)
-    for column in range(columns):
-        lengths[known[:, column]] = column + 1
-    kept = np.arange(columns)[None, :] < lengths[:, None]
+    """One row per pulse, with its electrodes up to the last known one, so that padding between known ones is kept."""
+    known = stimuli.electrodes != UNKNOWN
+    columns = np.arange(known.shape[1])
+    lengths = np.max((columns + 1) * known, axis=1, initial=0)
     rests = f"; {NOTHING}: nothing was delivered" if np.any(stimuli.is_rest) else ""
-    electrodes = VectorData(
-        name="electrode_ids", description="electrodes on the array pulsed together", data=stimuli.electrodes[kept]
-    )
     table = [
-        VectorData(name="start_time", description="start of the pulse, s", data=stimuli.time_s),
+        _column("start_time", "start of the pulse, s", stimuli.time_s),
         # NWB requires an end; the pulse's length is not stored, and readers treat an empty interval as a mistake.
-        VectorData(name="stop_time", description="nominal: 1 us after start_time", data=stimuli.time_s + 1e-6),
-        VectorData(name="frequency_hz", description="stimulus frequency; NaN: unknown", data=stimuli.frequency_hz),
-        VectorData(name="pattern", description=f"stimulation pattern; -1: unknown{rests}", data=stimuli.pattern),
-        VectorData(name="presentation", description="trial that the pulse belongs to", data=stimuli.presentation),
+        _column("stop_time", "nominal: 1 us after start_time", stimuli.time_s + 1e-6),
+        _column("frequency_hz", "stimulus frequency; NaN: unknown", stimuli.frequency_hz),
+        _column("pattern", f"stimulation pattern; -1: unknown{rests}", stimuli.pattern),
+        _column("presentation", "trial that the pulse belongs to", stimuli.presentation),
     ]
-    if len(electrodes.data):
+    kept = stimuli.electrodes[columns < lengths[:, None]]
+    if len(kept):
         # A column without values is valid, but other programs fail on it.
-        index = VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths).astype(np.int64), target=electrodes)
-        table += [electrodes, index]
+        electrodes = _column("electrode_ids", "electrodes on the array pulsed together", kept)
+        table += [electrodes, VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths), target=electrodes)]
     return TimeIntervals(
         name="stimuli",
         description="Stimulation pulses, one row per pulse.",
@@ -167,31 +158,28 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
 
 def _recording_table(recording: Recording) -> DynamicTable:
     presentation = recording.presentation
-    cells: dict[str, tuple[object, str]] = {
-        "format_version": (FORMAT_VERSION, "version of the tables written by animat"),
-        "start_s": (float(recording.start_s), "start of the recording on its own clock, s"),
-        "duration_s": (float(recording.duration_s), "from start_s, s"),
-        "start_min": (float(recording.start_min), "start of the recording on the culture's clock, min"),
-        "sampling_rate_hz": (float(recording.sampling_rate_hz), "of the raw signal, Hz; NaN: unknown"),
-        "presentation_order": (presentation.order if presentation else "", "blocked or mixed; empty: unknown"),
-        "presentation_pulses": (presentation.pulses if presentation else 0, "pulses per trial; 0: unknown"),
-        "stimulus_electrode_columns": (recording.stimuli.electrodes.shape[1], "width of the padded electrode table"),
-    }
+    cells = [
+        ("format_version", "version of the tables written by animat", FORMAT_VERSION),
+        ("start_s", "start of the recording on its own clock, s", float(recording.start_s)),
+        ("duration_s", "from start_s, s", float(recording.duration_s)),
+        ("start_min", "start of the recording on the culture's clock, min", float(recording.start_min)),
+        ("sampling_rate_hz", "of the raw signal, Hz; NaN: unknown", float(recording.sampling_rate_hz)),
+        ("presentation_order", "blocked or mixed; empty: unknown", presentation.order if presentation else ""),
+        ("presentation_pulses", "pulses per trial; 0: unknown", presentation.pulses if presentation else 0),
+        ("stimulus_electrode_columns", "width of the padded electrode table", recording.stimuli.electrodes.shape[1]),
+    ]
     return DynamicTable(
         name="animat_recording",
         description="The scalars of the recording, one row.",
         id=np.arange(1),
-        columns=[VectorData(name=n, description=text, data=[value]) for n, (value, text) in cells.items()],
+        columns=[_column(name, description, [value]) for name, description, value in cells],
     )
 
 
 def _text(name: str, text: object) -> str:
+    """Text that HDF5 can hold."""
     text = str(text)
-    try:
-        encoded = text.encode("utf-8")
-    except UnicodeEncodeError:
-        encoded = b"\0"
-    if b"\0" in encoded:
+    if "\0" in text or any("\ud800" <= character <= "\udfff" for character in text):
         raise InvalidArgument(f"{name}: expected text without null characters or lone surrogates, got {text!r}")
     return text
 

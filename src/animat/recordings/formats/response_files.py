@@ -1,19 +1,7 @@
-"""Response tables in CSV and NPZ: a count or a rate per stimulus and channel, without spike times.
-
-    NAME_responses.csv[.gz]   wide: one line per stimulus; a column count_CHANNEL or rate_hz_CHANNEL for each channel
-                              long: one line per stimulus and channel; trial (or stimulus_time_s), channel, count or
-                              rate_hz
-                              both: stimulus columns as in a stimulus file, condition for pattern; window_start_ms,
-                              window_end_ms and start_min, the same in all lines
-    NAME.npz                  response_count or response_rate_hz (stimuli, channels); response_window_ms (2,);
-                              stimulus_... and channel_... as in an NPZ of spikes, all optional
-
-Lines are in order of presentation, or have times. In a long table, a stimulus and channel without a line count as 0.
-"""
+"""Response tables in CSV and NPZ: a count or a rate per stimulus and channel (see docs/recordings.md)."""
 
 from __future__ import annotations
 
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -23,43 +11,31 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
-from animat.recordings.findings import Finding, left_out_finding
+from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
 from animat.recordings.formats.npz import load_columns
-from animat.recordings.formats.text_table import TextTable, folded, read_header, read_text_table
+from animat.recordings.formats.text_table import TextTable, folded
 from animat.recordings.response_table import Kind, ResponseTable
 
 KINDS: tuple[Kind, ...] = ("count", "rate_hz")
 TABLE_COLUMNS = STIMULUS_COLUMNS | {"stimulus_pattern": (*STIMULUS_COLUMNS["stimulus_pattern"], "condition")}
 NPZ_KEYS = {f"response_{kind}": kind for kind in KINDS}
-_Read = tuple[
-    Float64[np.ndarray, "stimuli channels"],
-    Kind,
-    Column,
-    Int64[np.ndarray, " stimuli"],
-    Int64[np.ndarray, " lines"],
-    set[int],
-]
-"""Values, their kind, the channels, the first line of each stimulus, the stimulus of each line, the columns used."""
-WINDOW = ("window_start_ms", "window_end_ms")
+_Read = tuple[Float64[np.ndarray, "stimuli channels"], Kind, Column, Int64[np.ndarray, " lines"]]
+"""Values, their kind, the channels, and for each line the first line of its stimulus."""
 TRIAL = "trial"
 
 
-def is_response_csv(path: Path) -> bool:
-    """Whether a text file is a response table, by its header.
-
-    Raises:
-        InvalidFile: if it is not text.
-    """
-    names = {folded(name) for name in read_header(path)}
+def is_response_table(table: TextTable) -> bool:
+    """Whether text is a response table, by its header and the file's name."""
+    names, file_name = {folded(head) for head in table.header}, table.path.name.lower()
     # Spike files may have columns of counts and rates too.
-    if names & SPIKE_COLUMNS.keys() or path.name.lower().endswith(("_spikes.csv", "_spikes.csv.gz")):
+    if names & SPIKE_COLUMNS.keys() or file_name.endswith(("_spikes.csv", "_spikes.csv.gz")):
         return False
-    long = "channel" in names and bool(names & set(KINDS))
-    if path.name.lower().endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
+    if file_name.endswith(("_responses.csv", "_responses.csv.gz")) and not names & {"time", "time_s"}:
         # It is meant to be one, whatever it lacks.
         return True
-    return long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
+    is_long = "channel" in names and bool(names & set(KINDS))
+    return is_long or any(name.startswith(f"{kind}_") for name in names for kind in KINDS)
 
 
 def is_response_npz(path: Path) -> bool:
@@ -73,14 +49,13 @@ def is_response_npz(path: Path) -> bool:
     return any(f"{key}.npy" in names for key in NPZ_KEYS) and "spike_time_s.npy" not in names
 
 
-def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
+def read_response_npz(path: Path) -> ResponseTable:
     """Read a response table from a numpy archive; nothing in it is ever unpickled.
 
     Raises:
         InvalidFile: if the file is damaged, or holds both counts and rates.
         UnusableData: if an array is invalid.
     """
-    path = Path(path)
     arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms"))
     keys = [key for key in NPZ_KEYS if key in arrays]
     if len(keys) != 1:
@@ -98,42 +73,35 @@ def read_response_npz(path: str | os.PathLike[str]) -> ResponseTable:
     window = arrays.pop("response_window_ms", None)
     if window is not None and np.shape(window) != (2,):
         raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
-    findings = [left_out_finding("keys", left_out)] if left_out else []
-    labels = arrays.pop("channel_label", np.arange(values.shape[1]))
     window_ms = None if window is None else (float(window[0]), float(window[1]))
+    labels = arrays.pop("channel_label", np.arange(values.shape[1]))
     provenance = {"source": path.name, "format": "NPZ of responses"}
+    findings = left_out_findings("keys", left_out)
     return _table(values, NPZ_KEYS[keys[0]], labels, arrays, window_ms, provenance, findings)
 
 
-def read_response_csv(path: str | os.PathLike[str]) -> ResponseTable:
+def read_response_table(table: TextTable) -> ResponseTable:
     """Read a response table from text, wide or long.
 
     Raises:
-        InvalidFile: for text that cannot be read, with its line.
+        InvalidFile: for columns that are missing, or cells that are not numbers, with their line.
         UnusableData: if a column is invalid.
     """
-    table = read_text_table(Path(path))
     is_long = table.place(("channel",)) is not None
-    values, kind, labels, first, stimulus_of, used = _long(table) if is_long else _wide(table)
+    values, kind, labels, first_of = _long(table) if is_long else _wide(table)
     columns: dict[str, Any] = {}
     for name, names in TABLE_COLUMNS.items():
-        place = table.place(names)
-        if place is not None:
-            used.add(place)
-            columns[name] = _per_stimulus(table, place, name, first[stimulus_of])[first]
-    single = {name: _constant(table, name, used) for name in (*WINDOW, "start_min")}
-    start_ms, end_ms = single["window_start_ms"], single["window_end_ms"]
+        if (place := table.place(names)) is not None:
+            columns[name] = _per_stimulus(table, place, name, first_of)
+    start_ms, end_ms, start_min = (_constant(table, name) for name in ("window_start_ms", "window_end_ms", "start_min"))
     if (start_ms is None) != (end_ms is None):
         raise InvalidFile(f"{table.path}, line 1: expected window_start_ms and window_end_ms, or neither; got one")
-    if single["start_min"] is not None:
-        columns["start_min"] = single["start_min"]
-    left_out = [name for i, name in enumerate(table.header) if i not in used]
-    if left_out:
-        missing = [alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names]
-        table.findings.append(left_out_finding("columns", left_out, table.path.name, missing))
+    if start_min is not None:
+        columns["start_min"] = start_min
+    table.note_left_out([alias for name, names in TABLE_COLUMNS.items() if name not in columns for alias in names])
     window_ms = None if start_ms is None or end_ms is None else (start_ms, end_ms)
     provenance = {"source": table.path.name, "format": "CSV of responses"}
-    return _table(values, kind, labels, columns, window_ms, provenance, table.findings)
+    return _table(values, kind, labels, columns, window_ms, provenance, tuple(table.findings))
 
 
 def _wide(table: TextTable) -> _Read:
@@ -148,10 +116,10 @@ def _wide(table: TextTable) -> _Read:
     kind = kinds[0]
     labels = np.array([_label(table.header[i], kind) for i in places[kind]], dtype=np.str_)
     values = np.column_stack([table.numbers(i, table.header[i], required=True) for i in places[kind]])
-    trial = table.place((TRIAL,))
-    used = {*places[kind], *([] if trial is None else [trial])}
-    rows = np.arange(len(table.rows))
-    return values, kind, labels, rows, rows, used
+    table.used.update(places[kind])
+    # It is known, though nothing needs it.
+    table.place((TRIAL,))
+    return values, kind, labels, np.arange(len(table.rows))
 
 
 def _label(head: str, kind: Kind) -> str:
@@ -162,23 +130,20 @@ def _label(head: str, kind: Kind) -> str:
 def _long(table: TextTable) -> _Read:
     """Read a table with one line per stimulus and channel."""
     places = {kind: place for kind in KINDS if (place := table.place((kind,))) is not None}
-    trial = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"]))
-    if len(places) != 1 or trial is None:
+    trial, channel = table.place((TRIAL, *TABLE_COLUMNS["stimulus_time_s"])), table.place(("channel",))
+    if len(places) != 1 or trial is None or channel is None:
         raise InvalidFile(
             f"{table.path}, line 1: expected trial (or stimulus_time_s), channel, and count or rate_hz, found "
             + ", ".join(table.header[:12])
             + nearest(table, (TRIAL, *TABLE_COLUMNS["stimulus_time_s"], "channel", *KINDS))
         )
-    (kind, place), channel = next(iter(places.items())), table.place(("channel",))
-    assert channel is not None
+    ((kind, place),) = places.items()
     numbers = table.numbers(place, kind, required=True)
-    trials, first, row_of = np.unique(table.text(trial), return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty(len(trials), dtype=np.int64)
-    rank[order] = np.arange(len(trials))
+    _, first, trial_of = np.unique(table.text(trial), return_index=True, return_inverse=True)
+    first_of = first[trial_of]
+    trials, row_of = np.unique(first_of, return_inverse=True)
     labels, column_of = np.unique(table.text(channel), return_inverse=True)
-    stimulus_of = rank[row_of.reshape(-1)]
-    cells = stimulus_of * len(labels) + column_of.reshape(-1)
+    cells = row_of * len(labels) + column_of
     distinct, counts = np.unique(cells, return_counts=True)
     if np.any(counts > 1):
         again = int(np.flatnonzero(cells == distinct[counts > 1][0])[1])
@@ -188,33 +153,30 @@ def _long(table: TextTable) -> _Read:
     if missing := len(values) - len(distinct):
         message = f"{missing:,} of {len(values):,} pairs of a stimulus and a channel have no line and count as 0"
         table.findings.append(Finding("pairs-missing", "note", message, float(missing)))
-    used = {place, channel, trial}
-    return values.reshape(len(trials), len(labels)), kind, labels, first[order], stimulus_of, used
+    return values.reshape(len(trials), len(labels)), kind, labels, first_of
 
 
-def _per_stimulus(table: TextTable, place: int, name: str, first: Int64[np.ndarray, " lines"]) -> Column:
-    """A column that must be the same in all lines of a stimulus; `first` is the first line of each line's stimulus."""
+def _per_stimulus(table: TextTable, place: int, name: str, first_of: Int64[np.ndarray, " lines"]) -> Column:
+    """The value for each stimulus of a column that must be the same in all of its lines."""
     column = plain_column(table, place, name)
-    same = column == column[first]
+    first = column[first_of]
+    same = column == first
     if column.dtype.kind == "f":
-        same |= np.isnan(column) & np.isnan(column[first])
+        same |= np.isnan(column) & np.isnan(first)
     if not np.all(same):
         row = int(np.argwhere(~same)[0, 0])
-        cells, line = table.text(place), table.lines[first[row]]
-        expected = f"expected {cells[first[row]]!r} as in line {line}, of the same stimulus"
+        cells, line = table.text(place), table.lines[first_of[row]]
+        expected = f"expected {cells[first_of[row]]!r} as in line {line}, of the same stimulus"
         raise table.wrong(row, f"{name}: {expected}, got {cells[row]!r}")
-    return column
+    return column[np.unique(first_of)]
 
 
-def _constant(table: TextTable, name: str, used: set[int]) -> float | None:
+def _constant(table: TextTable, name: str) -> float | None:
     """The single number of a column, None if there is no such column."""
     place = table.place((name,))
-    if place is None:
+    if place is None or not table.rows:
         return None
-    used.add(place)
     values = table.numbers(place, name, required=True)
-    if not len(values):
-        return None
     if np.any(values != values[0]):
         row = int(np.flatnonzero(values != values[0])[0])
         raise table.wrong(
@@ -230,7 +192,7 @@ def _table(
     columns: dict[str, Any],
     window_ms: tuple[float, float] | None,
     provenance: dict[str, str],
-    findings: list[Finding],
+    findings: tuple[Finding, ...],
 ) -> ResponseTable:
     """The table, with stimuli and channels checked like plain columns."""
     has_times = "stimulus_time_s" in columns
@@ -240,8 +202,8 @@ def _table(
         raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
     if not has_times:
         order = "the table has no stimulus times: its rows are assumed to be in order of presentation"
-        findings = [Finding("stimulus-times-unknown", "note", order), *findings]
-    recording = plain.to_recording({}, tuple(findings))
+        findings = (Finding("stimulus-times-unknown", "note", order), *findings)
+    recording = plain.to_recording({}, findings)
     return ResponseTable(
         values=np.asarray(values, dtype=np.float64)[np.argsort(times, kind="stable")],
         kind=kind,

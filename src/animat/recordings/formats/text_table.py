@@ -1,8 +1,4 @@
-"""Reads text tables: a header line and one line per row, separated by commas, semicolons or tabs, gzipped or not.
-
-Headers may have capitals, spaces and brackets (`Time (s)` is `time_s`), and numbers may have decimal commas where they
-are unambiguous; both are reported. Errors name the file and the line.
-"""
+"""Reads text tables: a header line and one line per row, separated by commas, semicolons or tabs, gzipped or not."""
 
 from __future__ import annotations
 
@@ -20,10 +16,9 @@ from jaxtyping import Float64
 
 from animat.errors import InvalidFile
 from animat.plain_file import expect_plain_file
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, left_out_findings
 
 UNPACKED_BYTES, UNPACKED_RATIO = 2**22, 20
-LONGEST_HEADER = 2**20
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
 
@@ -36,6 +31,7 @@ class TextTable:
         header: the column names, unchanged from the file.
         rows: the cells, as many in each row as in the header.
         lines: the line of the file on which each row ends, counted from 1.
+        used: the columns that were looked up.
         findings: methods add to them.
     """
 
@@ -43,14 +39,11 @@ class TextTable:
     header: list[str]
     rows: list[list[str]]
     lines: list[int]
+    used: set[int] = field(default_factory=set)
     findings: list[Finding] = field(default_factory=list)
 
     def place(self, names: Sequence[str]) -> int | None:
-        """The column of the first of several names in the header, ignoring case; None if there is none.
-
-        Raises:
-            InvalidFile: if two columns have that name.
-        """
+        """The column of the first of several names in the header, as written or `folded`; None if there is none."""
         for name in names:
             columns = [i for i, head in enumerate(self.header) if head == name] or [
                 i for i, head in enumerate(self.header) if folded(head) == name
@@ -61,6 +54,7 @@ class TextTable:
             if columns:
                 if (head := self.header[columns[0]]) != name:
                     self._note_once("headers-read-as", f"{head!r} of {self.path.name} is read as {name}")
+                self.used.add(columns[0])
                 return columns[0]
         return None
 
@@ -69,18 +63,10 @@ class TextTable:
         return [row[column].strip() for row in self.rows]
 
     def numbers(self, column: int, name: str, *, required: bool = False) -> Float64[np.ndarray, " rows"]:
-        """The numbers of a column, NaN for an empty cell.
-
-        Args:
-            name: its name in errors.
-            required: whether each must be present and finite.
-
-        Raises:
-            InvalidFile: for a cell that is not a number, with its line.
-        """
+        """The numbers of a column that errors call `name`, NaN for an empty cell; if required, all must be finite."""
         cells = self.text(column)
         try:
-            values = np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+            values = as_numbers(cells)
         except ValueError:
             values = self._with_decimal_commas(cells, name)
         if required and not np.all(np.isfinite(values)):
@@ -104,7 +90,12 @@ class TextTable:
             row = commas[0] if commas else 0
             raise self.wrong(row, f"{name}: expected a number with a decimal point, got {cells[row]!r}")
         self._note_once("decimal-commas", f"{name} of {self.path.name} has decimal commas, read as points")
-        return np.array([cell.replace(",", ".") or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+        return as_numbers([cell.replace(",", ".") for cell in cells])
+
+    def note_left_out(self, missing: Sequence[str]) -> None:
+        """Add a finding on columns that were not looked up, which may be one of the missing, misspelt."""
+        left_out = [name for column, name in enumerate(self.header) if column not in self.used]
+        self.findings.extend(left_out_findings("columns", left_out, self.path.name, missing))
 
     def _note_once(self, name: str, message: str) -> None:
         if not any(finding.message == message for finding in self.findings):
@@ -162,23 +153,6 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
     return TextTable(path, header, rows, lines)
 
 
-def read_header(path: Path) -> list[str]:
-    """The column names of a file, unchanged.
-
-    Raises:
-        InvalidFile: if the file is missing, damaged or not text.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(LONGEST_HEADER)
-        if content.startswith(b"\x1f\x8b"):
-            content = zlib.decompressobj(wbits=31).decompress(content, LONGEST_HEADER)
-        line = content.lstrip(b"\r\n").partition(b"\n")[0].decode("utf-8-sig")
-    except (OSError, zlib.error, UnicodeDecodeError) as error:
-        raise InvalidFile(f"{path}: expected CSV (text in UTF-8), got something else ({error})") from error
-    return [name.strip().strip('"') for name in line.strip("\r").split(_separator(line))]
-
-
 def _separator(line: str) -> str:
     return max(",;\t", key=line.count)
 
@@ -186,6 +160,11 @@ def _separator(line: str) -> str:
 def folded(name: str) -> str:
     """A header in lower case, with underscores for spaces and without brackets: `Time (s)` is `time_s`."""
     return re.sub(r"[\s_\-]+", "_", re.sub(r"[()\[\]{}\"']", "", name).strip().casefold())
+
+
+def as_numbers(cells: Sequence[str]) -> Float64[np.ndarray, " cells"]:
+    """Cells as numbers, NaN for an empty one; raises ValueError for any other text."""
+    return np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
 
 
 def is_number(cell: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import replace
 from functools import partial
@@ -16,7 +15,14 @@ from jaxtyping import Float32, Int64
 from animat.errors import InvalidFile
 from animat.recordings.formats.cl1 import read_cl1
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
-from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, unavailable_filters
+from animat.recordings.formats.hdf5 import (
+    PLUGIN_ADVICE,
+    Hdf5File,
+    choose,
+    hdf5_file,
+    is_positive,
+    unavailable_filters,
+)
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
 from animat.recordings.raw import RawTraces, in_microvolts
@@ -39,32 +45,24 @@ def open_traces(
     Raises:
         InvalidFile: if the file holds no raw traces, or they are compressed by a filter that is not installed.
     """
-    path = Path(path)
-    with hdf5_file(path, "file of raw traces") as file:
+    with hdf5_file(Path(path)) as file:
         kind = format_of(file)
-        if kind is None:
-            raise InvalidFile(f"{path}: expected raw traces in MaxWell, CL1 or NWB, got another HDF5 file")
-    if kind == "MaxWell":
-        base = read_maxwell(path, part=part, stimuli=stimuli, spikes=False)
-        if len(base.stimuli) and any(finding.name == "clock-from-first-event" for finding in base.findings):
-            raise InvalidFile(
-                f"{path}: expected the first frame of the traces (frame_nos), which aligns them with stimuli, "
-                "found none"
-            )
-    elif kind == "CL1":
-        base = read_cl1(path, spikes=False)
-    else:
-        with hdf5_file(path, "NWB recording") as file:
-            base = read_foreign_nwb(file, stimuli, spikes=False)
-    with hdf5_file(path, "file of raw traces") as file:
         if kind == "MaxWell":
+            base = read_maxwell(file, part, stimuli, spikes=False)
+            if len(base.stimuli) and any(finding.name == "clock-from-first-event" for finding in base.findings):
+                raise InvalidFile(
+                    f"{path}: expected the first frame of the traces (frame_nos), which aligns them with stimuli, "
+                    "found none"
+                )
             traces = _maxwell(file, part, base)
         elif kind == "CL1":
+            base = read_cl1(file, spikes=False)
             traces = _traces(file, "samples", base, _number(file.attribute("/", "uV_per_sample_unit"), 0.195))
         else:
+            base = read_foreign_nwb(file, stimuli, spikes=False)
             traces = _nwb(file, part, base)
-    stop_s = max(base.stop_s, traces.start_s + traces.samples / traces.sampling_rate_hz)
     start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
+    stop_s = max(base.stop_s, traces.start_s + traces.samples / rate_hz)
     # Replaced together: stimuli lie within the new span, but perhaps not within the new start and the old duration.
     base = replace(
         base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s, duration_s=stop_s - start_s
@@ -74,22 +72,22 @@ def open_traces(
 
 def _maxwell(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     if is_old(file):
-        lsb = _number(file.first("settings/lsb"), OLD_LSB_V)
-        return _traces(file, "sig", base, 1e6 * lsb, channels_first=True, labels=np.arange(OLD_CHANNELS))
+        scale = 1e6 * _number(file.first("settings/lsb"), OLD_LSB_V)
+        return _traces(file, "sig", base, scale, channels_first=True, labels=np.arange(OLD_CHANNELS))
     recordings = parts(file)
     at = recordings[choose(f"{file.path}: part", "--part", recordings, part)]
-    groups = [g for g in file.names(f"{at}/groups") if file.has(f"{at}/groups/{g}/raw")]
+    groups = [f"{at}/groups/{g}" for g in file.names(f"{at}/groups") if file.has(f"{at}/groups/{g}/raw")]
     if not groups:
         raise InvalidFile(f"{file.path}: expected raw traces at /{at}/groups, found none: the rig kept spikes only")
     # Most groups are parts of another one; the one with the most channels has them all.
-    group = max(groups, key=lambda g: file.dataset(f"{at}/groups/{g}/raw").shape[0])
-    labels = file.read(f"{at}/groups/{group}/channels") if file.has(f"{at}/groups/{group}/channels") else None
-    ends = [e for g in groups if (e := file.ends(f"{at}/groups/{g}/frame_nos")) is not None]
-    own = file.ends(f"{at}/groups/{group}/frame_nos")
-    start_s = 0.0 if own is None else (own[0] - min(e[0] for e in ends)) / base.sampling_rate_hz
-    lsb = _number(file.first(f"{at}/settings/lsb"), OLD_LSB_V)
-    where = f"{at}/groups/{group}/raw"
-    return _traces(file, where, base, 1e6 * lsb, channels_first=True, start_s=start_s, labels=labels)
+    group = max(groups, key=lambda group: file.dataset(f"{group}/raw").shape[0])
+    labels = file.read(f"{group}/channels") if file.has(f"{group}/channels") else None
+    start_s = 0.0
+    if own := file.ends(f"{group}/frame_nos"):
+        earliest = min(ends[0] for g in groups if (ends := file.ends(f"{g}/frame_nos")))
+        start_s = (own[0] - earliest) / base.sampling_rate_hz
+    scale = 1e6 * _number(file.first(f"{at}/settings/lsb"), OLD_LSB_V)
+    return _traces(file, f"{group}/raw", base, scale, channels_first=True, start_s=start_s, labels=labels)
 
 
 def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
@@ -99,16 +97,18 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     if not series:
         raise InvalidFile(f"{path}: expected raw traces as an ElectricalSeries in /acquisition, found none")
     at = f"acquisition/{choose(f'{path}: series', '--part', series, part)}"
-    rate_hz = _number(file.attribute(f"{at}/starting_time", "rate"), math.nan)
-    if math.isnan(rate_hz):
+    rate_hz = file.attribute(f"{at}/starting_time", "rate")
+    if not is_positive(rate_hz):
         raise InvalidFile(f"{path}: expected the rate of /{at} in Hz at its starting_time, found none")
-    rows = file.read(f"{at}/electrodes").astype(np.int64) if file.has(f"{at}/electrodes") else None
     labels = None
-    if rows is not None and len(rows) and rows.max() < len(base.channels) and rows.min() >= 0:
-        labels = base.channels.label[rows]
-    scale = _number(file.attribute(f"{at}/data", "conversion"), 1.0)
+    if file.has(f"{at}/electrodes"):
+        rows = file.read(f"{at}/electrodes").astype(np.int64)
+        if len(rows) and rows.max() < len(base.channels) and rows.min() >= 0:
+            labels = base.channels.label[rows]
+    scale = 1e6 * _number(file.attribute(f"{at}/data", "conversion"), 1.0)
     start_s = float(file.first(f"{at}/starting_time") or 0.0)
-    return _traces(file, f"{at}/data", base, 1e6 * scale, rate_hz=rate_hz, start_s=start_s, labels=labels)
+    base = replace(base, sampling_rate_hz=float(rate_hz))
+    return _traces(file, f"{at}/data", base, scale, start_s=start_s, labels=labels)
 
 
 def _traces(
@@ -118,12 +118,11 @@ def _traces(
     uv_per_step: float,
     *,
     channels_first: bool = False,
-    rate_hz: float | None = None,
     start_s: float = 0.0,
     labels: Any = None,
 ) -> RawTraces:
     """Traces in a dataset, with those of the recording's channels that it holds; one label per row or column."""
-    path, rate_hz = file.path, base.sampling_rate_hz if rate_hz is None else rate_hz
+    path = file.path
     if not isinstance(file.node(where), h5py.Dataset):
         raise InvalidFile(f"{path}: expected raw traces at /{where}, found none")
     dataset = file.dataset(where)
@@ -131,34 +130,31 @@ def _traces(
         raise InvalidFile(
             f"{path}: expected traces of several channels at /{where}, got {dataset.shape} {dataset.dtype}"
         )
-    missing = unavailable_filters(dataset)
-    if missing:
+    if missing := unavailable_filters(dataset):
         raise InvalidFile(
             f"{path}: the raw traces at /{where} are compressed by {missing}, which is not installed: {PLUGIN_ADVICE}; "
             "spikes detected by the rig can be read without it"
         )
-    if not (np.isfinite(rate_hz) and rate_hz > 0):
-        raise InvalidFile(f"{path}: expected a sampling rate of the traces at /{where}, got {rate_hz:g}")
     samples, columns = dataset.shape[::-1] if channels_first else dataset.shape
-    names = np.arange(columns) if labels is None else np.asarray(labels)[:columns]
-    row_of = {str(label): row for row, label in enumerate(base.channels.label)}
-    if labels is None and len(base.channels) == columns:
-        rows = list(range(columns))
+    table = base.channels
+    if labels is None and len(table) == columns:
+        rows = np.arange(columns)
     else:
-        rows = [row_of.get(str(name), UNKNOWN) for name in names]
-    used = np.array([column for column, row in enumerate(rows) if row != UNKNOWN], dtype=np.int64)
-    if not len(used):
+        row_of = {str(label): row for row, label in enumerate(table.label)}
+        names = range(columns) if labels is None else labels[:columns]
+        rows = np.array([row_of.get(str(name), UNKNOWN) for name in names], dtype=np.int64)
+    used = np.flatnonzero(rows != UNKNOWN)
+    if len(used):
+        # If a channel occurs twice in the traces, its first column is used.
+        _, first = np.unique(rows[used], return_index=True)
+        used = used[np.sort(first)]
+        kept = rows[used]
+        channels = Channels(table.label[kept], table.electrode[kept], table.x_um[kept], table.y_um[kept])
+    else:
         used, nowhere = np.arange(columns), np.full(columns, np.nan)
         channels = Channels(used.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
-    else:
-        # If a channel occurs twice in the traces, its first column is used.
-        _, first = np.unique(np.array(rows)[used], return_index=True)
-        used = used[np.sort(first)]
-        kept = np.array(rows)[used]
-        table = base.channels
-        channels = Channels(table.label[kept], table.electrode[kept], table.x_um[kept], table.y_um[kept])
     read_uv = partial(read_dataset_uv, path, where, used, channels_first, uv_per_step)
-    return RawTraces(read_uv, channels, int(samples), float(rate_hz), start_s)
+    return RawTraces(read_uv, channels, int(samples), base.sampling_rate_hz, start_s)
 
 
 def read_dataset_uv(
@@ -180,7 +176,7 @@ def read_dataset_uv(
     Raises:
         InvalidFile: if the samples cannot be read.
     """
-    with hdf5_file(path, "file of raw traces") as file:
+    with hdf5_file(path) as file:
         dataset = file.dataset(where)
         piece = np.asarray(dataset[:, start:stop].T if channels_first else dataset[start:stop])
     if piece.shape[0] != stop - start:
@@ -191,4 +187,4 @@ def read_dataset_uv(
 
 
 def _number(value: Any, otherwise: float) -> float:
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) and value > 0 else otherwise
+    return float(value) if is_positive(value) else otherwise

@@ -1,8 +1,7 @@
 """Opens raw traces in any format that SpikeInterface reads, with the extra `animat[raw]`, which is imported on demand.
 
-The format is named by the user (`intan`, `openephys`, `mcsraw`, ...: SpikeInterface's `read_...` functions), never
-guessed: guessing would try many readers on an untrusted file. SpikeInterface's own saved objects are not read, as they
-name Python classes to load.
+The format is never guessed, which would try many readers on an untrusted file. SpikeInterface's own saved objects are
+not read, as they name Python classes to load.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from animat.recordings.columns import PlainColumns
 from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.raw import RawTraces, in_microvolts
-from animat.recordings.recording import Channels, Recording
+from animat.recordings.recording import Recording
 
 REFUSED = ("binary",)
 """Trace readers that need more than a file."""
@@ -49,12 +48,8 @@ def open_with_spikeinterface(
     read = _reader(reader)
     try:
         recording = read(path, **({"install_maxwell_plugin": False} if reader == "maxwell" else {}))
-        n = int(recording.get_num_channels())
         labels = np.array([str(name) for name in recording.get_channel_ids()], dtype=np.str_)
-        placed = recording.has_probe() if hasattr(recording, "has_probe") else False
-        xy_um = np.asarray(recording.get_channel_locations())[:, :2] if placed else np.full((n, 2), np.nan)
-        x_um, y_um = xy_um.astype(np.float64).T
-        channels = Channels(labels, np.full(n, -1), x_um, y_um)
+        xy_um = np.asarray(recording.get_channel_locations())[:, :2] if recording.has_probe() else None
         samples = int(recording.get_num_samples(segment_index=0))
         rate_hz = float(recording.get_sampling_frequency())
         duration_s = samples / rate_hz
@@ -85,7 +80,7 @@ def open_with_spikeinterface(
         )
 
     # Starts at 0 s, as the times of stimuli count from the start of the traces.
-    return RawTraces(read_uv, channels, samples, rate_hz), base
+    return RawTraces(read_uv, base.channels, samples, rate_hz), base
 
 
 def _reader(name: str) -> Callable[..., Any]:
