@@ -376,7 +376,7 @@ def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> 
         return next((f.message for f in recording.findings if f.name == "unsorted-spikes"), None)
 
     assert told([[0.1, 0.5, 0.9], [0.2, 0.4]]) is None
-    assert str(told([[0.1, 0.9, 0.5], [0.4, 0.2]])).startswith("2 of 5 spikes follow a later one in the file")
+    assert str(told([[0.1, 0.9, 0.5], [0.4, 0.2]])).startswith("spikes that follow a later one in the file: 2 of 5")
 
 
 def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False) -> Path:

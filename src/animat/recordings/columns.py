@@ -13,7 +13,7 @@ from animat.errors import UnusableData
 from animat.recordings.findings import Finding, merged
 from animat.recordings.gaps import late_start
 from animat.recordings.recording import Channels, Recording
-from animat.stimulation.protocol import Order, Presentation
+from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN, expect_times
 
@@ -87,9 +87,11 @@ class PlainColumns:
         stimulus_time_s, stimuli_in_time = _in_time("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
         channels, rows = self._channels(len(spike_time_s), noted)
         patterns, names = self._patterns(len(stimulus_time_s))
-        start_s, duration_s = self._span(spike_time_s, stimulus_time_s)
+        event_s = np.concatenate([spike_time_s, stimulus_time_s])
         if self.start_s is None:
             noted += late_start(spike_time_s, stimulus_time_s)
+        start_s = float(event_s.min(initial=0.0) if self.start_s is None else self.start_s)
+        stop_s = float(event_s.max(initial=start_s))
         stimuli = Stimuli(
             time_s=stimulus_time_s,
             frequency_hz=self._frequencies(len(stimulus_time_s))[stimuli_in_time],
@@ -97,6 +99,10 @@ class PlainColumns:
             electrodes=self._electrodes(len(stimulus_time_s))[stimuli_in_time],
             presentation=self._presentations(len(stimulus_time_s), stimuli_in_time, noted),
         )
+        presentation = None
+        if self.presentation_order is not None or self.presentation_pulses is not None:
+            pulses = 1 if self.presentation_pulses is None else self.presentation_pulses
+            presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
         return Recording(
             spike_times_s=spike_time_s,
             spike_channels=rows[spikes_in_time],
@@ -104,9 +110,9 @@ class PlainColumns:
             stimuli=stimuli,
             sampling_rate_hz=float(self.sampling_rate_hz),
             start_s=start_s,
-            duration_s=duration_s,
+            duration_s=_duration_s(start_s, stop_s) if self.duration_s is None else float(self.duration_s),
             start_min=float(self.start_min),
-            presentation=self._presentation(),
+            presentation=presentation,
             provenance={**provenance, **names},
             findings=merged(noted),
         )
@@ -212,24 +218,6 @@ class PlainColumns:
             )
         return np.arange(n)
 
-    def _presentation(self) -> Presentation | None:
-        if self.presentation_order is None:
-            if self.presentation_pulses is not None:
-                raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses")
-            return None
-        order: Order = self.presentation_order  # type: ignore[assignment]
-        return Presentation(order, 1 if self.presentation_pulses is None else self.presentation_pulses)
-
-    def _span(
-        self, spike_time_s: Float64[np.ndarray, " spikes"], stimulus_time_s: Float64[np.ndarray, " stimuli"]
-    ) -> tuple[float, float]:
-        """Start and duration in seconds, such that start + duration does not round to before the last event."""
-        events_s = [times[i] for times in (spike_time_s, stimulus_time_s) if len(times) for i in (0, -1)]
-        start_s = float(min([0.0, *events_s])) if self.start_s is None else float(self.start_s)
-        if self.duration_s is not None:
-            return start_s, float(self.duration_s)
-        return start_s, _duration_s(start_s, float(max([start_s, *events_s])))
-
 
 def with_start(recording: Recording, start_s: float) -> Recording:
     """The recording with a new start, reported as a finding if it differs, and the same end.
@@ -283,8 +271,7 @@ def count_out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
 
 def unsorted_finding(events: str, early: int, n: int) -> Finding:
     """The note on events that were out of order in their file."""
-    verbs = ("follows", "it was") if early == 1 else ("follow", "they were")
-    message = f"{early:,} of {n:,} {events} {verbs[0]} a later one in the file; {verbs[1]} sorted by time"
+    message = f"{events} that follow a later one in the file: {early:,} of {n:,}; they were sorted by time"
     return Finding(f"unsorted-{events}", "note", message, float(early))
 
 

@@ -1,9 +1,7 @@
 """Reads HDF5 files in a separate process, so that a damaged file cannot crash the program.
 
-The HDF5 library itself can crash, or loop for ever, on a few misplaced bytes (seen in three of 2,000 damaged files). So
-another Python process reads them, under limits on processor time and memory that the operating system enforces; if it
-dies, the file was damaged, and the next file gets a new process. It is started for the first file, in a few tenths of a
-second, and kept for later ones.
+The HDF5 library itself can crash, or loop for ever, on a few misplaced bytes (seen in three of 2,000 damaged files).
+The operating system limits the process's time and memory; it is kept for later files, until one kills it.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from animat.errors import some_of
 from animat.recordings.findings import Finding
 from animat.recordings.gaps import silences
 from animat.recordings.recording import Recording
@@ -128,10 +129,7 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     count = np.bincount(recording.spike_channels, minlength=n)
     if silent := int(np.count_nonzero(count == 0)):
         mostly = silent > MOSTLY_SILENT * n
-        message = f"{silent:,} of {n:,} channels " + (
-            "is silent; it counts" if silent == 1 else "are silent; they count"
-        )
-        message += " in rates per channel"
+        message = f"channels without a spike: {silent:,} of {n:,}; they count in rates per channel"
         message += ": route electrodes where the culture fires" if mostly else ""
         yield Finding("silent-channels", "warning" if mostly else "note", message, float(silent))
     fast = count > FAST_HZ * recording.duration_s if recording.duration_s > 0 else np.zeros(n, dtype=bool)
@@ -139,12 +137,9 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
     noisy = np.flatnonzero(fast | most)
     if len(noisy):
         share = float(count[noisy].sum() / n_spikes)
-        names = ", ".join(channels.label[noisy[:NAMED]]) + (", ..." if len(noisy) > NAMED else "")
-        one = ("fires", "has", "it carries", "its threshold", "it")
-        several = ("fire", "have", "they carry", "their threshold", "them")
-        fire, have, carry, threshold, them = one if len(noisy) == 1 else several
         message = (
-            f"{len(noisy):,} of {n:,} channels ({names}) {fire} as no neuron does and {have} {100 * share:.0f} % of "
-            f"all spikes: {carry} noise; raise {threshold} or leave {them} out of the routing"
+            f"channels that fire as no neuron does: {len(noisy):,} of {n:,} ({some_of(channels.label[noisy], NAMED)}), "
+            f"with {100 * share:.0f} % of all spikes, carry noise; raise their threshold or leave them out of the "
+            "routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

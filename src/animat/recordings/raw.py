@@ -16,15 +16,11 @@ TILE_SAMPLES, TILE_CHANNELS = 256, 64
 
 
 def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np.ndarray, "samples channels"]:
-    """Traces in microvolts, with each channel contiguous in memory, as filters need it.
-
-    Args:
-        steps: of any number type, in any layout, shape (samples, channels).
-    """
+    """Traces in microvolts, with each channel contiguous in memory, as filters need it."""
     samples, channels = steps.shape
     rows = np.empty((channels, samples), dtype=np.float32)
-    # In tiles: with 1,024 channels, successive samples of a column are 4 KB apart, for which caches have few places.
-    # This takes a quarter of the time for a second of 1,024 channels.
+    # In tiles, which takes a quarter of the time: successive samples of 1,024 channels are 4 KB apart, for which caches
+    # have few places.
     for first in range(0, channels, TILE_CHANNELS):
         block = slice(first, first + TILE_CHANNELS)
         for start in range(0, samples, TILE_SAMPLES):
@@ -64,10 +60,9 @@ class RawTraces:
         """Raw traces in memory.
 
         Args:
-            voltage_uv: shape (samples, channels), any number type.
+            voltage_uv: shape (samples, channels), any number type, in steps of `uv_per_step`.
             channels: one per column.
             start_s: time of the first sample.
-            uv_per_step: microvolts per step of `voltage_uv`.
 
         Raises:
             InvalidArgument: for a wrong shape.

@@ -23,7 +23,7 @@ from animat.recordings.formats.response_files import (
     read_response_npz,
     read_response_table,
 )
-from animat.recordings.formats.text_table import read_text_table
+from animat.recordings.formats.text_table import GZIP, read_text_table
 from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -41,7 +41,6 @@ OTHERS = {
     b"\x93NUMPY": "NPY, which holds one array; save several by name with numpy.savez",
 }
 """First bytes of files that are often mistaken for recordings, and what to do with them."""
-GZIP = b"\x1f\x8b"
 HDF5_NAMES = (".nwb", ".h5", ".hdf5")
 TEXT_NAMES = (".csv", ".csv.gz", ".tsv", ".txt")
 IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz", "*_responses.csv", "*_responses.csv.gz")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float64
 
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
@@ -68,24 +69,31 @@ def frequency_findings(stimuli: Stimuli, *, has_times: bool = True) -> Iterator[
         yield Finding(CONTRADICTED, "warning", message)
 
 
-def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
-    """A finding if all intervals are the same multiple of those of the stated frequencies."""
+def _multiples(stimuli: Stimuli) -> Iterator[dict[float, Float64[np.ndarray, " intervals"]]]:
+    """The intervals between stimuli as multiples of those of their stated frequency, for each frequency.
+
+    First as if a pulse's frequency were that of the interval before it, then as if it were that of the one after it.
+    """
     interval_s = np.diff(stimuli.time_s)
-    # A pulse's frequency may be that of the interval before it, or of the one after it.
     for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
         known = ~np.isnan(frequency_hz) & (interval_s > 0)
-        distinct = np.unique(frequency_hz[known])
-        if len(distinct) < 2 or distinct[-1] < APART * distinct[0]:
+        stated_hz = np.unique(frequency_hz[known]).tolist()
+        yield {hz: interval_s[known & (frequency_hz == hz)] * hz for hz in stated_hz}
+
+
+def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
+    """A finding if all intervals are the same multiple of those of the stated frequencies."""
+    for multiples_of in _multiples(stimuli):
+        if not multiples_of or max(multiples_of) < APART * min(multiples_of):
             continue
-        multiples = np.array([np.median(interval_s[known & (frequency_hz == f)] * f) for f in distinct])
-        multiple = float(np.median(multiples))
+        multiples = np.array([np.median(multiples) for multiples in multiples_of.values()])
+        multiple, lowest_hz = float(np.median(multiples)), min(multiples_of)
         if np.all(np.abs(multiples / multiple - 1) < AGREE) and not 1 / FAR < multiple < FAR:
-            example_s = float(np.median(interval_s[known & (frequency_hz == distinct[0])]))
             unit = _unit(multiple, sampling_rate_hz)
             message = (
-                f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those at {distinct[0]:g} Hz would be "
-                f"{example_s:g} s apart, not {1 / distinct[0]:g} s, and the others are off by the same factor of "
-                f"{_plain(multiple)}: "
+                f"stimulus times {'cannot' if unit else 'may not'} be in seconds: those at {lowest_hz:g} Hz would be "
+                f"{multiples[0] / lowest_hz:g} s apart, not {1 / lowest_hz:g} s, and the others are off by the same "
+                f"factor of {_plain(multiple)}: "
                 + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?")
             )
             return Finding(NAME, "refuse" if unit else "warning", message)
@@ -94,12 +102,9 @@ def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
 
 def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
     """A finding on stimuli that come sooner than their stated frequency allows."""
-    intervals_s, sooner = np.diff(stimuli.time_s), []
-    # A pulse's frequency may be that of the interval before it, or of the one after it.
-    for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
-        known = ~np.isnan(frequency_hz) & (intervals_s > 0)
-        of = {f: (intervals_s * f)[known & (frequency_hz == f)] for f in np.unique(frequency_hz[known])}
-        medians = [(float(np.median(m)), float(f)) for f, m in of.items() if len(m) >= ENOUGH_STIMULI]
+    sooner = []
+    for multiples_of in _multiples(stimuli):
+        medians = [(float(np.median(m)), hz) for hz, m in multiples_of.items() if len(m) >= ENOUGH_STIMULI]
         sooner.append(min(medians, default=(1.0, 0.0)))
     least, stated_hz = max(sooner)
     if least > 1 / APART:

@@ -19,12 +19,8 @@ def band_pass(
 ) -> Float32[np.ndarray, "channels samples"]:
     """Filter each row; do not use `MARGIN_S` at both ends.
 
-    The gain at frequency f is |H(f)|^2, H being a Butterworth band-pass of order 3: the result of filtering forwards
-    and backwards, without the two passes.
-
-    Args:
-        voltage_uv: one row per channel.
-        band_hz: frequencies at which |H|^2 is a half.
+    The gain at frequency f is |H(f)|^2, H being a Butterworth band-pass of order 3 whose |H|^2 is a half at the ends of
+    the band: the result of filtering forwards and backwards, without the two passes.
     """
     samples = voltage_uv.shape[1]
     length = fft.next_fast_len(samples, real=True)

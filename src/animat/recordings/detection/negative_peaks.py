@@ -1,5 +1,4 @@
-"""Finds spikes as negative peaks below a threshold and below their neighbourhood, and estimates the noise that sets
-thresholds."""
+"""Finds spikes as negative peaks, and estimates the noise that sets their threshold."""
 
 from __future__ import annotations
 
@@ -15,12 +14,7 @@ NORMAL = 0.6745
 def median_noise_uv(
     voltage_uv: Float32[np.ndarray, "channels samples"], is_blank: Bool[np.ndarray, "channels samples"] | None = None
 ) -> Float32[np.ndarray, " channels"]:
-    """Standard deviation of each channel's noise: median(|v - median(v)|) / 0.6745.
-
-    Args:
-        voltage_uv: filtered traces, one row per channel.
-        is_blank: samples that do not count.
-    """
+    """Standard deviation of each channel's noise, in filtered traces: median(|v - median(v)|) / 0.6745."""
     if is_blank is not None and is_blank.any():
         # A sample counts if no channel is blanked, if there are enough; a few long blanks do not shift a median.
         kept = ~is_blank.any(axis=0)
@@ -32,8 +26,7 @@ def median_noise_uv(
 
 
 def _median(values: Float32[np.ndarray, "rows values"]) -> Float32[np.ndarray, " rows"]:
-    """The median of each row, for an even number the upper of the two middle values: one partition, while numpy's
-    median does three and takes several times as long."""
+    """The (upper) median of each row by one partition; numpy's does three and takes several times as long."""
     middle = values.shape[1] // 2
     return np.asarray(np.partition(values, middle, axis=1)[:, middle], dtype=np.float32)
 
@@ -45,15 +38,10 @@ def find_negative_peaks(
     first: int,
     last: int,
 ) -> tuple[Int64[np.ndarray, " peaks"], Int64[np.ndarray, " peaks"]]:
-    """Rows and samples of the negative peaks.
+    """Rows and samples of the negative peaks from sample `first` on until `last`.
 
-    A sample t is a peak if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples; of equal ones, the first.
-
-    Args:
-        voltage_uv: filtered, one row per channel.
-        depth_uv: depth that a negative peak must exceed on each channel; infinite to find none.
-        apart: half the width of the neighbourhood, in samples, at least 1.
-        first, last: range of samples to search, excluding `last`.
+    A sample t is a peak if v(t) < -depth and v(t) <= v(s) for all s within `apart` samples, at least 1; of equal ones,
+    the first. A channel of infinite depth has none.
     """
     inner = voltage_uv[:, first:last]
     # The neighbourhood is checked for these few samples only.

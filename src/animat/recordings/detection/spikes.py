@@ -204,18 +204,15 @@ def _findings(
     yield Finding("noise", "note", f"noise: {middle:.2f} uV on the median of {n:,} channels; spikes are negative "
                   f"peaks of {settings.threshold:g} times their channel's noise and more", middle)  # fmt: skip
     if dead := int(np.count_nonzero(is_dead(noise_uv))):
-        are, them, count = ("is", "it", "it counts") if dead == 1 else ("are", "them", "they count")
         message = (
-            f"{dead:,} of {n:,} channels {are} dead (less than {DEAD:g} of the median noise): no spike can be detected "
-            f"on {them}, and {count} in rates per channel; leave {them} out of the routing next time"
+            f"dead channels (less than {DEAD:g} of the median noise): {dead:,} of {n:,}; no spike can be detected on "
+            "them, and they count in rates per channel; leave them out of the routing next time"
         )
         yield Finding("dead-channels", "note" if dead < 0.1 * n else "warning", message, float(dead))
-    noisy = int(np.count_nonzero(noise_uv > NOISY * middle)) if middle > 0 else 0
-    if noisy:
-        have = "has" if noisy == 1 else "have"
+    if middle > 0 and (noisy := int(np.count_nonzero(noise_uv > NOISY * middle))):
         message = (
-            f"{noisy:,} of {n:,} channels {have} more than {NOISY:g} times the median noise: "
-            "only large spikes are detected there; look for loose contacts or air bubbles"
+            f"noisy channels (more than {NOISY:g} times the median noise): {noisy:,} of {n:,}; only large spikes are "
+            "detected there; look for loose contacts or air bubbles"
         )
         yield Finding("noisy-channels", "note" if noisy < 0.1 * n else "warning", message, float(noisy))
     if n_stimuli:

@@ -1,11 +1,4 @@
-"""Reads spikes and stimuli of Cortical Labs CL1 recordings (H5).
-
-    /spikes(timestamp, channel), /stims(timestamp, channel)      frames from the start of the recording
-    attributes of /: frames_per_second, channel_count, duration_frames, start_timestamp, created_utc
-    /data_stream/animat_stimuli/{index(timestamp, start_index, end_index), data}      stimulus parameters from animat
-
-An entry of the data stream applies to the pulses from its timestamp on until the next.
-"""
+"""Reads spikes and stimuli of Cortical Labs CL1 recordings (H5), and the stimulus parameters that animat adds."""
 
 from __future__ import annotations
 
@@ -127,7 +120,10 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
 
 
 def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:
-    """The stimulus parameters from animat's data stream; electrodes are known from the stimuli themselves."""
+    """The parameters of stimuli from animat's data stream, each entry of which applies until the next.
+
+    Electrodes are known from the stimuli themselves.
+    """
     at = f"data_stream/{STIMULUS_STREAM}"
     if not len(stimulus) or not file.has(f"{at}/index") or not file.has(f"{at}/data"):
         return {}

@@ -22,7 +22,6 @@ SPARE_VALUES = 1_000_000
 """Values that any file may hold, however small it is; each one beyond them must take at least a byte."""
 LARGEST_VALUES = 200_000_000
 LARGEST_ITEM_BYTES = 2**16
-LARGEST_CHUNK_BYTES = 2**28
 DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError, AttributeError)
 """Errors that h5py and numpy raise on damaged files."""
 
@@ -72,11 +71,6 @@ class Hdf5File:
         node = self.node(where)
         return sorted(node) if isinstance(node, h5py.Group) else []
 
-    @property
-    def root_names(self) -> str:
-        """The first names at the root, for messages."""
-        return some_of(self.names("/"), 5) or "nothing"
-
     def has(self, where: str) -> bool:
         """Whether there is a group or dataset at a path."""
         return self.node(where) is not None
@@ -97,11 +91,6 @@ class Hdf5File:
                 f"{self.path}: expected the values of {where} in the file itself, but they are in other files, which "
                 "are never opened; copy all data into one file"
             )
-        chunk = node.chunks
-        if node.dtype.itemsize > LARGEST_ITEM_BYTES or (
-            chunk is not None and math.prod(chunk) * max(node.dtype.itemsize, 1) > LARGEST_CHUNK_BYTES
-        ):
-            raise InvalidFile(f"{self.path}: {where} is stored in chunks of an absurd size: the file is damaged")
         return node
 
     def read(self, where: str, field: str | None = None) -> Column:
@@ -116,7 +105,14 @@ class Hdf5File:
         text = h5py.check_string_dtype(dtype) is not None
         if not text and (dtype.kind not in "iufb" or dtype.shape):
             raise InvalidFile(f"{self.path}: expected numbers or text at {name}, got {dtype}")
-        self._check_size(name, dataset, dtype)
+        n_values = math.prod(dataset.shape)
+        filtered = dataset.id.get_create_plist().get_nfilters() > 0
+        possible = SPARE_VALUES + (self._bytes if filtered else self._bytes // max(dtype.itemsize, 1))
+        if n_values > min(possible, LARGEST_VALUES) or n_values * dtype.itemsize > 8 * LARGEST_VALUES:
+            raise InvalidFile(
+                f"{self.path}: {name} claims {n_values:,} values, more than a file of {self._bytes:,} bytes can hold: "
+                "it is damaged, or not a recording"
+            )
         if missing := unavailable_filters(dataset):
             raise InvalidFile(f"{self.path}: {name} is compressed by {missing}: {PLUGIN_ADVICE}")
         values = np.asarray(dataset[()] if field is None else dataset.fields(field)[()])
@@ -158,21 +154,9 @@ class Hdf5File:
         """How many values each row of a ragged column of NWB has; refuses an index that does not divide them."""
         ends = self.read(f"{where}_index").astype(np.int64).reshape(-1)
         lengths = np.diff(ends, prepend=0)
-        if np.any(lengths < 0) or (int(ends[-1]) if len(ends) else 0) != n_values:
+        if np.any(lengths < 0) or lengths.sum() != n_values:
             raise InvalidFile(f"{self.path}: /{where}_index does not divide the {n_values:,} values of it: damaged")
         return lengths
-
-    def _check_size(self, name: str, dataset: h5py.Dataset, dtype: np.dtype[Any]) -> None:
-        if dataset.shape is None:
-            raise InvalidFile(f"{self.path}: expected values at {name}, got an empty dataspace")
-        values = math.prod(dataset.shape)
-        filtered = dataset.id.get_create_plist().get_nfilters() > 0
-        possible = SPARE_VALUES + (self._bytes if filtered else self._bytes // max(dtype.itemsize, 1))
-        if values > min(possible, LARGEST_VALUES) or values * dtype.itemsize > 8 * LARGEST_VALUES:
-            raise InvalidFile(
-                f"{self.path}: {name} claims {values:,} values, more than a file of {self._bytes:,} bytes can hold: "
-                "it is damaged, or not a recording"
-            )
 
 
 PLUGIN_ADVICE = "install the filter's plugin (MaxWell's comes with MaxLab Live) and set HDF5_PLUGIN_PATH to its folder"
@@ -212,7 +196,7 @@ def hdf5_file(path: Path) -> Iterator[Hdf5File]:
 def first_line(error: BaseException) -> str:
     """The first line of an error's message, or its type if it has none."""
     line = str(error).strip().partition("\n")[0]
-    return (line if line.isprintable() else "".join(c for c in line if c.isprintable()))[:200] or type(error).__name__
+    return "".join(filter(str.isprintable, line))[:200] or type(error).__name__
 
 
 def is_positive(value: Any) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, some_of
 from animat.recordings.formats.cl1 import is_cl1, read_cl1
 from animat.recordings.formats.hdf5 import Hdf5File, hdf5_file
 from animat.recordings.formats.maxwell import is_maxwell, read_maxwell
@@ -22,8 +22,8 @@ def format_of(file: Hdf5File) -> Literal["NWB", "MaxWell", "CL1"]:
     if is_cl1(file):
         return "CL1"
     raise InvalidFile(
-        f"{file.path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: {file.root_names}); save its "
-        "columns as NPZ or CSV"
+        f"{file.path}: expected NWB, MaxWell or CL1, got another HDF5 file (it holds: "
+        f"{some_of(file.names('/'), 5) or 'nothing'}); save its columns as NPZ or CSV"
     )
 
 

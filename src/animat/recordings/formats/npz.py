@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -40,12 +40,11 @@ def read_npz(path: Path) -> Recording:
         InvalidFile: if the file is missing, damaged, holds pickled objects, or lacks a required key.
         UnusableData: if a column is invalid.
     """
-    columns, routing, left_out = load_columns(path)
+    columns, keys, left_out = load_columns(path, (*KEYS, *ROUTING))
     if missing := [key for key in REQUIRED if key not in columns]:
-        keys = [*columns, *routing, *left_out]
         if any(key.startswith("state_") for key in keys):
             raise InvalidFile(f"{path}: expected a recording, got the state of a virtual culture")
-        counts = [key for key in keys if "spike" in key and key not in KEYS]
+        counts = [key for key in left_out if "spike" in key]
         if counts and "spike_time_s" in missing and "stimulus_time_s" in missing:
             raise InvalidFile(
                 f"{path}: expected times of spikes and of stimuli (spike_time_s, spike_channel, stimulus_time_s), "
@@ -57,42 +56,35 @@ def read_npz(path: Path) -> Recording:
             f"{some_of(keys, 12) or 'none'}" + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
         )
     provenance = {"source": path.name, "format": "NPZ"}
-    if columns.pop("sorted_units", False):
+    if "spike_unit" in keys:
         provenance["channels"] = "sorted units"
+    routing = [columns.pop(key) for key in ROUTING if key in columns]
     if "channel_xy_um" in columns and "channel_electrode" not in columns and len(routing) == len(ROUTING):
-        columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing.values())
+        columns["channel_electrode"] = _electrodes_at(columns["channel_xy_um"], *routing)
         provenance["channel_electrode"] = "by position, from mapping_electrode and mapping_xy_um"
     findings = left_out_findings("keys", left_out, missing=[key for key in KEYS if key not in columns])
     return PlainColumns(**columns).to_recording(provenance, findings)
 
 
-def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Column], list[str]]:
-    """The contents of an archive: values under our names, the array's routing, and the keys that were left out.
-
-    Keys in `others` are known in addition to those of a recording.
-    """
+def load_columns(path: Path, known: Iterable[str]) -> tuple[dict[str, Any], list[str], list[str]]:
+    """The known columns of an archive under our names, all of its keys, and those that were left out."""
     columns: dict[str, Any] = {}
-    routing: dict[str, Column] = {}
     left_out = []
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             _check_size(path, archive.zip)
             if SPREADSHEET in archive.zip.namelist():
                 raise InvalidFile(f"{path}: expected NPZ, got a spreadsheet; save its tables as CSV")
-            for key in archive.files:
+            keys = archive.files
+            for key in keys:
                 name = OTHER_NAMES.get(key, key)
                 if name in columns:
                     raise InvalidFile(f"{path}: expected {name} once, got it under two names (one is {key})")
-                if name in SINGLE:
-                    columns[name] = _single(f"{path}: {key}", name, _array(archive, key))
-                elif name in KEYS or key in others:
-                    columns[name] = _array(archive, key)
-                elif key in ROUTING:
-                    routing[key] = archive[key]
+                if name in known:
+                    array = _array(archive, key)
+                    columns[name] = _single(f"{path}: {key}", name, array) if name in SINGLE else array
                 else:
                     left_out.append(key)
-            if "spike_unit" in archive.files:
-                columns["sorted_units"] = True
     except FileNotFoundError as error:
         raise InvalidFile(f"{path}: no such file") from error
     except ValueError as error:
@@ -105,7 +97,7 @@ def load_columns(path: Path, others: tuple[str, ...] = ()) -> tuple[dict[str, An
             f"{path}: expected a complete NPZ archive, but it is cut off or damaged ({first_line(error)}); "
             "copy or save it again"
         ) from error
-    return columns, {key: routing[key] for key in ROUTING if key in routing}, left_out
+    return columns, keys, left_out
 
 
 def _check_size(path: Path, archive: zipfile.ZipFile) -> None:

@@ -76,8 +76,7 @@ def write_nwb(
             f"got {first_s:g} to {last_s:g} s"
         )
     tree = nwb_file(recording, of_channels)
-    with atomic_write(path) as temporary, temporary.open("r+b", buffering=0) as raw:
-        disk = _Disk(raw)
+    with atomic_write(path) as temporary, _Disk(temporary, "r+") as disk:
         try:
             with h5py.File(disk, "w") as file, NWBHDF5IO(file=file, mode="w", manager=BuildManager(_types())) as nwb_io:
                 nwb_io.write(tree)
@@ -103,34 +102,23 @@ def recording_name(start_min: float) -> str:
     return f"recording_{format(start_min, 'g').zfill(4)}_min.nwb"
 
 
-class _Disk(io.RawIOBase):
+class _Disk(io.FileIO):
     """A file that accepts every write and remembers the first error, as HDF5 does not recover from a full disk."""
 
-    def __init__(self, file: io.FileIO) -> None:
-        self.error: OSError | None = None
-        self._file = file
-
-    def readinto(self, buffer: Any) -> int:
-        return self._file.readinto(buffer) or 0
+    error: OSError | None = None
 
     def write(self, data: Any) -> int:
         left = memoryview(data)
         try:
             while left and self.error is None:
-                left = left[self._file.write(left) :]
+                left = left[super().write(left) :]
         except OSError as error:
             self.error = error
         return len(data)
 
-    def seek(self, place: int, whence: int = os.SEEK_SET) -> int:
-        return self._file.seek(place, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
     def truncate(self, size: int | None = None) -> int:
         try:
-            return self._file.truncate(size)
+            return super().truncate(size)
         except OSError as error:
             self.error = self.error or error
             return size or 0

@@ -17,11 +17,7 @@ _COUNTED_AT_ONCE = 2**14
 
 
 class SpikeCounts:
-    """Counts the spikes of each channel incrementally.
-
-    Args:
-        channels: the number of channels.
-    """
+    """Counts the spikes of each of some channels incrementally."""
 
     def __init__(self, channels: int) -> None:
         self._counts = np.zeros(channels, np.int64)
@@ -30,11 +26,7 @@ class SpikeCounts:
         self._n_waiting = 0
 
     def add(self, times_s: Float64[np.ndarray, " spikes"], channel: Int[np.ndarray, " spikes"]) -> None:
-        """Add spikes to the counts.
-
-        Raises:
-            UnusableData: for a time that is not finite or an unknown channel, possibly from an earlier call.
-        """
+        """Add spikes; refuses times that are not finite and unknown channels, in this call or a later one."""
         if len(times_s):
             self._waiting.append((times_s, channel))
             self._n_waiting += len(times_s)
@@ -72,10 +64,7 @@ class SpikeCounts:
 def write_spikes(dataset: h5py.Dataset, blocks: Iterable[SpikeBlock], counts: Int64[np.ndarray, " channels"]) -> None:
     """Write spike times channel by channel, in ascending order within a channel.
 
-    Args:
-        dataset: of floats, as many as there are spikes, contiguous in the file.
-        blocks: all spikes, in any order.
-        counts: spikes of each channel.
+    `dataset` is contiguous in the file and has as many floats as `counts` counts spikes, in any order in `blocks`.
     """
     ends = np.cumsum(counts)
     place, newest_s = ends - counts, np.full(len(ends), -np.inf)

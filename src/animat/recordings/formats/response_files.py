@@ -13,7 +13,7 @@ from animat.errors import InvalidFile, UnusableData
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
-from animat.recordings.formats.npz import load_columns
+from animat.recordings.formats.npz import KEYS, load_columns
 from animat.recordings.formats.text_table import TextTable, folded
 from animat.recordings.response_table import Kind, ResponseTable
 
@@ -56,7 +56,8 @@ def read_response_npz(path: Path) -> ResponseTable:
         InvalidFile: if the file is damaged, or holds both counts and rates.
         UnusableData: if an array is invalid.
     """
-    arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms"))
+    of_stimuli = (key for key in KEYS if not key.startswith("spike_"))
+    arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms", *of_stimuli))
     keys = [key for key in NPZ_KEYS if key in arrays]
     if len(keys) != 1:
         raise InvalidFile(f"{path}: expected one of {' or '.join(NPZ_KEYS)}, got {' and '.join(keys) or 'neither'}")

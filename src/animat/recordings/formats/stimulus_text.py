@@ -1,12 +1,8 @@
 """Parses the text that accompanies a stimulus in a rig's file, in which animat's drivers store its parameters.
 
-A rig's own file holds when a pulse was and perhaps where, but not its frequency or trial. animat writes one JSON object
-per pulse (MaxWell: the event's message; CL1: an entry of the data stream `animat_stimuli`), of which every key is
-optional:
-
     {"frequency_hz": 20, "pattern": 3, "presentation": 17, "electrodes": [909, 23923], "order": "mixed", "pulses": 5}
 
-Text such as `frequency 20 electrode 909` or `frequency_hz=20` from other programs is parsed for the same names.
+Every key is optional. Text of other programs is parsed for the same names: `frequency 20 electrode 909`.
 """
 
 from __future__ import annotations

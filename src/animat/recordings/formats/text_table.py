@@ -18,6 +18,7 @@ from animat.errors import InvalidFile
 from animat.plain_file import expect_plain_file
 from animat.recordings.findings import Finding, left_out_findings
 
+GZIP = b"\x1f\x8b"
 UNPACKED_BYTES, UNPACKED_RATIO = 2**22, 20
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
@@ -103,10 +104,9 @@ class TextTable:
 
 
 def read_text_table(path: Path, bare: str | None = None) -> TextTable:
-    """Read a text table.
+    """Read a text table in UTF-8, gzipped or not.
 
     Args:
-        path: the file, in UTF-8, gzipped or not.
         bare: name of the only column of a file without a header; None: a header is required.
 
     Raises:
@@ -114,8 +114,7 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
             header.
     """
     text = _text(path)
-    first_line = text.lstrip("\r\n").partition("\n")[0]
-    separator = _separator(first_line)
+    separator = max(",;\t", key=text.lstrip("\r\n").partition("\n")[0].count)
     reader = csv.reader(io.StringIO(text), delimiter=separator)
     rows, lines, first, after = [], [], 1, 1
     try:
@@ -153,10 +152,6 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
     return TextTable(path, header, rows, lines)
 
 
-def _separator(line: str) -> str:
-    return max(",;\t", key=line.count)
-
-
 def folded(name: str) -> str:
     """A header in lower case, with underscores for spaces and without brackets: `Time (s)` is `time_s`."""
     return re.sub(r"[\s_\-]+", "_", re.sub(r"[()\[\]{}\"']", "", name).strip().casefold())
@@ -185,8 +180,14 @@ def _advice(row: list[str], separator: str) -> str:
 def _text(path: Path) -> str:
     try:
         content = expect_plain_file(path).read_bytes()
-        if content[:2] == b"\x1f\x8b":
-            content = _unpacked(path, content)
+        if content.startswith(GZIP):
+            limit = UNPACKED_BYTES + UNPACKED_RATIO * len(content)
+            with gzip.open(io.BytesIO(content)) as packed:
+                content = packed.read(limit + 1)
+            if len(content) > limit:
+                raise InvalidFile(
+                    f"{path}: unpacks to more than {limit:,} bytes, more than text of its size: it is damaged"
+                )
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InvalidFile(
@@ -196,13 +197,3 @@ def _text(path: Path) -> str:
         raise InvalidFile(
             f"{path}: expected a complete file, but it cannot be read or is cut off ({error}); copy it again"
         ) from error
-
-
-def _unpacked(path: Path, content: bytes) -> bytes:
-    """The contents of a gzipped file, unless they are far more than text of its size can hold."""
-    limit = UNPACKED_BYTES + UNPACKED_RATIO * len(content)
-    with gzip.open(io.BytesIO(content)) as packed:
-        unpacked = packed.read(limit + 1)
-    if len(unpacked) > limit:
-        raise InvalidFile(f"{path}: unpacks to more than {limit:,} bytes, more than text of its size: it is damaged")
-    return unpacked

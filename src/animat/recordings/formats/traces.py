@@ -166,15 +166,9 @@ def read_dataset_uv(
     start: int,
     stop: int,
 ) -> Float32[np.ndarray, "samples channels"]:
-    """The voltage of samples `start` to `stop` in an HDF5 dataset of numbers.
+    """The voltage of samples `start` to `stop` in an HDF5 dataset, some columns of it in the order of the channels.
 
-    Args:
-        path, where: of the dataset, whose values must be in the file itself.
-        columns: of the dataset, in the order of the channels.
-        channels_first: whether the dataset is (channels, samples) instead of (samples, channels).
-
-    Raises:
-        InvalidFile: if the samples cannot be read.
+    The dataset is (samples, channels), or the reverse if `channels_first`.
     """
     with hdf5_file(path) as file:
         dataset = file.dataset(where)
