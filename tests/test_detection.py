@@ -470,7 +470,7 @@ def test_raw_traces_of_a_maxwell_file(tmp_path: Path) -> None:
     assert "5 x median noise" in recording.provenance["spikes"]
     with h5py.File(path, "r+") as file:
         del file["wells/well000/rec0000/groups/routed/frame_nos"]
-    with pytest.raises(InvalidFile, match="which aligns them with stimuli, found none"):
+    with pytest.raises(InvalidFile, match="frame_nos, which align the traces with stimuli, found none"):
         read_traces(path, Detection())
     with h5py.File(path, "r+") as file:
         del file["wells/well000/rec0000/events"]

@@ -1,7 +1,4 @@
-"""JAX for modules that must be importable without it: it is imported on first use.
-
-`Array` and `Axes` are for annotations only.
-"""
+"""JAX for modules that must be importable without it, imported on first use; `Array` and `Axes` are annotations."""
 
 from __future__ import annotations
 

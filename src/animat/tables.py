@@ -25,11 +25,9 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
     length = None
     for attribute, dtype in dtypes.items():
         array = read_only(table, attribute, dtype)
-        if array.ndim == 0 or (length is not None and len(array) != length):
-            raise UnusableData(
-                f"{attribute}: expected {length if length is not None else 'a column of'} values in {name}, "
-                f"got shape {array.shape}"
-            )
+        if array.ndim == 0 or length not in (None, len(array)):
+            expected = "a column of" if length is None else length
+            raise UnusableData(f"{attribute}: expected {expected} values in {name}, got shape {array.shape}")
         length = len(array)
 
 
@@ -66,9 +64,8 @@ def expect_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:
         raise UnusableData(f"{name}: expected finite times in seconds, got {bad} of {len(times_s)} NaN or infinite")
     far = np.abs(times_s) > CENTURY_S
     if np.any(far):
-        raise UnusableData(
-            f"{name}: expected times in seconds, within a century, got {times_s[far][0]:g}; are they in seconds?"
-        )
+        got = times_s[far][0]
+        raise UnusableData(f"{name}: expected times in seconds, within a century, got {got:g}; are they in seconds?")
 
 
 def expect_rising_times(name: str, times_s: Float64[np.ndarray, " times"]) -> None:

@@ -132,10 +132,7 @@ class PlainColumns:
                 lengths[name] = len(column)
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
-            message = (
-                f"no channel table: the {len(fired):,} channels that fired are assumed to be all; silent ones are not "
-                "known, so rates per channel may be too high"
-            )
+            message = f"no channel table: the {len(fired):,} that fired count as all; rates per channel may be too high"
             noted.append(Finding("silent-channels-unknown", "warning", message, float(len(fired))))
             return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
         if len(set(lengths.values())) > 1:
@@ -185,9 +182,7 @@ class PlainColumns:
         if electrodes.ndim == 1:
             electrodes = electrodes[:, None]
         if electrodes.ndim != 2 or len(electrodes) != n:
-            raise UnusableData(
-                f"stimulus_electrodes: expected shape ({n}, electrodes), padded with -1, got {electrodes.shape}"
-            )
+            raise UnusableData(f"stimulus_electrodes: expected ({n}, electrodes), padded, got {electrodes.shape}")
         whole = _whole("stimulus_electrodes", electrodes)
         if whole.min(initial=UNKNOWN) < NOTHING:
             raise UnusableData(
@@ -206,16 +201,11 @@ class PlainColumns:
             # `Stimuli` refuses numbers that fall.
             if not np.any(unknown) or np.any(np.diff(presentations[~unknown]) < 0):
                 return presentations
-            message = (
-                f"{unknown.sum():,} of {n:,} stimuli have no trial number (-1): each of them is treated as one trial"
-            )
+            message = f"{unknown.sum():,} of {n:,} stimuli have no trial number (-1): each is treated as one trial"
             noted.append(Finding("trials-unknown", "note", message, float(unknown.sum())))
             return np.cumsum(np.append(True, np.diff(presentations) != 0) | unknown) - 1
-        if self.presentation_pulses is not None and self.presentation_pulses > 1 and n:
-            raise UnusableData(
-                f"stimulus_presentation: required to know which {self.presentation_pulses} pulses belong to one trial, "
-                "but missing"
-            )
+        if (pulses := self.presentation_pulses or 1) > 1 and n:
+            raise UnusableData(f"stimulus_presentation: required to know which {pulses} pulses are one trial, got none")
         return np.arange(n)
 
 

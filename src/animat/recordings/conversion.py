@@ -109,7 +109,7 @@ def convert_recording(
     start_s: float | None = None,
     progress: Progress | None = None,
 ) -> Recording:
-    """Read a recording in any format and write it as NWB.
+    """Read a recording in any format and write it as NWB; returns what was written.
 
     Args:
         out: the NWB file, complete or absent.
@@ -117,9 +117,6 @@ def convert_recording(
         reader: SpikeInterface's name of the format; spikes are then detected in its traces.
         stimuli_path, stimuli, part, start_min, start_s: as in `read_recording`.
         progress: of spike detection.
-
-    Returns:
-        The recording that was written.
 
     Raises:
         InvalidFile: if the file cannot be read, or the new one cannot be written.
@@ -172,9 +169,7 @@ def _without_zone(recording: Recording) -> Iterator[Finding]:
     except ValueError:
         return
     if is_without and all(finding.name != "zone-unknown" for finding in recording.findings):
-        message = (
-            f"recorded_at {recorded_at} has no time zone and is taken as UTC; add one after the time, such as +09:00"
-        )
+        message = f"recorded_at {recorded_at} has no time zone and is taken as UTC; add one, such as +09:00"
         yield Finding("zone-unknown", "note", message)
 
 

@@ -11,8 +11,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 
 TIMES = 10.0
-"""A gap must be this many times as long as the next shorter one. Of n similar gaps, the first is so by chance once in
-n^10 / 10! cases."""
+"""A gap must be so many times as long as the next shorter one: the first of n similar ones is in n^10 / 10! cases."""
 LATE_SHARE, LATE_SPIKES = 0.1, 20
 """Smallest share of the recording, as less hardly changes rates; and fewest spikes, as fewer are not conclusive."""
 SILENT_SHARES, SILENT_S, SILENT_SPIKES = (0.01, 0.5), 1.0, 1000
@@ -24,21 +23,16 @@ SILENCES = 5
 def late_start(
     spike_time_s: Float64[np.ndarray, " spikes"], stimulus_time_s: Float64[np.ndarray, " stimuli"]
 ) -> Iterator[Finding]:
-    """A finding if a recording with an unknown start, assumed to be 0, has its first event much later.
-
-    Args:
-        spike_time_s, stimulus_time_s: in ascending order.
-    """
+    """A finding if a recording with an unknown start, assumed to be 0, has its first event much later."""
     event_s = np.sort(np.concatenate([spike_time_s, stimulus_time_s]))
     if len(spike_time_s) < LATE_SPIKES:
         return
     first_s, last_s, longest_s = float(event_s[0]), float(event_s[-1]), float(np.diff(event_s).max())
     if first_s > max(TIMES * longest_s, LATE_SHARE * last_s):
         message = (
-            f"the recording does not state its start, which is assumed to be 0 s, but the first event is at "
-            f"{first_s:.12g} s and later events are at most {longest_s:.3g} s apart: if it starts near the first, "
-            "rates are too low and bursts are found where there are none; state the start "
-            "(animat convert --start-s, start_s in NPZ)"
+            f"the start is not stated and assumed to be 0 s, but the first event is at {first_s:.12g} s and later ones "
+            f"are at most {longest_s:.3g} s apart: if it starts near the first, rates are too low and bursts are found "
+            "where there are none; state the start (animat convert --start-s, start_s in NPZ)"
         )
         yield Finding("start-unknown", "warning", message, first_s)
 

@@ -35,8 +35,7 @@ def read_hdf5_in_subprocess(path: Path, *, part: str | None = None, stimuli: str
     """Read a recording as `animat.recordings.formats.hdf5_formats.read_hdf5` does, in the separate process.
 
     Raises:
-        InvalidFile: as there; also if the HDF5 library crashes on the file, or exceeds its limits on time or memory.
-        InvalidArgument: as there.
+        InvalidFile: also if the HDF5 library crashes on the file, or exceeds its limits on time or memory.
     """
     # Messages name the path as it was given, so the folder that it is relative to is passed too.
     call = pickle.dumps((_read, (Path.cwd(), path, part, stimuli), {}))

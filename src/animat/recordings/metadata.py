@@ -19,13 +19,9 @@ def to_metadata(recording: Recording) -> dict[str, str]:
     """
     metadata = dict(recording.provenance)
     if reserved := [key for key in metadata if key == "protocol" or _is_finding(key)]:
-        raise InvalidArgument(
-            f"provenance: expected other keys than those of protocol and findings in a file, got {reserved[0]!r}"
-        )
+        raise InvalidArgument(f"provenance: expected no key of a file's protocol or findings, got {reserved[0]!r}")
     if (culture := _culture_of(metadata)) != recording.culture:
-        raise InvalidArgument(
-            f"culture: expected that of the provenance's source and seed, {culture!r}, got {recording.culture!r}"
-        )
+        raise InvalidArgument(f"culture: expected {culture!r} by the provenance's source, got {recording.culture!r}")
     if recording.protocol is not None:
         metadata["protocol"] = recording.protocol.to_json()
     return metadata | {f"{finding.severity}: {finding.name}": finding.message for finding in recording.findings}

@@ -21,15 +21,9 @@ rarely."""
 
 
 def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
-    """All findings about a recording: those from reading its file, then those seen in its data.
+    """All findings about a recording (docs/recordings.md lists them): those from its file, then those in its data.
 
     For a response table, which has no spikes, only the former and those on its frequencies (`other-frequencies`).
-
-    Seen in the data: no stimuli (`no-stimuli`), no spikes (`no-spikes`), silent and noisy channels
-    (`channel_findings`), times that cannot be in seconds (`animat.recordings.time_quality`), silences of all channels
-    (`silence`), duplicate spikes (`duplicate-spikes`), more stimuli than spikes (`more-stimuli-than-spikes`), stimuli
-    with the same time (`simultaneous-stimuli`), trials of several frequencies (`trials-of-several-frequencies`),
-    stimuli without electrodes (`stimulus-electrodes-unknown`) and an unknown presentation (`presentation-unknown`).
     """
     if isinstance(recording, ResponseTable):
         return (*recording.findings, *frequency_findings(recording.stimuli, has_times=recording.has_times))
@@ -40,15 +34,13 @@ def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, .
 def _in_data(recording: Recording) -> Iterable[Finding]:
     channels, stimuli = recording.channels, recording.stimuli
     if not len(stimuli):
-        message = (
-            f"{len(recording.spike_times_s):,} spikes but no stimuli: there are no responses to learn from; "
-            "provide the stimulus times too"
-        )
+        n = len(recording.spike_times_s)
+        message = f"{n:,} spikes but no stimuli: no responses to learn from; provide the stimulus times too"
         yield Finding("no-stimuli", "refuse", message)
     if not len(recording.spike_times_s):
         yield Finding("no-spikes", "refuse", f"no spike on any of {len(channels):,} channels: nothing can be learned")
     else:
-        yield from channel_findings(recording)
+        yield from _on_channels(recording)
     yield from time_findings(recording)
     yield from silences(recording)
     yield from _duplicates(recording)
@@ -101,8 +93,7 @@ def _duplicates(recording: Recording) -> Iterable[Finding]:
     if share > DUPLICATES[0] and n >= DUPLICATES[1]:
         message = (
             f"{n:,} of {len(recording.spike_times_s):,} spikes ({100 * share:.0f} %) come at exactly the same time as "
-            "another on their channel: are they in the file twice, or are times coarse? Each is counted; provide them "
-            "once"
+            "another on their channel: are they in the file twice, or are times coarse? Each counts; provide them once"
         )
         yield Finding("duplicate-spikes", "warning", message, share)
 
@@ -115,14 +106,10 @@ SEVERAL = 8
 NAMED = 6
 
 
-def channel_findings(recording: Recording) -> Iterator[Finding]:
-    """Findings on silent channels (`silent-channels`) and noisy ones (`noisy-channels`).
+def _on_channels(recording: Recording) -> Iterator[Finding]:
+    """Findings on silent channels, and on noisy ones, of a recording with at least one spike.
 
-    A channel without a spike is silent. A channel is noisy if it fires at more than 100 Hz on average, or has more than
-    a third of all spikes of eight or more channels.
-
-    Args:
-        recording: with at least one spike.
+    A channel is noisy if it fires at more than 100 Hz on average, or has a third of all spikes of eight or more.
     """
     channels = recording.channels
     n, n_spikes = len(channels), len(recording.spike_times_s)
@@ -139,7 +126,6 @@ def channel_findings(recording: Recording) -> Iterator[Finding]:
         share = float(count[noisy].sum() / n_spikes)
         message = (
             f"channels that fire as no neuron does: {len(noisy):,} of {n:,} ({some_of(channels.label[noisy], NAMED)}), "
-            f"with {100 * share:.0f} % of all spikes, carry noise; raise their threshold or leave them out of the "
-            "routing"
+            f"with {100 * share:.0f} % of all spikes: noise; raise their threshold or leave them out of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

@@ -68,9 +68,7 @@ class RawTraces:
             InvalidArgument: for a wrong shape.
         """
         if voltage_uv.ndim != 2 or voltage_uv.shape[1] != len(channels):
-            raise InvalidArgument(
-                f"voltage_uv: expected shape (samples, {len(channels)} channels), got {voltage_uv.shape}"
-            )
+            raise InvalidArgument(f"voltage_uv: expected (samples, {len(channels)} channels), got {voltage_uv.shape}")
 
         def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
             return in_microvolts(voltage_uv[start:stop], uv_per_step)

@@ -58,6 +58,8 @@ def read_recording(
 ) -> Recording:
     """Read one recording: NWB, MaxWell, CL1 (HDF5), NPZ (zip) or CSV (text, gzipped or not), detected by its content.
 
+    Problems noticed on the way are in its findings (see `animat.recordings.quality`).
+
     Args:
         stimuli_path: the stimulus file, for CSV only; by default the one next to the spikes.
         stimuli: which of several candidates in a file are the stimuli: in NWB from other programs, the name; in
@@ -65,10 +67,6 @@ def read_recording(
         part: which recording of a MaxWell file with several, such as `well000/rec0000`.
         start_min: start on the culture's clock, in minutes; by default the one in the file.
         start_s: start on the recording's own clock, in seconds, for a file that does not state it.
-
-    Returns:
-        The recording, sorted and checked; problems noticed on the way are in its findings (see
-        `animat.recordings.quality`).
 
     Raises:
         InvalidFile: naming the file, what was expected and what came.
@@ -86,12 +84,11 @@ def read_recording(
             f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read; "
             "this needs spike times"
         )
-    if start_s is not None:
-        try:
-            source = with_start(source, start_s)
-        except UnusableData as error:
-            raise InvalidFile(f"{path}: {error}") from error
-    return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
+    try:
+        source = source if start_s is None else with_start(source, start_s)
+        return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
+    except UnusableData as error:
+        raise InvalidFile(f"{path}: {error}") from error
 
 
 def read_source(
@@ -106,9 +103,7 @@ def _read(
 ) -> Recording | ResponseTable:
     begin = first_bytes(path)
     if begin.startswith((HDF5, ZIP)) and stimuli_path is not None:
-        raise InvalidArgument(
-            f"stimuli_path: expected only with CSV spikes, got {stimuli_path}, but {path} holds its own stimuli"
-        )
+        raise InvalidArgument(f"stimuli_path: expected only with CSV spikes; {path} holds its own stimuli")
     if (stimuli is not None or part is not None) and not begin.startswith(HDF5):
         raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
@@ -139,10 +134,8 @@ def _read_text(path: Path, begin: bytes, stimuli_path: str | os.PathLike[str] | 
     except InvalidFile as error:
         if not has_hdf5_name or stimuli_path is not None:
             raise
-        raise InvalidFile(
-            f"{path}: expected HDF5 in a file with this name, got something else (perhaps text, or a server's error "
-            "page); copy it again"
-        ) from error
+        what = "something else (perhaps text, or a server's error page); copy it again"
+        raise InvalidFile(f"{path}: expected HDF5 in a file with this name, got {what}") from error
 
 
 def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording]:
@@ -150,9 +143,6 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
 
     Args:
         paths: one or more files, or folders with `*.nwb`, `*.h5`, `*.npz`, `*_spikes.csv` or `*_spikes.csv.gz`.
-
-    Returns:
-        The recordings, sorted by `start_min`.
 
     Raises:
         InvalidFile: for a file that cannot be read, a folder without recordings, or two recordings with the same start.
@@ -162,11 +152,7 @@ def read_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[s
 
 
 def read_sources(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Recording | ResponseTable]:
-    """Read recordings and response tables in the order of the culture's clock.
-
-    Arguments and errors are those of `read_recordings`; response tables in folders are `*.npz`, `*_responses.csv` and
-    `*_responses.csv.gz`.
-    """
+    """Read recordings and response tables (in folders `*.npz` and `*_responses.csv[.gz]`) as `read_recordings` does."""
     return _in_order(list_recordings(paths), read_source)
 
 
@@ -182,12 +168,7 @@ def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
 
 
 def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The recording files among paths: files as given, and those in folders in the order of their names.
-
-    Raises:
-        InvalidFile: for a folder without recordings.
-        InvalidArgument: if no path is given.
-    """
+    """The recording files among paths: files as given, and those in folders in the order of their names."""
     listed = [paths] if isinstance(paths, str | os.PathLike) else paths
     files = [file for path in listed for file in _files(Path(path))]
     if not files:

@@ -144,7 +144,11 @@ class Recording:
                 f"spike_channels: expected rows of the channel table (0 to {len(self.channels) - 1}), "
                 f"got {self.spike_channels[outside][0]} ({np.count_nonzero(outside)} spikes on unknown channels)"
             )
-        self._order_simultaneous_spikes()
+        # Files store spikes by channel: without a fixed order of ties, a recording would not read back equal.
+        if np.any((np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)):
+            channels = self.spike_channels[np.lexsort((self.spike_channels, self.spike_times_s))]
+            channels.setflags(write=False)
+            object.__setattr__(self, "spike_channels", channels)
         # Events up to a century before and after 0 are up to two centuries apart.
         if not (abs(self.start_s) <= CENTURY_S and 0 <= self.duration_s <= 2 * CENTURY_S):
             length = ", the latter 0 or more" if self.duration_s < 0 else ""
@@ -165,14 +169,6 @@ class Recording:
                     f"{name}: expected times within the recording ({self.start_s:g} to {self.stop_s:g} s), "
                     f"got {times[0]:g} to {times[-1]:g} s"
                 )
-
-    def _order_simultaneous_spikes(self) -> None:
-        # Files store spikes by channel: without a fixed order of ties, a recording would not read back equal.
-        ties_fall = (np.diff(self.spike_times_s) == 0) & (np.diff(self.spike_channels) < 0)
-        if np.any(ties_fall):
-            channels = self.spike_channels[np.lexsort((self.spike_channels, self.spike_times_s))]
-            channels.setflags(write=False)
-            object.__setattr__(self, "spike_channels", channels)
 
     @property
     def stop_s(self) -> float:

@@ -60,9 +60,7 @@ class ResponseTable:
         values = read_only(self, "values", np.float64)
         shape = (len(self.stimuli), len(self.channels))
         if values.shape != shape:
-            raise UnusableData(
-                f"responses: expected one row per stimulus and one column per channel, {shape}, got {values.shape}"
-            )
+            raise UnusableData(f"responses: expected rows of stimuli, columns of channels, {shape}, got {values.shape}")
         wrong = ~np.isfinite(values) | (values < 0)
         if np.any(wrong):
             row, column = np.argwhere(wrong)[0]
@@ -78,6 +76,4 @@ class ResponseTable:
                 f"channel {self.channels.label[column]}; if these are rates in Hz, name them rate_hz"
             )
         if self.window_ms is not None and not 0 <= self.window_ms[0] < self.window_ms[1] < np.inf:
-            raise UnusableData(
-                f"window: expected 0 <= start < end in ms, got {self.window_ms[0]:g}, {self.window_ms[1]:g}"
-            )
+            raise UnusableData(f"window: expected 0 <= start < end in ms, got {self.window_ms}")

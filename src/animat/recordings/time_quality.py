@@ -36,13 +36,8 @@ ENOUGH_SPIKES, ENOUGH_STIMULI = 1000, 20
 def time_findings(recording: Recording) -> Iterator[Finding]:
     """A finding on times that cannot be in seconds (`times-not-in-seconds`), or contradict stated frequencies.
 
-    Times cannot be in seconds if the intervals between stimuli are all the same multiple, that of a known unit, of
-    those of the stated frequencies, which are 1.5 times apart or more; if a recording of more than two hours has hardly
-    ever two spikes of a channel within half a second and a median rate under 0.02 Hz, or no spike within 100 ms after
-    any stimulus; if the median channel fires at more than 200 Hz; or if nearly all stimuli come after the last spike.
-    Any other multiple above 30 or below 1/30 is a warning: trains of 100 pulses, one row each, have intervals 100 times
-    as long. If there is no common factor and stimuli come sooner than stated, in two thirds of the time or less, there
-    is a warning on the frequencies (`other-frequencies`); stimuli that come later may have pauses between them.
+    docs/recordings.md has the cases. An unknown common factor is a warning only: trains of 100 pulses, one row each,
+    have intervals 100 times as long as stated. Stimuli that come later than stated may have pauses between them.
     """
     stated = _common_factor(recording.stimuli, recording.sampling_rate_hz)
     if stated is not None and stated.severity == "refuse":
@@ -202,9 +197,7 @@ def _separate_clocks(recording: Recording) -> str | None:
     before = float(np.mean(stimulus_s < spike_s[0]))
     if max(after, before) < 0.9:
         return None
-    where = (
-        f"after the last spike, at {spike_s[-1]:g} s" if after > before else f"before the first, at {spike_s[0]:g} s"
-    )
+    where = f"after the last spike, {spike_s[-1]:g} s" if after > before else f"before the first, {spike_s[0]:g} s"
     return (
         f"times cannot all be in seconds: {100 * max(after, before):.0f} % of the stimuli come {where}: stimuli and "
         "spikes have different units or clocks; provide both in seconds on the same clock"

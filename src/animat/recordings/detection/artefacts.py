@@ -143,9 +143,8 @@ def _saturated_until(
             return until
         stretches = np.lib.stride_tricks.sliding_window_view(trace_uv[rows], flat, axis=1)
         moves_uv = stretches.max(axis=2) - stretches.min(axis=2)
-        is_flat = (moves_uv <= FLAT_SHARE * size_uv[rows, flat - 1 :]) & is_saturated[:, flat - 1 :]
-        is_saturated = np.zeros_like(is_saturated)
-        is_saturated[:, flat - 1 :] = is_flat
+        is_saturated[:, : flat - 1] = False
+        is_saturated[:, flat - 1 :] &= moves_uv <= FLAT_SHARE * size_uv[rows, flat - 1 :]
     for row, flags in zip(rows.tolist(), is_saturated, strict=True):
         at = np.flatnonzero(flags)
         if pause is not None and np.any(is_over := np.diff(at, prepend=0) > pause + flat):
@@ -169,15 +168,10 @@ def _blank(
         if stop <= start:
             continue
         chosen = np.flatnonzero(until == stop)
-        left = voltage_uv[chosen, max(start - 10, 0) : start]
-        right = voltage_uv[chosen, stop : stop + 10]
-        ends = [side.mean(axis=1) if side.shape[1] else None for side in (left, right)]
-        from_uv = ends[0] if ends[0] is not None else ends[1]
-        to_uv = ends[1] if ends[1] is not None else ends[0]
-        if from_uv is None or to_uv is None:
-            from_uv = to_uv = np.zeros(len(chosen), np.float32)
+        sides = voltage_uv[chosen, max(start - 10, 0) : start], voltage_uv[chosen, stop : stop + 10]
+        ends_uv = [side.mean(axis=1) for side in sides if side.shape[1]] or [np.zeros(len(chosen), np.float32)]
+        from_uv, to_uv = ends_uv[0], np.where(is_held[chosen], ends_uv[0], ends_uv[-1])
         share = ((np.arange(stop - start) + 1) / (stop - start + 1)).astype(np.float32)
-        to_uv = np.where(is_held[chosen], from_uv, to_uv)
         voltage_uv[chosen, start:stop] = from_uv[:, None] * (1 - share) + to_uv[:, None] * share
         is_blank[chosen, start:stop] = True
 

@@ -55,7 +55,6 @@ def find_negative_peaks(
         return row.astype(np.int64), column.astype(np.int64)
     padded = np.pad(voltage_uv, ((0, 0), (apart, apart)), constant_values=np.inf)
     around = padded[row[:, None], column[:, None] + np.arange(2 * apart + 1)[None, :]]
-    is_least = np.all(peak_uv[:, None] < around[:, :apart], axis=1) & np.all(
-        peak_uv[:, None] <= around[:, apart + 1 :], axis=1
-    )
+    is_least = np.all(peak_uv[:, None] < around[:, :apart], axis=1)
+    is_least &= np.all(peak_uv[:, None] <= around[:, apart + 1 :], axis=1)
     return row[is_least].astype(np.int64), column[is_least].astype(np.int64)

@@ -190,10 +190,8 @@ def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Findin
     if n := int(lost.sum()):
         n_channels = np.count_nonzero(lost)
         share = n / (samples * n_channels)
-        message = (
-            f"{n:,} samples on {n_channels:,} of {len(lost):,} channels ({100 * share:.2g} % of theirs) are not "
-            "finite: no spikes are looked for there"
-        )
+        of_theirs = f"{n_channels:,} of {len(lost):,} channels ({100 * share:.2g} % of theirs)"
+        message = f"{n:,} samples on {of_theirs} are not finite: no spikes are looked for there"
         yield Finding("samples-lost", "note" if share < MUCH_LOST else "warning", message, float(n))
 
 

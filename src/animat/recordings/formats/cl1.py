@@ -28,10 +28,7 @@ def is_cl1(file: Hdf5File) -> bool:
 
 
 def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
-    """Read spikes and stimuli of an open CL1 recording.
-
-    Args:
-        spikes: whether to read spikes, which must exist; otherwise only stimuli, for raw traces.
+    """Read spikes, which must exist, and stimuli of an open CL1 recording; or only stimuli, for raw traces.
 
     Raises:
         InvalidFile: if the file lacks spikes.
@@ -44,9 +41,7 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
             "them in its raw traces with animat convert --raw"
         )
     rate_hz = _rate_hz(file, findings)
-    frame, channel = (
-        file.read("spikes", column) if spikes else np.empty(0, np.int64) for column in ("timestamp", "channel")
-    )
+    frame, channel = file.columns("spikes", "timestamp", "channel") if spikes else np.empty((2, 0), np.int64)
     n_channels = file.attribute("/", "channel_count")
     if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
         message = f"the number of channels is not in the file: assumed to be {CHANNELS}"
@@ -62,9 +57,7 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
     if stray := int(np.count_nonzero(~on_electrode)):
         strays = np.unique(channel[~on_electrode]).tolist()
         names = ", ".join(f"{c} ({NO_STIMULATION.get(c, 'unknown')})" for c in strays)
-        message = (
-            f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are not electrodes, and are left out"
-        )
+        message = f"{stray:,} of {len(channel):,} spikes are on channels {names}, which are no electrodes: left out"
         findings.append(Finding("spikes-not-on-electrodes", "note", message, float(stray)))
     spike_time_s, stimulus_time_s = (frame[on_electrode] - start) / rate_hz, (stimulus_frame - start) / rate_hz
     frames = file.attribute("/", "duration_frames")
@@ -111,7 +104,7 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
     """First frame of each stimulus, and its electrodes."""
     if not file.has("stims"):
         return np.empty(0, np.int64), {}
-    frame, channel = (file.read("stims", column).astype(np.int64) for column in ("timestamp", "channel"))
+    frame, channel = (column.astype(np.int64) for column in file.columns("stims", "timestamp", "channel"))
     frames, which = np.unique(frame, return_inverse=True)
     electrodes: list[set[int]] = [set() for _ in frames]
     for stimulus, electrode in zip(which.tolist(), channel.tolist(), strict=True):
@@ -142,10 +135,8 @@ def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> di
         findings.append(Finding("stimulus-words-lost", "warning", message, float(lost)))
     order = np.argsort(frame[:n_valid], kind="stable")
     texts = [_text(data, int(starts[i]), int(ends[i])) for i in order]
-    entry = np.searchsorted(frame[order], stimulus, side="right") - 1
-    columns = stimulus_columns(
-        [texts[i] if i >= 0 and not gone else "" for i, gone in zip(entry, is_lost, strict=True)]
-    )
+    entry = np.where(is_lost, -1, np.searchsorted(frame[order], stimulus, side="right") - 1)
+    columns = stimulus_columns([texts[i] if i >= 0 else "" for i in entry])
     columns.pop("stimulus_electrodes", None)
     return columns
 

@@ -143,9 +143,7 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
         numbers = table.numbers(place, name, required=name in REQUIRED)
         if name == "stimulus_frequency_hz" and np.any(numbers <= 0):
             row = int(np.flatnonzero(numbers <= 0)[0])
-            raise table.wrong(
-                row, f"{name}: expected positive frequencies in Hz, or empty fields, got {numbers[row]:g}"
-            )
+            raise table.wrong(row, f"{name}: expected positive frequencies in Hz, or nothing, got {numbers[row]:g}")
         return numbers
     cells = table.text(place)
     if name in REQUIRED and "" in cells:
@@ -168,7 +166,6 @@ def _electrodes(table: TextTable, place: int) -> Column:
         try:
             lists.append([int(electrode) for electrode in cell.split()])
         except (ValueError, OverflowError) as error:
-            raise table.wrong(
-                row, f"stimulus_electrodes: expected whole numbers separated by spaces, got {cell[:40]!r}"
-            ) from error
+            expected = "whole numbers separated by spaces"
+            raise table.wrong(row, f"stimulus_electrodes: expected {expected}, got {cell[:40]!r}") from error
     return padded(lists)

@@ -7,7 +7,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column, PlainColumns, count_out_of_order, unsorted_finding
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File
@@ -25,26 +25,19 @@ TEXTS = ("experiment_description", "session_description", "institution", "lab")
 def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True) -> Recording:
     """Read an open file of another program; every unit becomes a channel, at its first electrode's position.
 
-    Args:
-        stimuli: the name of the stimuli, if the file has several candidates.
-        spikes: whether to read units, which must exist; otherwise only channels and stimuli, for raw traces.
+    Units must exist; for raw traces, only channels and stimuli are read.
 
     Raises:
-        InvalidFile: if the file holds no units, or several candidates for stimuli and none is chosen.
+        InvalidFile: if the file holds no units, or several candidates for stimuli and none is named.
         UnusableData: if a column is invalid.
     """
     findings: list[Finding] = []
     if spikes:
         if not file.has(f"{UNITS_TABLE}/spike_times"):
-            raw = [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]
-            raise InvalidFile(
-                f"{file.path}: expected spikes in /{UNITS_TABLE}, found none"
-                + (
-                    f": it holds traces ({', '.join(raw[:4])}); find spikes in them with animat convert --raw"
-                    if raw
-                    else " and no traces either"
-                )
-            )
+            found = "none and no traces either"
+            if raw := [name for name in file.names("acquisition") if file.has(f"acquisition/{name}/data")]:
+                found = f"none: it holds traces ({some_of(raw, 4)}); find spikes in them with animat convert --raw"
+            raise InvalidFile(f"{file.path}: expected spikes in /{UNITS_TABLE}, found {found}")
         columns = _units(file, findings)
     else:
         columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **_electrodes(file)}

@@ -118,6 +118,10 @@ class Hdf5File:
         values = np.asarray(dataset[()] if field is None else dataset.fields(field)[()])
         return _as_text(values) if text else values
 
+    def columns(self, where: str, *fields: str) -> list[Column]:
+        """Some columns of a table; see `read`."""
+        return [self.read(where, field) for field in fields]
+
     def first(self, where: str) -> Any:
         """The first value of a dataset, a number or text; None if there is no such dataset or it is empty."""
         if not isinstance(self.node(where), h5py.Dataset):

@@ -28,11 +28,7 @@ def format_of(file: Hdf5File) -> Literal["NWB", "MaxWell", "CL1"]:
 
 
 def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None) -> Recording:
-    """Read a recording in any of the formats.
-
-    Args:
-        part: which recording of a MaxWell file with several.
-        stimuli: the name of the stimuli, if there are several candidates.
+    """Read a recording in any of the formats; `part` and `stimuli` are those of `read_recording`.
 
     Raises:
         InvalidFile: if the file is damaged, of an unknown format, or holds no recording.

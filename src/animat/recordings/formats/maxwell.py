@@ -63,12 +63,11 @@ class _Layout:
 def read_maxwell(
     file: Hdf5File, part: str | None = None, stimuli: str | None = None, *, spikes: bool = True
 ) -> Recording:
-    """Read spikes, stimuli and electrodes of one recording of an open MaxWell file.
+    """Read spikes, which must exist, stimuli and electrodes of an open MaxWell file; or no spikes, for raw traces.
 
     Args:
         part: which recording, such as `well000/rec0000`, if the file has several.
         stimuli: the type of the events that are stimuli, as a number, if there are several types.
-        spikes: whether to read spikes, which must exist; otherwise only channels and stimuli, for raw traces.
 
     Raises:
         InvalidFile: if the file lacks spikes, or holds several recordings and none is chosen.
@@ -81,9 +80,9 @@ def read_maxwell(
             f"{file.path}: expected spikes at /{layout.spikes}, found none: the rig kept raw traces only, or nothing; "
             "detect spikes in them with animat convert --raw"
         )
-    spike_frame, spike_channel = (
-        file.read(layout.spikes, column) if spikes else np.empty(0, np.int64) for column in ("frameno", "channel")
-    )
+    spike_frame, spike_channel = np.empty((2, 0), np.int64)
+    if spikes:
+        spike_frame, spike_channel = file.columns(layout.spikes, "frameno", "channel")
     stimulus_frame, columns = np.empty(0, np.int64), dict[str, Any]()
     if file.has(layout.stimuli):
         stimulus_frame, columns = _bits(file, layout) if is_old(file) else _events(file, layout, stimuli)

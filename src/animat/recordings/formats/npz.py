@@ -106,9 +106,7 @@ def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
     limit = UNPACKED_BYTES + UNPACKED_RATIO * path.stat().st_size
     unpacked = sum(entry.file_size for entry in archive.infolist())
     if unpacked > limit:
-        raise InvalidFile(
-            f"{path}: unpacks to {unpacked:,} bytes, more than a recording of its size ({limit:,}): it is damaged"
-        )
+        raise InvalidFile(f"{path}: unpacks to {unpacked:,} bytes, too many for its size ({limit:,}): it is damaged")
 
 
 def _array(archive: Mapping[str, Column], key: str) -> Column:

@@ -130,14 +130,10 @@ def is_nwb(file: Hdf5File) -> bool:
 
 
 def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
-    """Read a recording written by `write_nwb`, which equals the original, or by another program.
-
-    Args:
-        file: open.
-        stimuli: for another program's file, the name of the stimuli if there are several candidates.
+    """Read an open file of `write_nwb`, which equals the original recording, or of another program.
 
     Raises:
-        InvalidFile: if the file is of a newer version, or from another program and without spikes.
+        InvalidFile: if the file is of a newer version, or cannot be read (`read_foreign_nwb`).
     """
     path = file.path
     if not file.has(RECORDING_TABLE):
@@ -146,9 +142,7 @@ def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
         raise InvalidFile(f"{path}: expected no choice of stimuli for animat's own file, got {stimuli!r}")
     version = _cell(file, "format_version", int)
     if version > FORMAT_VERSION:
-        raise InvalidFile(
-            f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat to read it"
-        )
+        raise InvalidFile(f"{path}: expected format version {FORMAT_VERSION} or older, got {version}: update animat")
     texts = dict[str, str]()
     if file.has(PROVENANCE_TABLE):
         keys, values = (file.read(f"{PROVENANCE_TABLE}/{name}").tolist() for name in ("key", "words"))

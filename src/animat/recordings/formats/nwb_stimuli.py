@@ -28,11 +28,10 @@ _BLOCK = 2**20
 
 
 def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> dict[str, Any]:
-    """The stimulus columns of `PlainColumns`; an empty column of times if the file has no stimuli.
+    """The stimulus columns of `PlainColumns`, with no times if the file has no stimuli; findings are added.
 
     Args:
         asked: the name of the stimuli if the user gave one: a path, or its last part.
-        findings: new findings are added to it.
 
     Raises:
         InvalidFile: if there are several candidates and none is named, or the named one does not exist.
@@ -88,8 +87,7 @@ def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
                     columns[column] = values
                     break
     for name in ELECTRODES:
-        is_there = isinstance(file.node(f"{at}/{name}"), h5py.Dataset)
-        if is_there and (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
+        if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
             columns["stimulus_electrodes"] = electrodes
             break
     if "stimulus_frequency_hz" in columns:
@@ -100,6 +98,8 @@ def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
 
 def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     """The electrodes of each of n rows, from whole numbers or text ("7 9"); None if they are neither."""
+    if not isinstance(file.node(at), h5py.Dataset):
+        return None
     dataset = file.dataset(at)
     if dataset.dtype.kind in "SO" and dataset.shape == (n,):
         try:

@@ -37,12 +37,7 @@ _FILE_KEYS = ("experiment_description", "lab", "institution")
 
 
 def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"]) -> NWBFile:
-    """A recording as a pynwb object tree, with room for spikes; see `animat.recordings.formats.nwb_layout`.
-
-    Args:
-        recording: everything but its spikes is used.
-        spike_counts: of each channel; the caller writes the times.
-    """
+    """A recording as a pynwb object tree, with room for so many spikes of each channel, which the caller writes."""
     texts = {_text("provenance", k): _text("provenance", v) for k, v in to_metadata(recording).items()}
     nwb = NWBFile(
         session_description=texts.get(

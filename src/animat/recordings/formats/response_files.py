@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidFile, UnusableData
+from animat.errors import InvalidFile, UnusableData, some_of
 from animat.recordings.columns import Column, PlainColumns
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.csv import SPIKE_COLUMNS, STIMULUS_COLUMNS, nearest, plain_column
@@ -50,39 +50,31 @@ def is_response_npz(path: Path) -> bool:
 
 
 def read_response_npz(path: Path) -> ResponseTable:
-    """Read a response table from a numpy archive; nothing in it is ever unpickled.
-
-    Raises:
-        InvalidFile: if the file is damaged, or holds both counts and rates.
-        UnusableData: if an array is invalid.
-    """
+    """Read a response table from a numpy archive; nothing in it is ever unpickled."""
     of_stimuli = (key for key in KEYS if not key.startswith("spike_"))
     arrays, _, left_out = load_columns(path, (*NPZ_KEYS, "response_window_ms", *of_stimuli))
     keys = [key for key in NPZ_KEYS if key in arrays]
     if len(keys) != 1:
         raise InvalidFile(f"{path}: expected one of {' or '.join(NPZ_KEYS)}, got {' and '.join(keys) or 'neither'}")
-    values = np.asarray(arrays.pop(keys[0]))
+    key, values = keys[0], np.asarray(arrays.pop(keys[0]))
     if values.ndim != 2 or values.dtype.kind not in "iufb":
-        raise UnusableData(
-            f"{keys[0]}: expected numbers of shape (stimuli, channels), got {values.dtype} {values.shape}"
-        )
-    per_stimulus = {len(a) for key, a in arrays.items() if key.startswith("stimulus_") and np.ndim(a)}
-    if per_stimulus == {values.shape[1]} and values.shape[0] != values.shape[1]:
-        raise UnusableData(
-            f"{keys[0]}: expected a row for each of {values.shape[1]} stimuli, got {values.shape}: transpose it"
-        )
+        raise UnusableData(f"{key}: expected numbers of shape (stimuli, channels), got {values.dtype} {values.shape}")
+    n, n_channels = values.shape
+    per_stimulus = {len(array) for name, array in arrays.items() if name.startswith("stimulus_") and np.ndim(array)}
+    if per_stimulus == {n_channels} and n != n_channels:
+        raise UnusableData(f"{key}: expected a row for each of {n_channels} stimuli, got {values.shape}: transpose it")
     window = arrays.pop("response_window_ms", None)
     if window is not None and np.shape(window) != (2,):
         raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
     window_ms = None if window is None else (float(window[0]), float(window[1]))
-    labels = arrays.pop("channel_label", np.arange(values.shape[1]))
+    labels = arrays.pop("channel_label", np.arange(n_channels))
     provenance = {"source": path.name, "format": "NPZ of responses"}
     findings = left_out_findings("keys", left_out)
-    return _table(values, NPZ_KEYS[keys[0]], labels, arrays, window_ms, provenance, findings)
+    return _table(values, NPZ_KEYS[key], labels, arrays, window_ms, provenance, findings)
 
 
 def read_response_table(table: TextTable) -> ResponseTable:
-    """Read a response table from text, wide or long.
+    """Make a response table from text, wide or long.
 
     Raises:
         InvalidFile: for columns that are missing, or cells that are not numbers, with their line.
@@ -135,7 +127,7 @@ def _long(table: TextTable) -> _Read:
     if len(places) != 1 or trial is None or channel is None:
         raise InvalidFile(
             f"{table.path}, line 1: expected trial (or stimulus_time_s), channel, and count or rate_hz, found "
-            + ", ".join(table.header[:12])
+            + some_of(table.header, 12)
             + nearest(table, (TRIAL, *TABLE_COLUMNS["stimulus_time_s"], "channel", *KINDS))
         )
     ((kind, place),) = places.items()
@@ -180,9 +172,8 @@ def _constant(table: TextTable, name: str) -> float | None:
     values = table.numbers(place, name, required=True)
     if np.any(values != values[0]):
         row = int(np.flatnonzero(values != values[0])[0])
-        raise table.wrong(
-            row, f"{name}: expected the same in all lines, {values[0]:g} as in the first, got {values[row]:g}"
-        )
+        expected = f"the same in all lines, {values[0]:g} as in the first"
+        raise table.wrong(row, f"{name}: expected {expected}, got {values[row]:g}")
     return float(values[0])
 
 

@@ -46,9 +46,8 @@ class TextTable:
     def place(self, names: Sequence[str]) -> int | None:
         """The column of the first of several names in the header, as written or `folded`; None if there is none."""
         for name in names:
-            columns = [i for i, head in enumerate(self.header) if head == name] or [
-                i for i, head in enumerate(self.header) if folded(head) == name
-            ]
+            heads = self.header if name in self.header else map(folded, self.header)
+            columns = [column for column, head in enumerate(heads) if head == name]
             if len(columns) > 1:
                 twice = " and ".join(repr(self.header[i]) for i in columns[:2])
                 raise InvalidFile(f"{self.path}, line 1: expected one column {name}, got {twice}; rename one")
@@ -185,9 +184,7 @@ def _text(path: Path) -> str:
             with gzip.open(io.BytesIO(content)) as packed:
                 content = packed.read(limit + 1)
             if len(content) > limit:
-                raise InvalidFile(
-                    f"{path}: unpacks to more than {limit:,} bytes, more than text of its size: it is damaged"
-                )
+                raise InvalidFile(f"{path}: unpacks to over {limit:,} bytes, too many for its size: it is damaged")
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InvalidFile(

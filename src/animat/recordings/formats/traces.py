@@ -50,10 +50,7 @@ def open_traces(
         if kind == "MaxWell":
             base = read_maxwell(file, part, stimuli, spikes=False)
             if len(base.stimuli) and any(finding.name == "clock-from-first-event" for finding in base.findings):
-                raise InvalidFile(
-                    f"{path}: expected the first frame of the traces (frame_nos), which aligns them with stimuli, "
-                    "found none"
-                )
+                raise InvalidFile(f"{path}: expected frame_nos, which align the traces with stimuli, found none")
             traces = _maxwell(file, part, base)
         elif kind == "CL1":
             base = read_cl1(file, spikes=False)
@@ -127,9 +124,7 @@ def _traces(
         raise InvalidFile(f"{path}: expected raw traces at /{where}, found none")
     dataset = file.dataset(where)
     if dataset.ndim != 2 or dataset.dtype.kind not in "iuf":
-        raise InvalidFile(
-            f"{path}: expected traces of several channels at /{where}, got {dataset.shape} {dataset.dtype}"
-        )
+        raise InvalidFile(f"{path}: expected traces by channel at /{where}, got {dataset.shape} {dataset.dtype}")
     if missing := unavailable_filters(dataset):
         raise InvalidFile(
             f"{path}: the raw traces at /{where} are compressed by {missing}, which is not installed: {PLUGIN_ADVICE}; "

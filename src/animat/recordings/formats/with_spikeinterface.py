@@ -35,8 +35,7 @@ def open_with_spikeinterface(
     Args:
         path: a file or folder, as the reader requires.
         reader: the format, such as `intan`.
-        stimuli_path: CSV with stimulus times from the start of the traces, as for CSV spikes; by default
-            `NAME_stimuli.csv` next to the file.
+        stimuli_path: CSV with stimulus times from the start of the traces; by default `NAME_stimuli.csv` beside it.
 
     Raises:
         InvalidArgument: for an unknown reader, or if SpikeInterface is not installed.
@@ -56,9 +55,7 @@ def open_with_spikeinterface(
         segments = int(recording.get_num_segments())
     except Exception as error:
         # The readers of some 40 formats raise all kinds of errors.
-        raise InvalidFile(
-            f"{path}: expected {reader} data that SpikeInterface reads, got {first_line(error)}"
-        ) from error
+        raise InvalidFile(f"{path}: expected {reader} data for SpikeInterface, got {first_line(error)}") from error
     if segments != 1:
         raise InvalidFile(f"{path}: expected one segment of traces, got {segments}; export them one by one")
     pulses = Path(stimuli_path) if stimuli_path is not None else stimuli_beside(path.with_name(f"{path.stem}.csv"))
