@@ -27,27 +27,7 @@ LONGEST_TEXT = 1_000
 class PlainColumns:
     """Columns as read from a file: unsorted, unchecked, most of them optional. `to_recording` checks them all.
 
-    Attributes:
-        spike_time_s: time of each spike in seconds, in any order, shape (spikes,).
-        spike_channel: the channel of each spike, shape (spikes,). Looked up in `channel_label` if it is text, or if
-            the labels are numbers too. Otherwise numbers are rows of the channel columns. Without any channel column,
-            the channels are the distinct values, those that fired.
-        stimulus_time_s: start of each pulse in seconds, in any order, shape (stimuli,).
-        channel_label: the rig's name of each channel, text or whole numbers, unique, shape (channels,).
-        channel_electrode: the electrode each channel records, -1 for unknown, shape (channels,).
-        channel_xy_um: the electrode's position, NaN for unknown, shape (channels, 2).
-        stimulus_frequency_hz: NaN for unknown, shape (stimuli,).
-        stimulus_pattern: whole numbers, -1 for unknown, or names, which are numbered in alphabetical order (an empty
-            name is unknown), shape (stimuli,).
-        stimulus_electrodes: electrodes pulsed together, padded with -1, shape (stimuli, electrodes) or (stimuli,).
-        stimulus_presentation: trial of each pulse, shape (stimuli,); by default, and where it is -1, each pulse is a
-            trial.
-        sampling_rate_hz: of the raw signal, NaN for unknown.
-        start_min: start on the culture's clock in minutes.
-        start_s: start on the recording's clock; by default 0, or the first event if that is earlier.
-        duration_s: by default up to the last event.
-        presentation_order: `"blocked"` or `"mixed"`; by default not known.
-        presentation_pulses: pulses per trial.
+    Their shapes, units and defaults are those of the keys of NPZ in docs/recordings.md.
     """
 
     spike_time_s: Column
@@ -122,8 +102,7 @@ class PlainColumns:
         values = _column("spike_channel", self.spike_channel, n_spikes, "one channel per spike")
         if nameless := int(np.count_nonzero(values == "" if _is_text(values) else values != values)):
             raise UnusableData(f"spike_channel: expected a channel for each spike, got {nameless} without one")
-        if not _is_text(values):
-            values = _whole("spike_channel", values)
+        values = _names("spike_channel", values)
         lengths = {}
         for name in ("channel_label", "channel_electrode", "channel_xy_um"):
             if (column := getattr(self, name)) is not None:
@@ -141,9 +120,8 @@ class PlainColumns:
                 + ", ".join(f"{length} in {name}" for name, length in lengths.items())
             )
         n_channels = next(iter(lengths.values()))
-        labels = np.arange(n_channels) if self.channel_label is None else np.asarray(self.channel_label)
-        if not _is_text(labels):
-            labels = _whole("channel_label", labels)
+        given = np.arange(n_channels) if self.channel_label is None else np.asarray(self.channel_label)
+        labels = _names("channel_label", given)
         table = _channel_table(labels.astype(np.str_), self.channel_electrode, self.channel_xy_um)
         if self.channel_label is not None and (_is_text(values) or not _is_text(labels)):
             return table, _rows_of(values.astype(np.str_), table.label)
@@ -166,9 +144,9 @@ class PlainColumns:
         """The pattern of each stimulus, and the patterns' names for the provenance."""
         if self.stimulus_pattern is None:
             return np.full(n, UNKNOWN), {}
-        patterns = _column("stimulus_pattern", self.stimulus_pattern, n)
+        patterns = _names("stimulus_pattern", _column("stimulus_pattern", self.stimulus_pattern, n))
         if not _is_text(patterns):
-            return _whole("stimulus_pattern", patterns), {}
+            return patterns, {}
         named = patterns != ""
         names, numbers = np.unique(patterns[named], return_inverse=True)
         index = np.full(n, UNKNOWN)
@@ -297,7 +275,12 @@ def _column(name: str, column: Column, n: int, expected: str = "one value per st
 
 
 def _is_text(column: Column) -> bool:
-    return np.asarray(column).dtype.kind in "US"
+    return column.dtype.kind in "US"
+
+
+def _names(name: str, column: Column) -> Column:
+    """The column as it is if it is text, otherwise as whole numbers."""
+    return column if _is_text(column) else _whole(name, column)
 
 
 def _numbers(name: str, column: Column) -> Float64[np.ndarray, "..."]:

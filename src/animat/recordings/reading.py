@@ -182,12 +182,11 @@ def _files(path: Path) -> list[Path]:
             raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
         return [expect_plain_file(path)]
     try:
-        # To glob, an unreadable folder looks empty.
-        next(path.iterdir(), None)
+        # Hidden files are unfinished.
+        listed = [file for file in path.iterdir() if not file.name.startswith(".")]
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
-    # Hidden files are unfinished.
-    files = sorted({f for pattern in IN_FOLDERS for f in path.glob(pattern) if not f.name.startswith(".")})
+    files = sorted(file for file in listed if any(map(file.match, IN_FOLDERS)))
     if not files:
         raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it")
     return files

@@ -28,12 +28,7 @@ def is_cl1(file: Hdf5File) -> bool:
 
 
 def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
-    """Read spikes, which must exist, and stimuli of an open CL1 recording; or only stimuli, for raw traces.
-
-    Raises:
-        InvalidFile: if the file lacks spikes.
-        UnusableData: if a column is invalid.
-    """
+    """Read spikes, which must exist, and stimuli of an open CL1 recording; or only stimuli, for raw traces."""
     findings: list[Finding] = []
     if spikes and not file.has("spikes"):
         raise InvalidFile(

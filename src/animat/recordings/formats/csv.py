@@ -39,10 +39,6 @@ def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = Non
     Args:
         stimuli_path: the stimuli; by default `NAME_stimuli.csv` or `NAME_stimuli.csv.gz` next to `NAME_spikes.csv` (or
             next to `NAME.csv`). If there is none, the recording has no stimuli, with a finding.
-
-    Raises:
-        InvalidFile: if a file is missing, damaged or lacks a required column, or the two seem to be swapped.
-        UnusableData: if a column is invalid.
     """
     path = table.path
     if stimuli_path is None and _stem(path).endswith("_stimuli"):

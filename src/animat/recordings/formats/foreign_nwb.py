@@ -26,10 +26,6 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
     """Read an open file of another program; every unit becomes a channel, at its first electrode's position.
 
     Units must exist; for raw traces, only channels and stimuli are read.
-
-    Raises:
-        InvalidFile: if the file holds no units, or several candidates for stimuli and none is named.
-        UnusableData: if a column is invalid.
     """
     findings: list[Finding] = []
     if spikes:

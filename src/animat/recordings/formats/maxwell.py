@@ -68,10 +68,6 @@ def read_maxwell(
     Args:
         part: which recording, such as `well000/rec0000`, if the file has several.
         stimuli: the type of the events that are stimuli, as a number, if there are several types.
-
-    Raises:
-        InvalidFile: if the file lacks spikes, or holds several recordings and none is chosen.
-        UnusableData: if a column is invalid.
     """
     layout = _old(file) if is_old(file) else _new(file, part)
     findings, rate_hz = layout.findings, layout.rate_hz

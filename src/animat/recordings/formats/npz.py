@@ -34,12 +34,7 @@ ROUTING = ("mapping_electrode", "mapping_xy_um")
 
 
 def read_npz(path: Path) -> Recording:
-    """Read a recording from a numpy archive of plain columns; nothing in it is ever unpickled.
-
-    Raises:
-        InvalidFile: if the file is missing, damaged, holds pickled objects, or lacks a required key.
-        UnusableData: if a column is invalid.
-    """
+    """Read a recording from a numpy archive of plain columns; nothing in it is ever unpickled."""
     columns, keys, left_out = load_columns(path, (*KEYS, *ROUTING))
     if missing := [key for key in REQUIRED if key not in columns]:
         if any(key.startswith("state_") for key in keys):

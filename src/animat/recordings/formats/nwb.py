@@ -130,11 +130,7 @@ def is_nwb(file: Hdf5File) -> bool:
 
 
 def read_nwb(file: Hdf5File, stimuli: str | None = None) -> Recording:
-    """Read an open file of `write_nwb`, which equals the original recording, or of another program.
-
-    Raises:
-        InvalidFile: if the file is of a newer version, or cannot be read (`read_foreign_nwb`).
-    """
+    """Read an open file of `write_nwb`, which equals the original recording, or of another program."""
     path = file.path
     if not file.has(RECORDING_TABLE):
         return read_foreign_nwb(file, stimuli)

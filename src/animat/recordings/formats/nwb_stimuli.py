@@ -30,11 +30,7 @@ _BLOCK = 2**20
 def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> dict[str, Any]:
     """The stimulus columns of `PlainColumns`, with no times if the file has no stimuli; findings are added.
 
-    Args:
-        asked: the name of the stimuli if the user gave one: a path, or its last part.
-
-    Raises:
-        InvalidFile: if there are several candidates and none is named, or the named one does not exist.
+    The user may ask for stimuli by a path, or its last part, and must if there are several candidates.
     """
     at = _place(file, asked, findings)
     if at is None:

@@ -63,14 +63,21 @@ def nwb_file(recording: Recording, spike_counts: Int64[np.ndarray, " channels"])
     if texts:
         columns = [_column("key", "keyword", list(texts)), _column("words", "text", list(texts.values()))]
         description = "Where the recording came from, and findings made when it was read."
-        module.add(
-            DynamicTable(name="animat_provenance", description=description, id=np.arange(len(texts)), columns=columns)
-        )
+        module.add(_table(DynamicTable, "animat_provenance", description, columns))
     return nwb
+
+
+def _table(kind: type[DynamicTable], name: str, description: str, columns: list[VectorData]) -> DynamicTable:
+    return kind(name=name, description=description, id=np.arange(len(columns[0].data)), columns=columns)
 
 
 def _column(name: str, description: str, data: Any) -> VectorData:
     return VectorData(name=name, description=description, data=data)
+
+
+def _index(column: VectorData, ends: Int64[np.ndarray, " rows"]) -> VectorIndex:
+    """Where the values of each row of a ragged column end."""
+    return VectorIndex(name=f"{column.name}_index", data=ends.astype(np.int64), target=column)
 
 
 def _add_electrodes(nwb: NWBFile, channels: Channels) -> None:
@@ -106,25 +113,21 @@ def _add_units(nwb: NWBFile, recording: Recording, spike_counts: Int64[np.ndarra
         name="electrodes", description="row in the electrodes table", data=np.arange(rows), table=nwb.electrodes
     )
     one_each = np.arange(1, rows + 1)
+    columns: list[VectorData] = []
+    for column, ends in ((times, np.cumsum(spike_counts)), (observed, one_each), (electrodes, one_each)):
+        columns += [column, _index(column, ends)]
     nwb.units = Units(
         name="units",
         description="All spikes of each recording channel (multi-unit activity, or sorted units; see provenance).",
         id=np.arange(rows),
-        columns=[
-            times,
-            VectorIndex(name="spike_times_index", data=np.cumsum(spike_counts).astype(np.int64), target=times),
-            observed,
-            VectorIndex(name="obs_intervals_index", data=one_each, target=observed),
-            electrodes,
-            VectorIndex(name="electrodes_index", data=one_each, target=electrodes),
-        ],
+        columns=columns,
         electrode_table=nwb.electrodes,
     )
     if np.isfinite(recording.sampling_rate_hz):
         nwb.units.resolution = 1.0 / recording.sampling_rate_hz
 
 
-def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
+def _stimulus_table(stimuli: Stimuli) -> DynamicTable:
     """One row per pulse, with its electrodes up to the last known one, so that padding between known ones is kept."""
     known = stimuli.electrodes != UNKNOWN
     columns = np.arange(known.shape[1])
@@ -142,13 +145,8 @@ def _stimulus_table(stimuli: Stimuli) -> TimeIntervals:
     if len(kept):
         # A column without values is valid, but other programs fail on it.
         electrodes = _column("electrode_ids", "electrodes on the array pulsed together", kept)
-        table += [electrodes, VectorIndex(name="electrode_ids_index", data=np.cumsum(lengths), target=electrodes)]
-    return TimeIntervals(
-        name="stimuli",
-        description="Stimulation pulses, one row per pulse.",
-        id=np.arange(len(stimuli)),
-        columns=table,
-    )
+        table += [electrodes, _index(electrodes, np.cumsum(lengths))]
+    return _table(TimeIntervals, "stimuli", "Stimulation pulses, one row per pulse.", table)
 
 
 def _recording_table(recording: Recording) -> DynamicTable:
@@ -163,12 +161,8 @@ def _recording_table(recording: Recording) -> DynamicTable:
         ("presentation_pulses", "pulses per trial; 0: unknown", presentation.pulses if presentation else 0),
         ("stimulus_electrode_columns", "width of the padded electrode table", recording.stimuli.electrodes.shape[1]),
     ]
-    return DynamicTable(
-        name="animat_recording",
-        description="The scalars of the recording, one row.",
-        id=np.arange(1),
-        columns=[_column(name, description, [value]) for name, description, value in cells],
-    )
+    columns = [_column(name, description, [value]) for name, description, value in cells]
+    return _table(DynamicTable, "animat_recording", "The scalars of the recording, one row.", columns)
 
 
 def _text(name: str, text: object) -> str:

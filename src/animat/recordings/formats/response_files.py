@@ -74,12 +74,7 @@ def read_response_npz(path: Path) -> ResponseTable:
 
 
 def read_response_table(table: TextTable) -> ResponseTable:
-    """Make a response table from text, wide or long.
-
-    Raises:
-        InvalidFile: for columns that are missing, or cells that are not numbers, with their line.
-        UnusableData: if a column is invalid.
-    """
+    """Make a response table from text, wide or long."""
     is_long = table.place(("channel",)) is not None
     values, kind, labels, first_of = _long(table) if is_long else _wide(table)
     columns: dict[str, Any] = {}

@@ -103,14 +103,9 @@ class TextTable:
 
 
 def read_text_table(path: Path, bare: str | None = None) -> TextTable:
-    """Read a text table in UTF-8, gzipped or not.
+    """Read a text table in UTF-8, gzipped or not, with as many fields in each row as in the header.
 
-    Args:
-        bare: name of the only column of a file without a header; None: a header is required.
-
-    Raises:
-        InvalidFile: if the file is missing, damaged or not such text, or a row has more or fewer fields than the
-            header.
+    A file without a header may be a single column, whose name is `bare`.
     """
     text = _text(path)
     separator = max(",;\t", key=text.lstrip("\r\n").partition("\n")[0].count)

@@ -41,9 +41,6 @@ def open_traces(
     Args:
         part: which recording of a MaxWell file, or which series of an NWB file, if there are several.
         stimuli: which of several candidates are the stimuli, as in `read_recording`.
-
-    Raises:
-        InvalidFile: if the file holds no raw traces, or they are compressed by a filter that is not installed.
     """
     with hdf5_file(Path(path)) as file:
         kind = format_of(file)
