@@ -160,7 +160,7 @@ def test_channels_that_fire_as_no_neurons_do() -> None:
     hum = np.column_stack([np.arange(0, 10, 0.008), np.full(1250, 39)])
     found = {f.name: f for f in recording_findings(recording(np.vstack([usual, hum]), [1, 2], 40, 10.0))}
     assert (found["noisy-channels"].severity, found["noisy-channels"].value) == ("warning", 1)
-    assert "channels that fire as no neuron does: 1 of 40 (39), with 76 % of all spikes" in found["noisy-channels"].message
+    assert "that fire as no neuron does: 1 of 40 (39), with 76 % of all spikes" in found["noisy-channels"].message
     assert (found["silent-channels"].severity, found["silent-channels"].value) == ("note", 9)
     found = {f.name: f for f in recording_findings(recording(usual[:20], [1], 40, 10.0))}
     assert found["silent-channels"].severity == "warning"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def read_npz(path: Path) -> Recording:
     return PlainColumns(**columns).to_recording(provenance, findings)
 
 
-def load_columns(path: Path, known: Iterable[str]) -> tuple[dict[str, Any], list[str], list[str]]:
+def load_columns(path: Path, known: tuple[str, ...]) -> tuple[dict[str, Any], list[str], list[str]]:
     """The known columns of an archive under our names, all of its keys, and those that were left out."""
     columns: dict[str, Any] = {}
     left_out = []

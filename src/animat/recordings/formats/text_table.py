@@ -46,7 +46,7 @@ class TextTable:
     def place(self, names: Sequence[str]) -> int | None:
         """The column of the first of several names in the header, as written or `folded`; None if there is none."""
         for name in names:
-            heads = self.header if name in self.header else map(folded, self.header)
+            heads = self.header if name in self.header else [folded(head) for head in self.header]
             columns = [column for column, head in enumerate(heads) if head == name]
             if len(columns) > 1:
                 twice = " and ".join(repr(self.header[i]) for i in columns[:2])
