@@ -126,6 +126,6 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
         share = float(count[noisy].sum() / n_spikes)
         message = (
             f"channels that fire as no neuron does: {len(noisy):,} of {n:,} ({some_of(channels.label[noisy], NAMED)}), "
-            f"with {100 * share:.0f} % of all spikes: noise; raise their threshold or leave them out of the routing"
+            f"with {100 * share:.0f} % of all spikes; raise their threshold or leave them out of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

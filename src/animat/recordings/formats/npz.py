@@ -48,7 +48,8 @@ def read_npz(path: Path) -> Recording:
             )
         raise InvalidFile(
             f"{path}: expected the keys {', '.join(REQUIRED)}; missing {', '.join(missing)}; found "
-            f"{some_of(keys, 12) or 'none'}" + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
+            f"{some_of([*columns, *left_out], 12) or 'none'}"
+            + next(filter(None, (did_you_mean(key, missing) for key in left_out)), "")
         )
     provenance = {"source": path.name, "format": "NPZ"}
     if "spike_unit" in keys:
