@@ -123,9 +123,9 @@ def _on_channels(recording: Recording) -> Iterator[Finding]:
     most = (count > HOLDS_MOST * n_spikes) if n >= SEVERAL and n_spikes >= 10 * n else np.zeros(n, dtype=bool)
     noisy = np.flatnonzero(fast | most)
     if len(noisy):
-        share = float(count[noisy].sum() / n_spikes)
+        share, names = float(count[noisy].sum() / n_spikes), channels.label[noisy].tolist()
         message = (
-            f"channels that fire as no neuron does: {len(noisy):,} of {n:,} ({some_of(channels.label[noisy], NAMED)}), "
+            f"channels that fire as no neuron does: {len(noisy):,} of {n:,} ({some_of(names, NAMED)}), "
             f"with {100 * share:.0f} % of all spikes; raise their threshold or leave them out of the routing"
         )
         yield Finding("noisy-channels", "warning" if share > 0.1 else "note", message, float(len(noisy)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, Severity
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive, unavailable_filters
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.recording import Recording
@@ -91,7 +91,7 @@ def read_maxwell(
     routed = np.isin(spike_channel, columns["channel_label"])
     if lost := int(np.count_nonzero(~routed)):
         message = f"{lost:,} of {len(routed):,} spikes are on channels without a routed electrode and are left out"
-        severity = "note" if lost < 0.01 * len(routed) else "warning"
+        severity: Severity = "note" if lost < 0.01 * len(routed) else "warning"
         findings.append(Finding("spikes-not-routed", severity, message, float(lost)))
     spike_time_s = (spike_frame[routed].astype(np.int64) - first_frame) / rate_hz
     stimulus_time_s = (stimulus_frame.astype(np.int64) - first_frame) / rate_hz
@@ -129,7 +129,7 @@ def _new(file: Hdf5File, part: str | None) -> _Layout:
         lost = max(last - first + 1 - n for first, last, n in ends)
         if lost > 0:
             message = f"{lost:,} frames ({lost / layout.rate_hz:.3g} s) are missing from the recording"
-            severity = "warning" if lost > 0.001 * max(n for _, _, n in ends) else "note"
+            severity: Severity = "warning" if lost > 0.001 * max(n for _, _, n in ends) else "note"
             layout.findings.append(Finding("frames-lost", severity, message, float(lost)))
     if len(recordings) > 1:
         layout.provenance["part"] = name

@@ -107,7 +107,8 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     values = file.read(at).astype(np.int64)
     if file.has(f"{at}_index"):
         lengths = file.row_lengths(at, values.size)
-        return padded(np.split(values.reshape(-1), np.cumsum(lengths))[:-1]) if len(lengths) == n else None
+        rows = [row.tolist() for row in np.split(values.reshape(-1), np.cumsum(lengths))[:-1]]
+        return padded(rows) if len(rows) == n else None
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
 
 
@@ -126,7 +127,7 @@ def _of_series(file: Hdf5File, at: str) -> Column:
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):
         raise InvalidFile(f"{file.path}: expected the rate of /{at} in Hz at its starting_time, got {rate_hz}")
-    return start_s + _onsets(file, f"{at}/data", float(rate_hz)) / rate_hz
+    return np.asarray(start_s + _onsets(file, f"{at}/data", float(rate_hz)) / rate_hz)
 
 
 def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:

@@ -156,7 +156,7 @@ def _per_stimulus(table: TextTable, place: int, name: str, first_of: Int64[np.nd
         cells, line = table.text(place), table.lines[first_of[row]]
         expected = f"expected {cells[first_of[row]]!r} as in line {line}, of the same stimulus"
         raise table.wrong(row, f"{name}: {expected}, got {cells[row]!r}")
-    return column[np.unique(first_of)]
+    return np.asarray(column[np.unique(first_of)])
 
 
 def _constant(table: TextTable, name: str) -> float | None:
