@@ -19,6 +19,7 @@ from animat.tables import UNKNOWN, expect_times
 
 Column = np.ndarray[Any, Any]
 
+REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 LONGEST_TEXT = 1_000
 """Most characters of a name: an array reserves room for the longest name in every row."""
 

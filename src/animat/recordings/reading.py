@@ -78,7 +78,7 @@ def read_recording(
         raise InvalidArgument(f"start_min: expected finite minutes, got {start_min:g}")
     if start_s is not None and not np.isfinite(start_s):
         raise InvalidArgument(f"start_s: expected finite seconds, got {start_s:g}")
-    source = _read(path, stimuli_path, stimuli, part)
+    source = read_source(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(
             f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read; "
@@ -92,15 +92,14 @@ def read_recording(
 
 
 def read_source(
-    path: str | os.PathLike[str], *, stimuli: str | None = None, part: str | None = None
+    path: str | os.PathLike[str],
+    *,
+    stimuli_path: str | os.PathLike[str] | None = None,
+    stimuli: str | None = None,
+    part: str | None = None,
 ) -> Recording | ResponseTable:
     """Read any source of responses: a recording, or a response table without spikes; see `read_recording`."""
-    return _read(Path(path), None, stimuli, part)
-
-
-def _read(
-    path: Path, stimuli_path: str | os.PathLike[str] | None, stimuli: str | None, part: str | None
-) -> Recording | ResponseTable:
+    path = Path(path)
     begin = first_bytes(path)
     if begin.startswith((HDF5, ZIP)) and stimuli_path is not None:
         raise InvalidArgument(f"stimuli_path: expected only with CSV spikes; {path} holds its own stimuli")

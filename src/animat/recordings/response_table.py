@@ -61,19 +61,14 @@ class ResponseTable:
         shape = (len(self.stimuli), len(self.channels))
         if values.shape != shape:
             raise UnusableData(f"responses: expected rows of stimuli, columns of channels, {shape}, got {values.shape}")
-        wrong = ~np.isfinite(values) | (values < 0)
+        wrong, advice = ~np.isfinite(values) | (values < 0), ""
+        expected = "counts of 0 or more" if self.kind == "count" else "rates in Hz of 0 or more"
+        if self.kind == "count" and not np.any(wrong):
+            wrong, expected = values != np.round(values), "whole spike counts"
+            advice = "; if these are rates in Hz, name them rate_hz"
         if np.any(wrong):
             row, column = np.argwhere(wrong)[0]
-            kind = "counts" if self.kind == "count" else "rates in Hz"
-            raise UnusableData(
-                f"responses: expected {kind} of 0 or more, got {values[row, column]:g} for stimulus {row + 1} "
-                f"on channel {self.channels.label[column]} ({np.count_nonzero(wrong):,} such)"
-            )
-        if self.kind == "count" and np.any(values != np.round(values)):
-            row, column = np.argwhere(values != np.round(values))[0]
-            raise UnusableData(
-                f"responses: expected whole spike counts, got {values[row, column]:g} for stimulus {row + 1} on "
-                f"channel {self.channels.label[column]}; if these are rates in Hz, name them rate_hz"
-            )
+            where = f"for stimulus {row + 1} on channel {self.channels.label[column]}"
+            raise UnusableData(f"responses: expected {expected}, got {values[row, column]:g} {where}{advice}")
         if self.window_ms is not None and not 0 <= self.window_ms[0] < self.window_ms[1] < np.inf:
             raise UnusableData(f"window: expected 0 <= start < end in ms, got {self.window_ms}")

@@ -28,13 +28,9 @@ PAUSE_MS = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Cleaned:
-    """A stretch of traces without artefacts.
+    """A stretch of traces without artefacts, and the samples in which no spikes are searched for.
 
-    Attributes:
-        voltage_uv: shape (channels, samples).
-        is_blank: samples in which no spikes are searched for, shape (channels, samples).
-        saturated: number of saturated channels after each stimulus in the stretch, shape (stimuli,).
-        longest_ms: time after each stimulus until which the last of them was blanked, shape (stimuli,).
+    After each stimulus in it, `saturated` channels are saturated, the last of which is blanked for `longest_ms`.
     """
 
     voltage_uv: Float32[np.ndarray, "channels samples"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from animat.errors import InvalidFile, did_you_mean, some_of
-from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_text_table
 from animat.recordings.recording import Recording
@@ -27,7 +27,6 @@ STIMULUS_COLUMNS = {
     "stimulus_presentation": ("stimulus_presentation", "stim_presentation", "presentation"),
     "stimulus_electrodes": ("stimulus_electrodes", "stim_electrodes", "electrodes"),
 }
-REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 NAMES = ("spike_channel", "stimulus_pattern")
 """Columns that may be text."""
 SUFFIXES = (".csv", ".csv.gz")

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
-from animat.recordings.columns import Column, PlainColumns
+from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import left_out_findings
 from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
-REQUIRED = ("spike_time_s", "spike_channel", "stimulus_time_s")
 KEYS = tuple(field.name for field in fields(PlainColumns))
 UNPACKED_BYTES, UNPACKED_RATIO = 2**26, 20
 SINGLE = ("sampling_rate_hz", "start_min", "start_s", "duration_s", "presentation_pulses", "presentation_order")

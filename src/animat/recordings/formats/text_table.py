@@ -26,11 +26,9 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+", re.ASCII)
 
 @dataclass(frozen=True, eq=False)
 class TextTable:
-    """A table with its cells as text, unchanged from the file.
+    """A table with its header and cells as text, unchanged from the file.
 
     Attributes:
-        header: the column names, unchanged from the file.
-        rows: the cells, as many in each row as in the header.
         lines: the line of the file on which each row ends, counted from 1.
         used: the columns that were looked up.
         findings: methods add to them.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +70,10 @@ def open_with_spikeinterface(
         duration_s=max(duration_s, float(np.max(columns["stimulus_time_s"], initial=0.0))),
         **columns,
     ).to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"})
+    get_traces = partial(recording.get_traces, segment_index=0, return_in_uV=recording.has_scaleable_traces())
 
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
-        has_scale = recording.has_scaleable_traces()
-        return in_microvolts(
-            recording.get_traces(segment_index=0, start_frame=start, end_frame=stop, return_in_uV=has_scale), 1.0
-        )
+        return in_microvolts(get_traces(start_frame=start, end_frame=stop), 1.0)
 
     # Starts at 0 s, as the times of stimuli count from the start of the traces.
     return RawTraces(read_uv, base.channels, samples, rate_hz), base
