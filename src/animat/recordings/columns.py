@@ -64,29 +64,22 @@ class PlainColumns:
             if width > LONGEST_TEXT:
                 raise UnusableData(f"{name}: expected names of at most {LONGEST_TEXT:,} characters, got {width:,}")
         noted = [*findings]
-        spike_time_s, spikes_in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
+        spike_time_s, in_time = _in_time("spike_time_s", self.spike_time_s, "spikes", noted)
         stimulus_time_s, stimuli_in_time = _in_time("stimulus_time_s", self.stimulus_time_s, "stimuli", noted)
         channels, rows = self._channels(len(spike_time_s), noted)
-        patterns, names = self._patterns(len(stimulus_time_s))
-        event_s = np.concatenate([spike_time_s, stimulus_time_s])
         if self.start_s is None:
             noted += late_start(spike_time_s, stimulus_time_s)
+        stimuli, names = self._stimuli(stimulus_time_s, stimuli_in_time, noted)
+        event_s = np.concatenate([spike_time_s, stimulus_time_s])
         start_s = float(event_s.min(initial=0.0) if self.start_s is None else self.start_s)
         stop_s = float(event_s.max(initial=start_s))
-        stimuli = Stimuli(
-            time_s=stimulus_time_s,
-            frequency_hz=self._frequencies(len(stimulus_time_s))[stimuli_in_time],
-            pattern=patterns[stimuli_in_time],
-            electrodes=self._electrodes(len(stimulus_time_s))[stimuli_in_time],
-            presentation=self._presentations(len(stimulus_time_s), stimuli_in_time, noted),
-        )
         presentation = None
         if self.presentation_order is not None or self.presentation_pulses is not None:
             pulses = 1 if self.presentation_pulses is None else self.presentation_pulses
             presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
         return Recording(
             spike_times_s=spike_time_s,
-            spike_channels=rows[spikes_in_time],
+            spike_channels=rows[in_time],
             channels=channels,
             stimuli=stimuli,
             sampling_rate_hz=float(self.sampling_rate_hz),
@@ -136,38 +129,40 @@ class PlainColumns:
             )
         return table, values.astype(np.int64)
 
-    def _frequencies(self, n: int) -> Float64[np.ndarray, " stimuli"]:
-        if self.stimulus_frequency_hz is None:
-            return np.full(n, np.nan)
-        return _numbers("stimulus_frequency_hz", _column("stimulus_frequency_hz", self.stimulus_frequency_hz, n))
-
-    def _patterns(self, n: int) -> tuple[Int64[np.ndarray, " stimuli"], dict[str, str]]:
-        """The pattern of each stimulus, and the patterns' names for the provenance."""
-        if self.stimulus_pattern is None:
-            return np.full(n, UNKNOWN), {}
-        patterns = _names("stimulus_pattern", _column("stimulus_pattern", self.stimulus_pattern, n))
-        if not _is_text(patterns):
-            return patterns, {}
-        named = patterns != ""
-        names, numbers = np.unique(patterns[named], return_inverse=True)
-        index = np.full(n, UNKNOWN)
-        index[named] = numbers
-        return index, {"patterns": ", ".join(f"{i}: {name}" for i, name in enumerate(names))}
+    def _stimuli(
+        self, time_s: Float64[np.ndarray, " stimuli"], in_time: Int64[np.ndarray, " stimuli"], noted: list[Finding]
+    ) -> tuple[Stimuli, dict[str, str]]:
+        """The stimulus table, and the patterns' names for the provenance."""
+        n = len(time_s)
+        frequency_hz, pattern, names = np.full(n, np.nan), np.full(n, UNKNOWN), dict[str, str]()
+        if self.stimulus_frequency_hz is not None:
+            column = _column("stimulus_frequency_hz", self.stimulus_frequency_hz, n)
+            frequency_hz = _numbers("stimulus_frequency_hz", column)
+        if self.stimulus_pattern is not None:
+            pattern = _names("stimulus_pattern", _column("stimulus_pattern", self.stimulus_pattern, n))
+        if _is_text(pattern):
+            # The empty name, of an unknown pattern, comes first.
+            (_, *listed), number = np.unique(np.append("", pattern), return_inverse=True)
+            pattern = number[1:] + UNKNOWN
+            names["patterns"] = ", ".join(f"{i}: {name}" for i, name in enumerate(listed))
+        stimuli = Stimuli(
+            time_s=time_s,
+            frequency_hz=frequency_hz[in_time],
+            pattern=pattern[in_time],
+            electrodes=self._electrodes(n)[in_time],
+            presentation=self._presentations(n, in_time, noted),
+        )
+        return stimuli, names
 
     def _electrodes(self, n: int) -> Int64[np.ndarray, "stimuli electrodes"]:
-        if self.stimulus_electrodes is None:
-            return np.full((n, 1), UNKNOWN)
-        electrodes = np.asarray(self.stimulus_electrodes)
-        if electrodes.ndim == 1:
-            electrodes = electrodes[:, None]
+        given = np.full(n, UNKNOWN) if self.stimulus_electrodes is None else np.asarray(self.stimulus_electrodes)
+        electrodes = given[:, None] if given.ndim == 1 else given
         if electrodes.ndim != 2 or len(electrodes) != n:
             raise UnusableData(f"stimulus_electrodes: expected ({n}, electrodes), padded, got {electrodes.shape}")
         whole = _whole("stimulus_electrodes", electrodes)
         if whole.min(initial=UNKNOWN) < NOTHING:
-            raise UnusableData(
-                f"stimulus_electrodes: expected electrode numbers, with {UNKNOWN} for unknown and {NOTHING} for "
-                f"nothing delivered, got {whole.min()}"
-            )
+            expected = f"electrode numbers, with {UNKNOWN} for unknown and {NOTHING} for nothing delivered"
+            raise UnusableData(f"stimulus_electrodes: expected {expected}, got {whole.min()}")
         return whole
 
     def _presentations(
