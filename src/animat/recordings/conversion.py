@@ -133,10 +133,7 @@ def convert_recording(
     if (detection is not None or reader is not None) and start_s is not None:
         raise InvalidArgument(f"start_s: expected none for raw traces, which state their start, got {start_s:g}")
     if reader is None and detection is not None and stimuli_path is not None:
-        raise InvalidArgument(
-            f"stimuli_path: expected only with CSV spikes or traces read with a reader, got {stimuli_path}, but "
-            f"{path} holds its own stimuli"
-        )
+        raise InvalidArgument(f"stimuli_path: expected only with CSV or a reader; {path} holds its own stimuli")
     if reader is not None:
         traces, base = open_with_spikeinterface(path, reader, stimuli_path=stimuli_path)
         recording = _with_detected_spikes(traces, base, detection, progress)

@@ -81,13 +81,46 @@ def detect_spikes(
     stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
     workers = workers or len(os.sched_getaffinity(0))
     noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
-    sample, channel, saturation, lost = _detect(traces, stimulus, noise_uv, level_uv, settings, workers, progress)
+    margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
+    apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
+    depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
+
+    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, int, np.ndarray, np.ndarray]:
+        piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
+        samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
+        for columns in blocks(len(noise_uv)):
+            cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
+            filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+            if cleaned.is_blank.any():
+                filtered[cleaned.is_blank] = 0.0
+            end = margin + piece.stop - piece.start
+            row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
+            samples.append(sample - margin + piece.start)
+            channels.append(row + columns.start)
+            # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
+            saturation[:, 0] += cleaned.saturated * piece.owned
+            saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
+        return np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost
+
+    samples, channels = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    saturations, lost = np.zeros((len(stimulus), 2)), np.zeros(len(noise_uv), np.int64)
+    starts = range(0, traces.samples, length)
+    with ThreadPoolExecutor(workers) as pool:
+        for done, (sample, channel, first, saturation, lost_in_it) in enumerate(pool.map(of_piece, starts), start=1):
+            samples.append(sample)
+            channels.append(channel)
+            its = saturations[first : first + len(saturation)]
+            its[:, 0] += saturation[:, 0]
+            its[:, 1] = np.maximum(its[:, 1], saturation[:, 1])
+            lost += lost_in_it
+            progress.update(done, len(starts), f"{sum(map(len, samples)):,} spikes")
+    sample, channel = np.concatenate(samples), np.concatenate(channels)
     order = np.lexsort((channel, sample))
     return DetectedSpikes(
         time_s=traces.start_s + sample[order] / rate_hz,
         channel=channel[order],
         noise_uv=noise_uv,
-        findings=(*_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturation, settings)),
+        findings=(*_lost(lost, traces.samples), *_findings(noise_uv, len(stimulus), saturations, settings)),
     )
 
 
@@ -136,54 +169,6 @@ def _filtered(
     if settings.band_hz is None:
         return np.asarray(rows - np.median(rows, axis=1, keepdims=True), dtype=np.float32)
     return band_pass(rows, settings.band_hz, rate_hz)
-
-
-def _detect(
-    traces: RawTraces,
-    stimulus: Int64[np.ndarray, " stimuli"],
-    noise_uv: Float32[np.ndarray, " channels"],
-    level_uv: Float32[np.ndarray, " channels"],
-    settings: Detection,
-    workers: int,
-    progress: Progress,
-) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], np.ndarray, Int64[np.ndarray, " channels"]]:
-    """Samples and channels of the spikes; for each stimulus, how many channels saturate and how long in ms; and the
-    number of lost (non-finite) samples of each channel."""
-    rate_hz = traces.sampling_rate_hz
-    margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
-    apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
-    depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
-
-    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, int, np.ndarray, np.ndarray]:
-        piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
-        samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
-        for columns in blocks(len(noise_uv)):
-            cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
-            filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
-            if cleaned.is_blank.any():
-                filtered[cleaned.is_blank] = 0.0
-            end = margin + piece.stop - piece.start
-            row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
-            samples.append(sample - margin + piece.start)
-            channels.append(row + columns.start)
-            # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
-            saturation[:, 0] += cleaned.saturated * piece.owned
-            saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
-        return np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost
-
-    samples, channels = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    saturations, lost = np.zeros((len(stimulus), 2)), np.zeros(len(noise_uv), np.int64)
-    starts = range(0, traces.samples, length)
-    with ThreadPoolExecutor(workers) as pool:
-        for done, (sample, channel, first, saturation, lost_in_it) in enumerate(pool.map(of_piece, starts), start=1):
-            samples.append(sample)
-            channels.append(channel)
-            its = saturations[first : first + len(saturation)]
-            its[:, 0] += saturation[:, 0]
-            its[:, 1] = np.maximum(its[:, 1], saturation[:, 1])
-            lost += lost_in_it
-            progress.update(done, len(starts), f"{sum(map(len, samples)):,} spikes")
-    return np.concatenate(samples), np.concatenate(channels), saturations, lost
 
 
 def _lost(lost: Int64[np.ndarray, " channels"], samples: int) -> Iterator[Finding]:

@@ -10,7 +10,7 @@ from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
 from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
-from animat.recordings.formats.hdf5 import Hdf5File
+from animat.recordings.formats.hdf5 import Hdf5File, is_positive
 from animat.recordings.formats.stimulus_text import LONGEST, stimulus_columns
 from animat.recordings.recording import Recording
 from animat.tables import padded
@@ -35,7 +35,11 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
             f"{file.path}: expected spikes at /spikes, found none: it was recorded with include_spikes=False; detect "
             "them in its raw traces with animat convert --raw"
         )
-    rate_hz = _rate_hz(file, findings)
+    rates_hz = [file.attribute("/", name) for name in ("frames_per_second", "sampling_frequency")]
+    rate_hz = next((float(rate) for rate in rates_hz if is_positive(rate)), None)
+    if rate_hz is None:
+        rate_hz, message = USUAL_RATE_HZ, "the sampling rate is not in the file: assumed to be 25 kHz"
+        findings.append(Finding("sampling-missing", "warning", message))
     frame, channel = file.columns("spikes", "timestamp", "channel") if spikes else np.empty((2, 0), np.int64)
     n_channels = file.attribute("/", "channel_count")
     if not isinstance(n_channels, int) or not 0 < n_channels <= _LARGEST_CHANNEL_COUNT:
@@ -71,16 +75,6 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
         sampling_rate_hz=rate_hz,
         **columns,
     ).to_recording(provenance, tuple(findings))
-
-
-def _rate_hz(file: Hdf5File, findings: list[Finding]) -> float:
-    for name in ("frames_per_second", "sampling_frequency"):
-        rate = file.attribute("/", name)
-        if isinstance(rate, int | float) and 0 < rate < 1e9:
-            return float(rate)
-    message = "the sampling rate is not in the file: assumed to be 25 kHz"
-    findings.append(Finding("sampling-missing", "warning", message))
-    return USUAL_RATE_HZ
 
 
 def _first_frame(file: Hdf5File, spike: Column, stimulus: Column) -> int:
