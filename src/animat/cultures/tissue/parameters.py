@@ -7,14 +7,12 @@ from typing import Annotated
 from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.records import Number, Positive, Share, Whole, record
+from animat.records import FromZero, Number, Positive, Share, Whole, record
 
 REVISION = 6
 """Revision of the tissue's numerics. Raise it by one when the same seed, parameters and pulses give different spikes,
 whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of another
 revision are then refused instead of being continued as if they were of this tissue."""
-
-FromZero = Annotated[Number, Field(ge=0)]
 
 
 @record
