@@ -50,4 +50,4 @@ def plain_duration(duration_s: Any) -> float:
     duration_s = seconds("duration_s", duration_s)
     if not 0 <= duration_s < float("inf"):
         raise InvalidArgument(f"duration_s: expected a finite number of seconds from 0, got {duration_s}")
-    return duration_s
+    return float(duration_s)
