@@ -1,12 +1,4 @@
-"""The contract of a culture as tests, for authors of cultures.
-
-    class TestMine(CultureContract):
-        def make_culture(self) -> Culture:
-            return MyCulture(...)
-
-makes pytest run them all. `make_culture` returns a new, closed culture each time; simulated ones have the same seed.
-The tests take a few seconds of the culture's time and deliver a few dozen stimuli, all within its limits.
-"""
+"""The contract of a culture as tests, for authors of cultures: pytest runs them all on a subclass, `TestMine`."""
 
 from __future__ import annotations
 
@@ -32,7 +24,10 @@ E = TypeVar("E", bound=Exception)
 
 
 class CultureContract(abc.ABC):
-    """What every culture must do. Override `pulse`, `frequencies_hz` and `is_repeatable` where they do not fit."""
+    """What every culture must do. Override `pulse`, `frequencies_hz` and `is_repeatable` where they do not fit.
+
+    The tests take a few seconds of the culture's time and deliver a few dozen stimuli, all within its limits.
+    """
 
     pulse: Pulse = PUBLISHED_PULSE
     """A pulse that the culture's limits allow."""
@@ -43,7 +38,7 @@ class CultureContract(abc.ABC):
 
     @abc.abstractmethod
     def make_culture(self) -> Culture:
-        """A new culture, closed."""
+        """A new culture, closed; simulated ones have the same seed."""
 
     def lose(self, culture: Culture) -> bool:
         """Make the device of an open or closed culture unreachable from now on; returns whether there is a device."""

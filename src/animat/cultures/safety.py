@@ -92,15 +92,10 @@ class Guard:
         self._stopped = reason if self._stopped is None else self._stopped
 
     def check(self, stimuli: Iterable[Stimulus], now_s: float) -> None:
-        """Raise unless the request as a whole is within the limits; nothing is remembered.
+        """Raise unless a request as a whole is within the limits; nothing is remembered.
 
-        Args:
-            stimuli: in order of time, counted from now.
-            now_s: the culture's clock, float64.
-
-        Raises:
-            UnsafeStimulus: naming the limit, the value, and what to do.
-            InvalidArgument: for anything that is not a stimulus, or a clock less precise than float64.
+        Times ascend and count from `now_s` on the culture's clock, a float64. Raises UnsafeStimulus, naming the limit,
+        the value, and what to do, and InvalidArgument for anything that is not a stimulus or a time.
         """
         self._examine(plain_stimuli(stimuli), seconds("now_s", now_s))
 

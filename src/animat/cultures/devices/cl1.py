@@ -17,7 +17,7 @@ from animat.cultures.devices.cl1_delivery import FRAMES_PER_S, LEAD_US, Session
 from animat.cultures.failures import as_device_failure, describe_error, vendor_module, while_open
 from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine, of_the_program
-from animat.cultures.observed import Observed, Spikes, observed_in_frames
+from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Guard, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
 from animat.extras import install_command
@@ -51,6 +51,8 @@ CL1_LIMITS = Limits(
 CL1_PULSE = Pulse((Phase(160.0, amplitude_ua=-1.0), Phase(160.0, amplitude_ua=1.0)))
 """Balanced, cathodic first, 0.16 nC per phase: the SDK's default pulse for a current of 1 uA."""
 
+Patterns = Sequence[Sequence[int]] | Int64[np.ndarray, "patterns size"]
+
 
 class CL1Culture(Culture):
     """A culture on a CL1, or on the SDK's simulator if that is installed.
@@ -80,7 +82,7 @@ class CL1Culture(Culture):
 
     def __init__(
         self,
-        patterns: Sequence[Sequence[int]] | Int64[np.ndarray, "patterns size"] | None = None,
+        patterns: Patterns | None = None,
         *,
         seed: int = 0,
         ticks_per_s: int = 1000,
@@ -194,7 +196,7 @@ class CL1Culture(Culture):
             return Observed(self.now_s, 0.0, Spikes(np.empty(0), np.empty(0, np.int64)), np.empty(0))
         session, since = while_open(self._session), round(admitted.now_s * FRAMES_PER_S)
         try:
-            start, stop, frame, channel, begun = session.deliver(admitted.stimuli, duration_s, since)
+            observed, not_on_electrodes = session.deliver(admitted.stimuli, duration_s, since)
         except BaseException as error:
             outcome = "what had not begun was interrupted"
             try:
@@ -212,9 +214,8 @@ class CL1Culture(Culture):
                 f"CL1: expected a loop over {duration_s:g} s, got {describe_error(error)}: "
                 f"{outcome}{_remedy(error, session)}"
             ) from error
-        row = _ROW_OF[channel]
-        self.spikes_not_on_electrodes += int(np.count_nonzero(row == UNKNOWN))
-        return observed_in_frames(start, stop, frame, row, begun, FRAMES_PER_S)
+        self.spikes_not_on_electrodes += not_on_electrodes
+        return observed
 
     def _rest(self, duration_s: float) -> None:
         session = while_open(self._session)
@@ -243,10 +244,6 @@ class CL1Culture(Culture):
             self._stack.close()
 
 
-_ROW_OF = np.full(CHANNELS, UNKNOWN, dtype=np.int64)
-_ROW_OF[list(SITES)] = np.arange(len(SITES))
-
-
 def _remedy(error: Exception, session: Session) -> str:
     """What to do if the SDK's simulator was too slow; empty for other errors, and on a device."""
     if "Timeout waiting for timestamp" not in str(error) or not session.cl.is_simulator():
@@ -262,9 +259,7 @@ def _sdk() -> ModuleType:
     )
 
 
-def _check_patterns(
-    patterns: Sequence[Sequence[int]] | Int64[np.ndarray, "patterns size"],
-) -> Int64[np.ndarray, "patterns size"]:
+def _check_patterns(patterns: Patterns) -> Int64[np.ndarray, "patterns size"]:
     rows = [[int(channel) for channel in row if channel != UNKNOWN] for row in patterns]
     for number, row in enumerate(rows):
         if not row or len(set(row)) < len(row):

@@ -11,13 +11,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from animat.cultures.observed import Observed, observed_in_frames
 from animat.cultures.safety import Guard
 from animat.errors import DeviceFailed
-from animat.recordings.formats.cl1_layout import SITES
+from animat.recordings.formats.cl1_layout import CHANNELS, SITES
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 
 FRAMES_PER_S = 25_000
 LEAD_US = 80
@@ -29,7 +30,8 @@ no more than that from the queue."""
 QUEUEING_S = 0.5
 """How long a stop waits while a pulse is being queued."""
 
-Result = tuple[int, int, Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], Float64[np.ndarray, " stimuli"]]
+_ROW_OF = np.full(CHANNELS, UNKNOWN, dtype=np.int64)
+_ROW_OF[list(SITES)] = np.arange(len(SITES))
 
 
 class Session:
@@ -67,12 +69,11 @@ class Session:
         """Stop pulses in progress on every channel, and clear the queue."""
         self.neurons.interrupt(self.cl.ChannelSet(*SITES))
 
-    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float, since: int) -> Result:
+    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float, since: int) -> tuple[Observed, int]:
         """Deliver, and read until `duration_s` after the loop starts, extended by the delay of the stimuli.
 
-        Times of stimuli count from the frame `since`, no later than the start. Returns the first frame, the frame after
-        the last, frames and channels of the spikes, and the frame of each stimulus start; raises DeviceFailed if it was
-        stopped half way, or a pulse never came.
+        Times of stimuli count from the frame `since`, no later than the start. Also returns how many spikes were not on
+        electrodes; raises DeviceFailed if it was stopped half way, or a pulse never came.
         """
         waiting, requested = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
         queued: list[int] = []
@@ -100,8 +101,10 @@ class Session:
                 tick.loop.stop()
         if start is None or waiting:
             raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended early")
-        begun = [_began(stimulus, frame, reported, start) for stimulus, frame in zip(stimuli, queued, strict=True)]
-        return start, stop, np.array(frames, np.int64), np.array(channels, np.int64), np.array(begun, np.float64)
+        began = [_began(stimulus, due, reported, start) for stimulus, due in zip(stimuli, queued, strict=True)]
+        frame_of, row = np.array(frames, np.int64), _ROW_OF[np.array(channels, np.int64)]
+        observed = observed_in_frames(start, stop, frame_of, row, np.array(began, np.float64), FRAMES_PER_S)
+        return observed, int(np.count_nonzero(row == UNKNOWN))
 
     def _check_going(self, queued: int, total: int) -> None:
         if total and self._halted.is_set():

@@ -1,8 +1,4 @@
-"""The simulated tissue as a data source of the CL1's SDK: any CL application runs on it as on a device.
-
-from animat.cultures.devices.cl1_source import use_simulated_culture
-use_simulated_culture(seed=1)          # before `cl.open()`; the SDK's simulator then reacts to stimuli
-"""
+"""The simulated tissue as a data source of the CL1's SDK: any CL application runs on it as on a device."""
 
 from __future__ import annotations
 

@@ -180,10 +180,8 @@ class TissueParameters:
     def __post_init__(self) -> None:
         if self.load_min == self.conduction_min:
             raise InvalidArgument(f"load_min, conduction_min: expected different values, got {self.load_min} twice")
-        for degree, available in (
-            (self.in_degree_e, self.n_excitatory),
-            (self.in_degree_i, self.neurons - self.n_excitatory),
-        ):
+        n_inhibitory = self.neurons - self.n_excitatory
+        for degree, available in ((self.in_degree_e, self.n_excitatory), (self.in_degree_i, n_inhibitory)):
             if not 0 <= degree < available:
                 raise InvalidArgument(
                     f"in_degree_e, in_degree_i: expected fewer synapses than the {available} neurons of that type, "

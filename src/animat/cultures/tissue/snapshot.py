@@ -1,7 +1,4 @@
-"""A tissue's state at one time, and whether a tissue can reach it.
-
-The compiled kernel checks no index and no clock: its arguments must have been checked before.
-"""
+"""A tissue's state at one time, and whether a tissue can reach it: the kernel checks neither indices nor clocks."""
 
 from __future__ import annotations
 
