@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import os
 import threading
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -60,19 +61,14 @@ class Turns:
         self._is_taken = False
         self._lock.release()
 
-    def end(self, wait_s: float) -> None:
-        """Allow no further turn, and wait for the current one to end, up to `wait_s`; below 0: without limit."""
+    def end(self, halt: Callable[[], None], wait_s: float) -> None:
+        """Allow no further turn; halt another thread's, and wait for it up to `wait_s`, below 0 without limit."""
         self._is_over = True
-        if self._lock.acquire(timeout=wait_s):
-            self._lock.release()
-
-    @property
-    def is_taken_elsewhere(self) -> bool:
-        """Whether another thread has the turn now."""
-        if self._lock.acquire(blocking=False):
-            self._lock.release()
-            return False
-        return True
+        if not self._lock.acquire(blocking=False):
+            halt()
+            if not self._lock.acquire(timeout=wait_s):
+                return
+        self._lock.release()
 
 
 class Openable(abc.ABC):
@@ -207,9 +203,7 @@ class Openable(abc.ABC):
                     return
                 try:
                     turns.guard.stop("it was closed")
-                    if turns.is_taken_elsewhere:
-                        self._halt()
-                    turns.end(self.ends_within_s)
+                    turns.end(self._halt, self.ends_within_s)
                 finally:
                     self._close()
 
