@@ -135,10 +135,9 @@ class Culture(Openable):
     def stimulate(
         self, electrodes: Sequence[int], pulse: Pulse, window_ms: tuple[float, float] = (2.0, 10.0)
     ) -> Spikes:
-        """Deliver one pulse now and let time pass to the end of a window after it; raises as `deliver` does.
+        """Deliver one pulse now, and return the spikes with start <= time < end of a window, counted from the pulse.
 
-        Returns:
-            Spikes with start <= time < end of the window, counted from the pulse.
+        Time passes to the window's end. Raises as `deliver` does.
         """
         start_ms, end_ms = (number("window_ms", edge_ms) for edge_ms in window_ms)
         if not 0 <= start_ms < end_ms < float("inf"):

@@ -115,8 +115,7 @@ def record_within(
     If a recording fails half way, only what it had handed to the culture is spent.
 
     Raises:
-        BudgetSpent: if the budget does not cover it; nothing is then delivered.
-        UnsafeStimulus, InvalidArgument: as `Culture.record` does.
+        BudgetSpent: if the budget does not cover it; nothing is then delivered. Others as `Culture.record` does.
     """
     schedule = culture.schedule(protocol, seed)
     by_block = [schedule.deliveries(block) for block in schedule.blocks]

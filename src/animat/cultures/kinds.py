@@ -39,7 +39,6 @@ def culture_of(
         InvalidArgument: for an unknown kind, a seed below 0, a state or a selection for a kind that takes none, or a
             MaxOne without a selection.
         InvalidFile, Mismatch: if the state is damaged, or another culture's.
-        DeviceFailed: for a device whose package is not installed.
     """
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")

@@ -98,8 +98,8 @@ _IS_AS_TIGHT: dict[str, Callable[[Any, Any], bool]] = {
     "kind": operator.eq,
     "phase_us": lambda ours, device: device[0] <= ours[0] and ours[1] <= device[1],
     **dict.fromkeys(("amplitude", "charge_per_phase", "net_charge", "net_charge_per_session"), operator.le),
-    **dict.fromkeys(("stimuli_per_electrode_s", "stimuli_per_s", "stimuli_per_session"), operator.le),
-    **dict.fromkeys(("electrodes_at_once", "phases_per_pulse"), operator.le),
+    **dict.fromkeys(("electrodes_at_once", "phases_per_pulse", "stimuli_per_session"), operator.le),
+    **dict.fromkeys(("stimuli_per_electrode_s", "stimuli_per_s"), operator.le),
     **dict.fromkeys(("alternates", "interval_us", "gap_us"), operator.ge),
     "phase_step_us": is_multiple,
     # The device's own step or 0, which stands for it: with any other, the guard would check a pulse never delivered.

@@ -18,7 +18,6 @@ from animat.stimulation.stimulus import Stimulus, plain_stimuli
 __all__ = ["SIMULATED_LIMITS", "Admitted", "Guard", "Limits"]
 
 _MAY_ADMIT: Final = object()
-_REMEMBERED_PULSES = 1000
 _PACE = frozenset({"overlap", "gap_us", "interval_us", "stimuli_per_electrode_s", "stimuli_per_s"})
 _DELAY_STEP_S = 0.001
 _PATIENCE_S = 2.0
@@ -70,7 +69,7 @@ class Guard:
     ) -> None:
         self.limits = plain_limits(limits)
         self._sites = frozenset(sites)
-        self._net_charge_of = lru_cache(_REMEMBERED_PULSES)(self.check_pulse)
+        self._net_charge_of = lru_cache(1000)(self.check_pulse)
         self._left_on: dict[int, float] = {}
         self._stopped: str | None = None
         self._delivered = 0

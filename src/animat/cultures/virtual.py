@@ -54,9 +54,6 @@ class VirtualCulture(ComputedCulture):
             stay silent, and unseen.
         limits: tighter limits than `SIMULATED_LIMITS`.
         progress: updated during the scan.
-
-    Raises:
-        InvalidArgument: for an invalid setting.
     """
 
     name: ClassVar[str] = "virtual"

@@ -50,9 +50,6 @@ class SimulatedCL1:
         reach_um: of an electrode; assumed, and wider than a CMOS array's, as its electrodes are larger.
         charge_nc: of a pulse of strength 1; assumed: that of the SDK's default pulse for 1 uA (160 us).
         noise_uv: root mean square of the noise.
-
-    Raises:
-        InvalidArgument: for an invalid setting.
     """
 
     def __init__(

@@ -16,8 +16,6 @@ from animat.errors import InvalidArgument
 
 SMALLEST_KICK_MV = 0.5
 """Smaller kicks are left out: they are negligible next to the noise."""
-REMEMBERED_PATTERNS = 10_000
-
 LARGEST_STRENGTH = 2.0
 """Pulses up to twice the full strength are modelled."""
 
@@ -29,10 +27,7 @@ class Pulse:
     Attributes:
         time_s: start, on the tissue's clock.
         x_um, y_um: positions of the electrodes, shape (electrodes,).
-        strength: 1 for the full pulse; kicks and the number of axons reached grow with it in proportion.
-
-    Raises:
-        InvalidArgument: for positions of different shapes, or a strength outside 0 to 2.
+        strength: 0 to 2, 1 for the full pulse; kicks and the number of axons reached grow with it in proportion.
     """
 
     time_s: float
@@ -89,7 +84,7 @@ class Coupling:
         self._kick_factor = rng.lognormal(0.0, parameters.kick_sigma, len(network))
         self._own_latency_ms = parameters.axon_latency_spread_ms * rng.uniform(0, 1, len(network))
         self._reach_of_one = cache(self._find_reach)
-        self._reach_of_all = lru_cache(REMEMBERED_PATTERNS)(self._join_reaches)
+        self._reach_of_all = lru_cache(10_000)(self._join_reaches)
 
     def reach(self, x_um: Float64[np.ndarray, " electrodes"], y_um: Float64[np.ndarray, " electrodes"]) -> Reach:
         """What a pulse on the electrodes at (x, y) reaches; positions are distinguished to 0.1 um."""

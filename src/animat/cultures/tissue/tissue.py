@@ -20,7 +20,6 @@ from animat.cultures.tissue.snapshot import Snapshot, expect_sound
 from animat.errors import InvalidArgument, Mismatch
 
 NS = 1_000_000_000
-MINUTE_NS = 60 * NS
 
 
 class Spikes(NamedTuple):
@@ -47,9 +46,6 @@ class Tissue:
         x_um, y_um: position of each neuron along the array's long and short side, shape (neurons,).
         is_excitatory: type of each neuron, shape (neurons,).
         step_ns: the time step.
-
-    Raises:
-        InvalidArgument: for a negative seed.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:
@@ -113,7 +109,7 @@ class Tissue:
         """Let time pass like `advance`, without keeping the spikes: any duration takes the memory of a minute."""
         end_ns = self._now_ns + _nanoseconds(duration_s)
         while self._now_ns < end_ns:
-            self.advance(min(end_ns - self._now_ns, MINUTE_NS) / NS)
+            self.advance(min(end_ns - self._now_ns, 60 * NS) / NS)
 
     def snapshot(self) -> Snapshot:
         """A copy of the state, for `restore`."""
