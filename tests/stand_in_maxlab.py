@@ -123,9 +123,6 @@ class Stream:
             )
         self.rig.now = max(self.rig.now, frame)
 
-    def forget(self, before: int) -> None:
-        pass
-
     def take(self, start: int, stop: int) -> Any:
         answers = list(self.extra)
         for pulse in reversed(self.rig.delivered):

@@ -279,7 +279,7 @@ def test_a_stop_from_another_thread_lets_nothing_through_after_it(neurons: Neuro
 def test_queueing_that_hangs_does_not_keep_a_stop_from_clearing_the_queue(
     neurons: Neurons, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("animat.cultures.devices.cl1.QUEUEING_S", 0.1)
+    monkeypatch.setattr("animat.cultures.devices.cl1_delivery.QUEUEING_S", 0.1)
     hanging, released, made = threading.Event(), threading.Event(), neurons.create_stim_plan
 
     def plan() -> object:

@@ -99,7 +99,6 @@ def test_every_pulse_that_the_guard_admits_is_one_that_the_sdk_takes(tmp_path: P
     script = """
 import cl
 from animat.cultures.devices.cl1 import CL1_LIMITS
-from animat.cultures.devices.cl1_delivery import Delivery
 from animat.cultures.safety import Guard
 from animat.errors import UnsafeStimulus
 rng, taken, refused, wrongly = np.random.default_rng(0), 0, 0, 0

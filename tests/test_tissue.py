@@ -13,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.cultures.tissue import Pulse, ShortTerm, Spikes, Tissue, TissueParameters
-from animat.cultures.tissue.arrays import Arrivals, State, Wiring
 from animat.cultures.tissue.coupling import Kicks
 from animat.cultures.tissue.drift import Drift
-from animat.cultures.tissue.kernel import AXONAL_KICK_MV, ORDER
+from animat.cultures.tissue.kernel import AXONAL_KICK_MV
 from animat.cultures.tissue.network import _communities, grow
 from animat.cultures.tissue.preparation import block_polynomial, nmda_block, prepare_wiring
 from animat.errors import InvalidArgument, Mismatch
@@ -325,10 +324,6 @@ def test_resting_is_advancing_without_being_watched() -> None:
     rested.rest(125.0)
     assert_same_spikes(rested.advance(1.0), watched.advance(1.0))
     assert rested.now_s == watched.now_s == pytest.approx(126.3)
-
-
-def test_the_compiled_loop_is_made_again_where_the_order_of_its_arrays_changes() -> None:
-    assert tuple(" ".join(each._fields) for each in (Wiring, State, Arrivals)) == ORDER
 
 
 def test_a_clock_may_be_longer_than_32_bits_of_steps() -> None:

@@ -28,9 +28,10 @@ def _plain(value: Any) -> Any:
 
 Whole = Annotated[int, Strict(), BeforeValidator(_plain)]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False), BeforeValidator(_plain)]
-Flag = Annotated[bool, Strict()]
+Flag = Annotated[bool, Strict(), BeforeValidator(_plain)]
 """Strict types, from a file or from numpy: a whole number is accepted as a number; nothing else is converted."""
 Positive = Annotated[Number, Field(gt=0)]
+FromZero = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Seed = Annotated[Whole, Field(ge=0, le=2**32 - 1)]
 """JAX uses 32 bits of a seed: beyond them, two seeds would give the same draws."""

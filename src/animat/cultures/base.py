@@ -18,7 +18,7 @@ from animat.cultures.observed import Observed, Spikes, assemble, more_left_out, 
 from animat.cultures.openable import Openable
 from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
-from animat.errors import AnimatError, InvalidArgument, shown, some_of
+from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.places import electrodes_of
@@ -34,13 +34,10 @@ class Culture(Openable):
     """A culture on an array: open it, stimulate it, record it, let time pass, close it.
 
     Users call final methods, which check their arguments, consult the guard, and then call the backend's methods, whose
-    names begin with an underscore. Only what the guard admitted is delivered: `_deliver` takes `Admitted` stimuli, and
-    only a guard makes them. A culture has its own state and clock; everything takes time on it. Threads may share one:
-    their calls wait for each other, except for `stop`. It cannot be copied.
+    names begin with an underscore. A culture has its own state and clock; everything takes time on it. Threads may
+    share one: their calls wait for each other, except for `stop`. It cannot be copied.
 
-    A backend implements `name`, the data (`channels`, `stimulation_electrodes`, `patterns`, `device_limits`, `now_s`,
-    `sampling_rate_hz`, `provenance`) and `_open`, `_deliver`, `_rest`, `_halt` and `_close`; it passes
-    `animat.cultures.contract.CultureContract`.
+    A backend implements `name` and all that is abstract, and passes `animat.cultures.contract.CultureContract`.
 
     Args:
         limits: tighter limits than the device's; None: the device's.
@@ -49,8 +46,6 @@ class Culture(Openable):
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         _refuse_overrides(cls)
-
-    # A backend's data, valid once it is open.
 
     @property
     @abc.abstractmethod
@@ -70,7 +65,7 @@ class Culture(Openable):
     @property
     @abc.abstractmethod
     def provenance(self) -> dict[str, str]:
-        """The origin of recordings of this culture, by key."""
+        """The origin of recordings of this culture, by key; like all of a backend's data, valid once it is open."""
 
     @property
     def recorded_as(self) -> RecordedCulture | None:
@@ -87,34 +82,26 @@ class Culture(Openable):
         """How much of a block `record` requests at a time; None: all of it, as the clock runs between calls."""
         return None
 
-    # A backend's methods.
-
     @abc.abstractmethod
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         """Deliver stimuli at their times after `admitted.now_s`, let `duration_s` pass, and return the observation."""
-
-    # The user's methods.
 
     @final
     def deliver(self, stimuli: Iterable[Stimulus], duration_s: float, *, since_s: float | None = None) -> Observed:
         """Deliver stimuli within the next `duration_s` and observe all channels meanwhile.
 
-        A living culture's clock runs on while a program decides what to request. A caller that counted times from a
-        reading of that clock passes it as `since_s`: the time that has passed since is subtracted, so that stimuli come
-        when they are due. If the first one is overdue, it comes now and the others keep their intervals after it.
-
         Args:
             stimuli: in order of time, counted from now, or from `since_s`. For a rest (`Stimulus.is_rest`) nothing is
                 delivered.
             duration_s: how long, zero or more; all stimuli begin within it. All times are float64.
-            since_s: a reading of `now_s`; None: now.
+            since_s: a reading of `now_s`, as a living culture's clock runs on while a program decides what to request;
+                None: now. If the first stimulus is overdue, it comes now, and the others keep their intervals after it.
 
         Raises:
             UnsafeStimulus: naming the limit that one of them exceeds; nothing is then delivered, and no time passes.
             InvalidArgument: for a culture that is not open, stimuli outside this stretch of time, a time less precise
                 than float64, or a `since_s` that the clock has not reached.
-            DeviceFailed: if the device fails meanwhile; if the error's `is_admitted` is true, it is not known whether
-                the request was delivered.
+            DeviceFailed: if the device fails meanwhile; with `is_admitted` true, the request may have been delivered.
         """
         turns, request, admitted = self._opened(), Request.of(stimuli, duration_s), None
         try:
@@ -139,12 +126,7 @@ class Culture(Openable):
 
     @final
     def rest(self, duration_s: float) -> None:
-        """Let time pass unobserved.
-
-        Raises:
-            InvalidArgument: for a culture that is not open, or a negative time.
-            DeviceFailed: if the device fails meanwhile.
-        """
+        """Let time pass unobserved; raises as `deliver` does."""
         turns, duration_s = self._opened(), plain_duration(duration_s)
         with as_device_failure(self.name, "rest"), turns:
             self._rest(duration_s)
@@ -153,18 +135,9 @@ class Culture(Openable):
     def stimulate(
         self, electrodes: Sequence[int], pulse: Pulse, window_ms: tuple[float, float] = (2.0, 10.0)
     ) -> Spikes:
-        """Deliver one pulse now and return the spikes of a window after it; time passes to the window's end.
+        """Deliver one pulse now, and return the spikes with start <= time < end of a window, counted from the pulse.
 
-        Args:
-            electrodes: pulsed together.
-            pulse: that each delivers.
-            window_ms: start and end of the window after the pulse.
-
-        Returns:
-            Spikes with start <= time < end, counted from the pulse.
-
-        Raises:
-            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
+        Time passes to the window's end. Raises as `deliver` does.
         """
         start_ms, end_ms = (number("window_ms", edge_ms) for edge_ms in window_ms)
         if not 0 <= start_ms < end_ms < float("inf"):
@@ -183,18 +156,17 @@ class Culture(Openable):
             InvalidArgument: for anything that is not a protocol, places with electrodes that do not stimulate the
                 culture, or more patterns than it has.
         """
-        if not isinstance(protocol, Protocol):
-            raise InvalidArgument(f"protocol: expected a Protocol, such as Protocol(trials=5), got {shown(protocol)}")
-        table, electrodes = self.channels, np.array(self.stimulation_electrodes, np.int64)
+        expect_kind("protocol", protocol, Protocol, "a Protocol, such as Protocol(trials=5)")
+        table, sites = self.channels, self.stimulation_electrodes
         row_of = {electrode: row for row, electrode in enumerate(table.electrode.tolist())}
-        rows = [row_of.get(electrode, UNKNOWN) for electrode in electrodes.tolist()]
+        rows = [row_of.get(electrode, UNKNOWN) for electrode in sites]
         # An electrode that is not recorded has no known position.
         x_um, y_um = (np.append(positions, np.nan)[rows] for positions in (table.x_um, table.y_um))
-        places = electrodes_of(protocol.places, electrodes, x_um, y_um)
-        if strange := sorted({*chain(*places)} - {*electrodes.tolist()}):
+        places = electrodes_of(protocol.places, np.array(sites, np.int64), x_um, y_um)
+        if strange := sorted({*chain(*places)} - {*sites}):
             raise InvalidArgument(
-                f"places: expected electrodes among the {len(electrodes)} that stimulate this culture "
-                f"({some_of(sorted(electrodes.tolist()))}), got {some_of(strange)}"
+                f"places: expected electrodes among the {len(sites)} that stimulate this culture "
+                f"({some_of(sorted(sites))}), got {some_of(strange)}"
             )
         return make_schedule(protocol, self.patterns, seed, places=places)
 
@@ -209,7 +181,7 @@ class Culture(Openable):
         """Stimulate by a protocol and record.
 
         The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
-        recording's clock, on which blocks follow one another directly.
+        recording's clock, on which blocks follow one another directly. Raises as `deliver` does.
 
         Args:
             protocol: what to do; it is kept with the recording.
@@ -217,29 +189,17 @@ class Culture(Openable):
             progress: updated after each block, or stretch of one (`stretch_s`).
             follow: then called, except at the end, with a function that returns the recording so far. The time it takes
                 is subtracted from the next set-up time.
-
-        Raises:
-            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
-        schedule = self.schedule(protocol, seed)
-        progress = progress or Silent()
+        schedule, progress = self.schedule(protocol, seed), progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}
         self._rehearse(schedule)
-        before, recorded_as = self.left_out, self.recorded_as
-        start_min = self.now_s / 60
-        parts: list[Block] = []
-        observed: list[Observed] = []
+        about = {"channels": self.channels, "culture": self.recorded_as, "provenance": provenance}
+        start_min, rate_hz, before = self.now_s / 60, self.sampling_rate_hz, self.left_out
+        parts, observed = list[Block](), list[Observed]()
 
         def so_far() -> Recording:
-            return assemble(
-                replace(schedule, blocks=tuple(parts)),
-                observed,
-                channels=self.channels,
-                sampling_rate_hz=self.sampling_rate_hz,
-                start_min=start_min,
-                provenance=provenance,
-                culture=recorded_as,
-            )
+            blocks = replace(schedule, blocks=tuple(parts))
+            return assemble(blocks, observed, sampling_rate_hz=rate_hz, start_min=start_min, **about)
 
         followed_s = 0.0
         for done, block in enumerate(schedule.blocks):
@@ -259,15 +219,14 @@ class Culture(Openable):
 
     def _rehearse(self, schedule: Schedule) -> None:
         """Have the guard check the whole schedule, each block at its time, and deliver nothing."""
-        turns, offset_s, stimuli = self._opened(), 0.0, list[Stimulus]()
+        offset_s, pulses = 0.0, list[Stimulus]()
         for block in schedule.blocks:
             offset_s += block.setup_s
-            for stimulus in schedule.deliveries(block):
-                if not stimulus.is_rest:
-                    stimuli.append(Stimulus(offset_s + stimulus.time_s, stimulus.electrodes, stimulus.pulse))
+            stimuli = schedule.deliveries(block)
+            pulses += [replace(each, time_s=offset_s + each.time_s) for each in stimuli if not each.is_rest]
             offset_s += block.duration_s
-        with turns as guard:
-            guard.check(stimuli, self.now_s)
+        with self._opened() as guard:
+            guard.check(pulses, self.now_s)
 
 
 _BEFORE_ALL = ("__getattribute__", "__setattr__", "__delattr__", "__copy__", "__deepcopy__")
@@ -277,10 +236,7 @@ _REPLACEABLE = ("__init__", "left_out", "device", "recorded_as", "stretch_s")
 
 
 def _refuse_overrides(cls: type[Culture]) -> None:
-    """Raise TypeError for a subclass that replaces anything else of `Culture`, private or not.
-
-    Names inherited from a base class that precedes `Culture` count too.
-    """
+    """Raise TypeError for a subclass that replaces anything else of `Culture`, even through another base class."""
     own = {
         name: member
         for kind in reversed(Culture.__mro__)
@@ -292,24 +248,20 @@ def _refuse_overrides(cls: type[Culture]) -> None:
     } | {name: getattr_static(Culture, name, None) for name in _BEFORE_ALL}
     for name, member in own.items():
         if getattr_static(cls, name, None) is not member:
-            raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement the methods that its docstring names")
+            raise TypeError(f"{cls.__name__}.{name}: final in Culture; implement only what is abstract")
 
 
 class ComputedCulture(Culture):
-    """A culture that a program computes: a delivery ends within its call, and there is nothing to release.
-
-    Reopened, it continues where it was. Its arguments are those of `Culture`.
-    """
+    """A culture that a program computes: a delivery ends within its call; reopened, it continues where it was."""
 
     ends_within_s: ClassVar[float] = -1
 
     @property
     def device_limits(self) -> Limits:
-        """`SIMULATED_LIMITS`."""
         return SIMULATED_LIMITS
 
     def _halt(self) -> None:
         """Do nothing: the guard refuses the next delivery."""
 
     def _close(self) -> None:
-        """Do nothing: it stays in memory, and continues where it was when it is reopened."""
+        """Do nothing: it stays in memory."""

@@ -41,11 +41,7 @@ class Budget:
 
 
 class Account:
-    """What was spent of a budget, in recordings and closed loops alike.
-
-    Args:
-        budget: the allowance.
-    """
+    """What was spent of a budget, in recordings and closed loops alike."""
 
     def __init__(self, budget: Budget | None = None) -> None:
         self.budget = budget or Budget()
@@ -58,11 +54,7 @@ class Account:
         return max(self._on.values(), default=0)
 
     def check(self, stimuli: Sequence[Stimulus]) -> None:
-        """Raise unless the budget covers these stimuli too.
-
-        Raises:
-            BudgetSpent: naming what would be exceeded; nothing is entered.
-        """
+        """Raise `BudgetSpent`, naming what would be exceeded, unless the budget covers these stimuli too."""
         self.check_number(_pulses(stimuli))
         most = self.budget.pulses_per_electrode
         if most is None:
@@ -118,39 +110,37 @@ def record_within(
     progress: Progress | None = None,
     follow: Callable[[Callable[[], Recording]], None] | None = None,
 ) -> Recording:
-    """Record by a protocol if the budget covers all of it.
+    """Record by a protocol, as `Culture.record` does, if the budget covers all of it.
 
-    If a recording fails half way, only what it had handed to the culture is spent. Other arguments are those of
-    `Culture.record`.
+    If a recording fails half way, only what it had handed to the culture is spent.
 
     Raises:
-        BudgetSpent: if the budget does not cover it; nothing is then delivered.
-        UnsafeStimulus, InvalidArgument: as `Culture.record` does.
+        BudgetSpent: if the budget does not cover it; nothing is then delivered. Others as `Culture.record` does.
     """
     schedule = culture.schedule(protocol, seed)
     by_block = [schedule.deliveries(block) for block in schedule.blocks]
     account.check([stimulus for stimuli in by_block for stimulus in stimuli])
-    blocks = _Blocks(progress or Silent())
+    handed_over = _HandedOver(progress or Silent())
     try:
-        return culture.record(protocol, seed, blocks, follow)
+        return culture.record(protocol, seed, handed_over, follow)
     except BaseException as error:
         # Only an error of the culture shows that the current block was refused; not once part of it was delivered.
-        if not blocks.is_within_one:
-            blocks.handed_over += not isinstance(error, AnimatError) or error.is_admitted
+        if handed_over.blocks.is_integer():
+            handed_over.blocks += not isinstance(error, AnimatError) or error.is_admitted
         raise
     finally:
-        account.spend([stimulus for stimuli in by_block[: blocks.handed_over] for stimulus in stimuli])
+        begun = by_block[: math.ceil(handed_over.blocks)]
+        account.spend([stimulus for stimuli in begun for stimulus in stimuli])
 
 
-class _Blocks:
-    """Counts the blocks that this recording began: the culture's own count covers every thread."""
+class _HandedOver:
+    """Counts the blocks of this recording that were delivered: the culture's own count covers every thread."""
 
     def __init__(self, progress: Progress) -> None:
-        self._progress, self.handed_over, self.is_within_one = progress, 0, False
+        self._progress, self.blocks = progress, 0.0
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self.handed_over = math.ceil(done)
-        self.is_within_one = done != self.handed_over
+        self.blocks = done
         self._progress.update(done, total, note)
 
 

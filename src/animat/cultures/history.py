@@ -32,7 +32,7 @@ class History:
         """When the last stimulus ends."""
 
     def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
-        """Stimuli, on one electrode or on any, that began less than a second before a time, the last start or later."""
+        """Stimuli, on one electrode or on any, that began less than a second before a time not before the last."""
         starts = self._starts if electrode is None else self._starts_on.get(electrode, ())
         return len(starts) - bisect_right(starts, time_ns - NS)
 

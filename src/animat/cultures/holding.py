@@ -29,14 +29,10 @@ def of_the_program(device: str) -> Path:
 
 @contextmanager
 def hold(device: Path, holder: str) -> Iterator[bool]:
-    """Hold a device exclusively until the block or the process ends; yields whether another holder had it last.
-
-    Args:
-        device: the folder that represents it.
-        holder: a unique name.
+    """Hold a device exclusively until the block or the process ends; yields whether another `holder` had it last.
 
     Raises:
-        DeviceFailed: if another one holds it, or the folder cannot be used.
+        DeviceFailed: if another one holds it, or the folder that represents it cannot be used.
     """
     with ExitStack() as stack:
         try:

@@ -39,16 +39,12 @@ def culture_of(
         InvalidArgument: for an unknown kind, a seed below 0, a state or a selection for a kind that takes none, or a
             MaxOne without a selection.
         InvalidFile, Mismatch: if the state is damaged, or another culture's.
-        DeviceFailed: for a device whose package is not installed.
     """
     if seed < 0:
         raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
-    if state is not None and kind != "virtual":
-        raise InvalidArgument(f"state: expected none for a culture of kind {kind!r}, got {state}")
-    if selection is None and kind == "maxone":
-        raise InvalidArgument("selection: expected a file of electrodes for a culture of kind 'maxone', got none")
-    if selection is not None and kind != "maxone":
-        raise InvalidArgument(f"selection: expected none for a culture of kind {kind!r}, got {selection}")
+    for name, value, taken_by in (("state", state, "virtual"), ("selection", selection, "maxone")):
+        if value is not None and kind != taken_by:
+            raise InvalidArgument(f"{name}: expected none for a culture of kind {kind!r}, got {value}")
     if kind == "virtual":
         from animat.cultures.virtual import VirtualCulture
 
@@ -64,10 +60,12 @@ def culture_of(
         from animat.cultures.devices.cl1 import CL1Culture
 
         return CL1Culture(seed=seed)
-    if kind == "maxone" and selection is not None:
+    if kind == "maxone":
         from animat.cultures.devices.maxone import MaxOneCulture
         from animat.stimulation.selection import Selection
 
+        if selection is None:
+            raise InvalidArgument("selection: expected a file of electrodes for a culture of kind 'maxone', got none")
         return MaxOneCulture(Selection.load(selection))
     raise InvalidArgument(f"culture: expected one of {', '.join(get_args(CultureKind))}, got {kind!r}")
 
@@ -85,8 +83,7 @@ def pulse_for(kind: CultureKind) -> Pulse:
 def recorded_culture(kind: CultureKind, recordings: Sequence[Recording], files: Sequence[Path]) -> dict[str, Any]:
     """Arguments of `culture_of` that recreate the recorded culture, as far as they are known.
 
-    For a virtual culture these are its seed, and the state that was written after the recordings; for a CL1 the seed of
-    its patterns, so that it is stimulated through the same electrodes as in the recordings.
+    For a virtual culture its seed, and the state written after the recordings; for a CL1 the seed of its patterns.
     """
     culture = recordings[0].culture if recordings else None
     if culture is None or culture.kind != kind or culture.seed is None:

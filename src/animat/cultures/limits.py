@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from math import floor, isfinite
-from typing import Any
+from dataclasses import fields, replace
+from math import floor
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.stimulation.plain import number, whole_number
+from animat.records import Flag, FromZero, Positive, Whole, record
 from animat.stimulation.pulse import Kind, Pulse
 
+Count = Annotated[Whole, Field(ge=0)]
 
-@dataclass(frozen=True)
+
+@record
 class Limits:
     """What a culture and its device tolerate. Amplitudes are in mV and charges in mV ms where `kind` is `"voltage"`, in
-    uA and nC where it is `"current"` (see `Phase.charge`). Numbers of any type are converted to Python's own.
+    uA and nC where it is `"current"` (see `Phase.charge`).
 
     Attributes:
         kind: what the device controls during a phase.
@@ -24,8 +28,7 @@ class Limits:
         phase_us: shortest and longest phase.
         charge_per_phase: largest magnitude of a phase's charge.
         net_charge: largest magnitude of the sum of a pulse's charges: its imbalance.
-        net_charge_per_session: largest magnitude of the net charge on any one electrode, summed over pulses from `open`
-            to `close`.
+        net_charge_per_session: largest magnitude of the net charge on any one electrode, from `open` to `close`.
         electrodes_at_once: most electrodes of one stimulus.
         stimuli_per_electrode_s: most stimuli on one electrode in any second.
         stimuli_per_s: most stimuli on all electrodes in any second.
@@ -43,43 +46,25 @@ class Limits:
     """
 
     kind: Kind
-    amplitude: float
-    phase_us: tuple[float, float]
-    charge_per_phase: float
-    net_charge: float
-    net_charge_per_session: float
-    electrodes_at_once: int
-    stimuli_per_electrode_s: int
-    stimuli_per_s: int
-    stimuli_per_session: int
-    phases_per_pulse: int = 1000
-    alternates: bool = False
-    phase_step_us: float = 0.0
-    amplitude_step: float = 0.0
-    interval_us: float = 0.0
-    gap_us: float = 0.0
+    amplitude: FromZero
+    phase_us: tuple[Positive, Positive]
+    charge_per_phase: FromZero
+    net_charge: FromZero
+    net_charge_per_session: FromZero
+    electrodes_at_once: Count
+    stimuli_per_electrode_s: Count
+    stimuli_per_s: Count
+    stimuli_per_session: Count
+    phases_per_pulse: Count = 1000
+    alternates: Flag = False
+    phase_step_us: FromZero = 0.0
+    amplitude_step: FromZero = 0.0
+    interval_us: FromZero = 0.0
+    gap_us: FromZero = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in ("voltage", "current"):
-            raise InvalidArgument(f"kind: expected 'voltage' or 'current', got {self.kind!r}")
-        try:
-            shortest, longest = (number("phase_us", value) for value in self.phase_us)
-        except (TypeError, ValueError):
-            shortest = longest = 0.0
-        if not (0 < shortest <= longest and isfinite(longest)):
-            raise InvalidArgument(f"phase_us: expected (shortest, longest), above 0 and finite, got {self.phase_us}")
-        object.__setattr__(self, "phase_us", (shortest, longest))
-        alternates = getattr(self.alternates, "item", lambda: self.alternates)()
-        if type(alternates) is not bool:
-            raise InvalidArgument(f"alternates: expected True or False, got {self.alternates!r}")
-        object.__setattr__(self, "alternates", alternates)
-        for field in fields(Limits):
-            if field.type in ("float", "int"):
-                convert = number if field.type == "float" else whole_number
-                value = convert(field.name, getattr(self, field.name))
-                if not (isfinite(value) and value >= 0):
-                    raise InvalidArgument(f"{field.name}: expected a finite number from 0, got {value}")
-                object.__setattr__(self, field.name, value)
+        if self.phase_us[0] > self.phase_us[1]:
+            raise InvalidArgument(f"phase_us: expected (shortest, longest), got {self.phase_us}")
 
     @property
     def units(self) -> tuple[str, str]:
@@ -87,11 +72,7 @@ class Limits:
         return ("mV", "mV ms") if self.kind == "voltage" else ("uA", "nC")
 
     def check_within(self, device: Limits) -> None:
-        """Raise unless these limits are at least as tight as the device's.
-
-        Raises:
-            InvalidArgument: naming the limit that is looser.
-        """
+        """Raise InvalidArgument, naming the limit, unless these are at least as tight as the device's."""
         for field in fields(Limits):
             ours, theirs = getattr(self, field.name), getattr(device, field.name)
             if not _IS_AS_TIGHT[field.name](ours, theirs):
@@ -102,11 +83,7 @@ class Limits:
 
 
 def plain_limits(limits: Limits) -> Limits:
-    """A copy of limits as plain `Limits`, even from a subclass.
-
-    Raises:
-        InvalidArgument: for anything that is not `Limits`.
-    """
+    """A copy of limits as plain `Limits`, even from a subclass."""
     if not isinstance(limits, Limits):
         raise InvalidArgument(f"limits: expected Limits, got {type(limits).__name__}")
     return Limits(**{field.name: getattr(limits, field.name) for field in fields(Limits)})
@@ -121,14 +98,12 @@ _IS_AS_TIGHT: dict[str, Callable[[Any, Any], bool]] = {
     "kind": operator.eq,
     "phase_us": lambda ours, device: device[0] <= ours[0] and ours[1] <= device[1],
     **dict.fromkeys(("amplitude", "charge_per_phase", "net_charge", "net_charge_per_session"), operator.le),
-    **dict.fromkeys(("stimuli_per_electrode_s", "stimuli_per_s", "stimuli_per_session"), operator.le),
-    **dict.fromkeys(("electrodes_at_once", "phases_per_pulse"), operator.le),
-    "alternates": operator.ge,
+    **dict.fromkeys(("electrodes_at_once", "phases_per_pulse", "stimuli_per_session"), operator.le),
+    **dict.fromkeys(("stimuli_per_electrode_s", "stimuli_per_s"), operator.le),
+    **dict.fromkeys(("alternates", "interval_us", "gap_us"), operator.ge),
     "phase_step_us": is_multiple,
     # The device's own step or 0, which stands for it: with any other, the guard would check a pulse never delivered.
     "amplitude_step": lambda ours, device: ours in (0.0, device),
-    "interval_us": operator.ge,
-    "gap_us": operator.ge,
 }
 """For each limit, whether a requested value is at least as tight as the device's; a limit missing here is an error."""
 
@@ -154,8 +129,8 @@ def delivered_pulse(pulse: Pulse, amplitude_step: float) -> Pulse:
     if amplitude_step == 0:
         return pulse
     unit = "amplitude_mv" if pulse.kind == "voltage" else "amplitude_ua"
-    steps = [steps_of(phase.amplitude, amplitude_step) for phase in pulse.phases]
-    return Pulse(tuple(replace(p, **{unit: n * amplitude_step}) for p, n in zip(pulse.phases, steps, strict=True)))
+    rounded = [steps_of(phase.amplitude, amplitude_step) * amplitude_step for phase in pulse.phases]
+    return Pulse(tuple(replace(p, **{unit: value}) for p, value in zip(pulse.phases, rounded, strict=True)))
 
 
 def steps_of(amplitude: float, amplitude_step: float) -> int:

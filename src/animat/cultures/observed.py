@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.recording import Recording
 from animat.stimulation.schedule import Schedule
 from animat.stimulation.stimulus import Stimuli, Stimulus
+from animat.tables import UNKNOWN
+
+Rows = Int64[np.ndarray, " spikes"]
 
 
 class Spikes(NamedTuple):
@@ -43,57 +46,45 @@ class Observed:
     stimulus_time_s: Float64[np.ndarray, " stimuli"]
 
 
+def observed_in_frames(
+    start: int, stop: int, frame: Rows, row: Rows, begun: Float64[np.ndarray, " stimuli"], rate: int, zero: int = 0
+) -> Observed:
+    """What a device with `rate` frames a second saw from frame `start` to `stop`, without spikes on `UNKNOWN` rows.
+
+    `begun` are the frames in which stimuli began, and `zero` is that in which the culture's clock is 0.
+    """
+    frame, row = frame[row != UNKNOWN], row[row != UNKNOWN]
+    order = np.lexsort((row, frame))
+    spikes = Spikes((frame[order] - start) / rate, row[order])
+    return Observed((start - zero) / rate, (stop - start) / rate, spikes, (begun - start) / rate)
+
+
 def with_rests(observed: Observed, stimuli: Sequence[Stimulus], now_s: float) -> Observed:
-    """The observation with the times of rests inserted among those of the delivered stimuli.
+    """The observation of a delivery with the times of all requested stimuli, rests among them, counted from `now_s`.
 
     A rest comes at its requested time, plus the delay of the stimulus delivered before it.
-
-    Args:
-        observed: of the delivery, without times of rests.
-        stimuli: all that were requested, in order of time.
-        now_s: the zero of their times, on the culture's clock.
     """
     if not any(stimulus.is_rest for stimulus in stimuli):
         return observed
-    is_rest = np.array([stimulus.is_rest for stimulus in stimuli])
-    requested_s = np.array([stimulus.time_s for stimulus in stimuli]) + (now_s - observed.start_s)
-    late_s = np.zeros(len(stimuli))
-    late_s[~is_rest] = observed.stimulus_time_s - requested_s[~is_rest]
-    before = np.maximum.accumulate(np.where(is_rest, -1, np.arange(len(stimuli))))
-    late_s = np.where(before < 0, 0.0, late_s[before])
-    time_s = np.maximum(0.0, requested_s + late_s)
-    time_s[~is_rest] = observed.stimulus_time_s
-    return replace(observed, stimulus_time_s=time_s)
+    began_s, late_s, times_s = iter(observed.stimulus_time_s.tolist()), 0.0, []
+    for stimulus in stimuli:
+        requested_s = stimulus.time_s + (now_s - observed.start_s)
+        if stimulus.is_rest:
+            times_s.append(max(0.0, requested_s + late_s))
+        else:
+            times_s.append(next(began_s))
+            late_s = times_s[-1] - requested_s
+    return replace(observed, stimulus_time_s=np.array(times_s))
 
 
-def assemble(
-    schedule: Schedule,
-    observed: Sequence[Observed],
-    *,
-    channels: Channels,
-    sampling_rate_hz: float,
-    start_min: float,
-    provenance: Mapping[str, str],
-    culture: RecordedCulture | None,
-) -> Recording:
-    """The blocks of a schedule, concatenated on one clock, as a recording.
+def assemble(schedule: Schedule, observed: Sequence[Observed], *, sampling_rate_hz: float, **about: Any) -> Recording:
+    """A recording from the observations of a schedule's blocks, concatenated on one clock and rounded to samples.
 
-    Args:
-        schedule: as delivered.
-        observed: the observation of each block.
-        channels: of the culture.
-        sampling_rate_hz: of the samples to which times are rounded.
-        start_min: of the recording on the culture's clock.
-        provenance, culture: of the recording.
-
-    Returns:
-        The recording; it ends with the sample in which the last block ends.
+    It ends with the sample in which the last block ends. Other arguments are those of `Recording`.
     """
     starts_s = np.cumsum([0.0, *(block.duration_s for block in observed)])
     tables = [block.stimuli for block in schedule.blocks]
-    columns = {
-        column.name: np.concatenate([getattr(table, column.name) for table in tables]) for column in fields(Stimuli)
-    }
+    columns = {each.name: np.concatenate([getattr(table, each.name) for table in tables]) for each in fields(Stimuli)}
 
     def on_samples(parts: Sequence[Float64[np.ndarray, " times"]]) -> Float64[np.ndarray, " times"]:
         # Adding the blocks' starts introduces rounding errors.
@@ -103,21 +94,17 @@ def assemble(
     return Recording(
         spike_times_s=on_samples([block.spikes.time_s for block in observed]),
         spike_channels=np.concatenate([block.spikes.channel for block in observed]),
-        channels=channels,
         stimuli=Stimuli(**columns | {"time_s": on_samples([block.stimulus_time_s for block in observed])}),
         sampling_rate_hz=sampling_rate_hz,
         start_s=0.0,
         # A block may end between two samples; what is rounded to the later one must be within. Rounding errors aside.
         duration_s=float(np.ceil(starts_s[-1] * sampling_rate_hz - 1e-6) / sampling_rate_hz),
-        start_min=start_min,
         presentation=schedule.protocol.presentation,
-        provenance=provenance,
         protocol=schedule.protocol,
-        culture=culture,
+        **about,
     )
 
 
 def more_left_out(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
     """The counts left out between two readings that are not zero."""
-    more = {what: count - before.get(what, 0) for what, count in after.items()}
-    return {what: count for what, count in more.items() if count}
+    return {what: more for what, count in after.items() if (more := count - before.get(what, 0))}

@@ -5,13 +5,13 @@ from __future__ import annotations
 import abc
 import os
 import threading
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, ClassVar, NoReturn, Self, final
 
-from animat.cultures.failures import as_device_failure
+from animat.cultures.failures import as_device_failure, while_open
 from animat.cultures.history import History
 from animat.cultures.holding import hold
 from animat.cultures.limits import Limits, plain_limits
@@ -28,9 +28,6 @@ class Turns:
 
     Each session has its own, so that a call that hangs in an earlier session blocks nothing in the next. Waiting calls
     are refused when the guard is stopped, as the call they wait for may never end.
-
-    Args:
-        guard: of the session.
     """
 
     def __init__(self, guard: Guard) -> None:
@@ -45,14 +42,13 @@ class Turns:
         return self._process != os.getpid()
 
     def __enter__(self) -> Guard:
-        if not self._lock.acquire(blocking=False):
-            while not self._lock.acquire(timeout=_LOOK_S):
-                if (reason := self.guard.stopped) is not None:
-                    raise UnsafeStimulus(
-                        "stopped",
-                        f"an emergency stop is in force ({reason}) and a call from another thread has not returned: "
-                        "close and open again",
-                    )
+        while not self._lock.acquire(timeout=_LOOK_S):
+            if (reason := self.guard.stopped) is not None:
+                raise UnsafeStimulus(
+                    "stopped",
+                    f"an emergency stop is in force ({reason}) and a call from another thread has not returned: "
+                    "close and open again",
+                )
         if self._is_over or self._is_taken:
             self._lock.release()
             if self._is_over:
@@ -65,31 +61,18 @@ class Turns:
         self._is_taken = False
         self._lock.release()
 
-    def end(self, wait_s: float) -> None:
-        """Allow no further turn, and wait for the current one to end.
-
-        Args:
-            wait_s: how long to wait at most; below 0: without limit.
-        """
+    def end(self, halt: Callable[[], None], wait_s: float) -> None:
+        """Allow no further turn; halt another thread's, and wait for it up to `wait_s`, below 0 without limit."""
         self._is_over = True
-        if self._lock.acquire(timeout=wait_s):
-            self._lock.release()
-
-    @property
-    def is_taken_elsewhere(self) -> bool:
-        """Whether another thread has the turn now."""
-        if self._lock.acquire(blocking=False):
-            self._lock.release()
-            return False
-        return True
+        if not self._lock.acquire(blocking=False):
+            halt()
+            if not self._lock.acquire(timeout=wait_s):
+                return
+        self._lock.release()
 
 
 class Openable(abc.ABC):
-    """Opened for a session, with limits and a guard, and closed; `Culture` adds what happens in between.
-
-    Args:
-        limits: tighter limits than the device's; None: the device's.
-    """
+    """Opened for a session, with limits and a guard, and closed; `Culture` adds what happens in between."""
 
     name: ClassVar[str]
     ends_within_s: ClassVar[float] = 0.5
@@ -111,8 +94,6 @@ class Openable(abc.ABC):
 
     def __reduce_ex__(self, protocol: object) -> NoReturn:
         raise InvalidArgument("culture: expected no copies, got a request to copy or pickle it: create another one")
-
-    # The backend's data and methods.
 
     @property
     @abc.abstractmethod
@@ -150,8 +131,6 @@ class Openable(abc.ABC):
     def _close(self) -> None:
         """Leave the device safe and release it; also called when `_open` failed half way."""
 
-    # The user's methods.
-
     @final
     def open(self) -> Self:
         """Get ready, and begin a session: counts of stimuli restart and an emergency stop is lifted.
@@ -175,8 +154,7 @@ class Openable(abc.ABC):
                 # Checked again once open: some devices report their amplitude step only then.
                 replace(plain_limits(self._asked_limits), amplitude_step=0.0).check_within(self.device_limits)
             with as_device_failure(self.name, "open"):
-                device = self.device
-                holder = f"{self.__token} {os.getpid()}"
+                device, holder = self.device, f"{self.__token} {os.getpid()}"
                 is_handed_over = device is not None and self.__hold.enter_context(hold(device, holder))
             try:
                 with as_device_failure(self.name, "open"):
@@ -212,7 +190,10 @@ class Openable(abc.ABC):
         Raises:
             DeviceFailed: if the device does not confirm that it is safe; the culture is closed all the same.
         """
-        with self.__closing():
+        # A fork copies a lock that another thread holds, but not the thread that would release it.
+        is_ours = self.__process == os.getpid()
+        lock: AbstractContextManager[object] = self.__open_close_lock if is_ours else nullcontext()
+        with lock:
             turns, self.__turns = self.__turns, None
             if turns is None:
                 return
@@ -222,9 +203,7 @@ class Openable(abc.ABC):
                     return
                 try:
                     turns.guard.stop("it was closed")
-                    if turns.is_taken_elsewhere:
-                        self._halt()
-                    turns.end(self.ends_within_s)
+                    turns.end(self._halt, self.ends_within_s)
                 finally:
                     self._close()
 
@@ -233,19 +212,13 @@ class Openable(abc.ABC):
         return self.open()
 
     @final
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         try:
             self.close()
         except Exception as failed:
             if error is None:
                 raise
             error.add_note(f"and then: {failed}")
-
-    def __closing(self) -> AbstractContextManager[object]:
-        # A fork copies a lock that another thread holds, but not the thread that would release it.
-        return self.__open_close_lock if self.__process == os.getpid() else nullcontext()
 
     @property
     @final
@@ -289,9 +262,7 @@ class Openable(abc.ABC):
             self._halt()
 
     def _opened(self) -> Turns:
-        turns = self.__turns
-        if turns is None:
-            raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
+        turns = while_open(self.__turns)
         if turns.is_elsewhere:
             raise InvalidArgument("culture: expected one that this process opened, got a copy made by a fork")
         return turns

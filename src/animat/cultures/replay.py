@@ -27,8 +27,7 @@ class ReplayCulture(ComputedCulture):
     The last pulse of a trial is answered by a recorded last pulse, the others by other pulses, if there are any; among
     these by one on the same electrodes, if there are any; a stimulus without a frequency by one of any frequency. The
     newest recording at the culture's clock answers; the clock starts where the first recording did. There is no other
-    memory and no activity between responses: what a closed loop does has no effect on later responses, and that effect
-    is what a loop on a living culture is meant to test.
+    memory and no activity between responses.
 
     Args:
         recordings: of one culture, at least one, with stimuli of known frequencies and electrodes.
@@ -43,13 +42,7 @@ class ReplayCulture(ComputedCulture):
 
     name: ClassVar[str] = "replay"
 
-    def __init__(
-        self,
-        recordings: Sequence[Recording],
-        *,
-        seed: int = 0,
-        limits: Limits | None = None,
-    ) -> None:
+    def __init__(self, recordings: Sequence[Recording], *, seed: int = 0, limits: Limits | None = None) -> None:
         super().__init__(limits)
         if not recordings:
             raise InvalidArgument("recordings: expected at least one to answer from, got none")
@@ -79,17 +72,14 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def channels(self) -> Channels:
-        """Those of the recordings."""
         return self._recordings[0].channels
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """The electrodes of the patterns."""
-        return tuple(int(electrode) for electrode in np.unique(self._patterns[self._patterns != UNKNOWN]))
+        return tuple(np.unique(self._patterns[self._patterns != UNKNOWN]).tolist())
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
-        """The patterns of the first recording, in order of their numbers."""
         return self._patterns
 
     @property
@@ -109,19 +99,19 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def provenance(self) -> dict[str, str]:
-        """That it is a replay, and of which recordings."""
-        first = self._recordings[0]
-        replayed = {f"replayed {name}": text for name, text in first.provenance.items()}
-        minutes = ", ".join(f"{recording.start_min:g}" for recording in self._recordings)
-        source = {"source": "replay of recordings by animat.cultures.replay", "replayed minutes": minutes}
-        return {**source, "how": "draw", "seed": str(self._seed), **replayed}
+        return {
+            "source": "replay of recordings by animat.cultures.replay",
+            "replayed minutes": ", ".join(f"{recording.start_min:g}" for recording in self._recordings),
+            "how": "draw",
+            "seed": str(self._seed),
+            **{f"replayed {name}": text for name, text in self._recordings[0].provenance.items()},
+        }
 
     def _open(self) -> None:
         pass
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
-        start_ns = self._now_ns
-        end_ns = start_ns + round(duration_s * NS)
+        start_ns, end_ns = self._now_ns, self._now_ns + round(duration_s * NS)
         numbers = np.array([stimulus.presentation for stimulus in admitted.stimuli])
         # All answers are found before anything changes: a request with an unrecorded condition must leave no trace.
         answers = [
@@ -165,12 +155,9 @@ class ReplayCulture(ComputedCulture):
 
     def _answer(self, time_ns: int, recording: Recording, pulse: int) -> None:
         """Insert the spikes that followed a recorded pulse after this one, replacing those still pending."""
-        times_s = recording.stimuli.time_s
-        until_s = times_s[pulse] + REACH_S
-        if pulse + 1 < len(times_s):
-            until_s = min(until_s, times_s[pulse + 1])
-        first, last = np.searchsorted(recording.spike_times_s, [times_s[pulse], until_s])
-        since_ns = np.rint((recording.spike_times_s[first:last] - times_s[pulse]) * NS).astype(np.int64)
+        since_s, *next_s = recording.stimuli.time_s[pulse : pulse + 2].tolist()
+        first, last = np.searchsorted(recording.spike_times_s, [since_s, min([since_s + REACH_S, *next_s])])
+        since_ns = np.rint((recording.spike_times_s[first:last] - since_s) * NS).astype(np.int64)
         kept = int(np.searchsorted(self._pending_ns, time_ns))
         self._pending_ns = np.concatenate([self._pending_ns[:kept], time_ns + since_ns])
         self._pending_channel = np.concatenate([self._pending_channel[:kept], recording.spike_channels[first:last]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from math import isfinite
 from typing import Final, NoReturn
@@ -17,7 +18,10 @@ from animat.stimulation.stimulus import Stimulus, plain_stimuli
 __all__ = ["SIMULATED_LIMITS", "Admitted", "Guard", "Limits"]
 
 _MAY_ADMIT: Final = object()
-_REMEMBERED_PULSES = 1000
+_PACE = frozenset({"overlap", "gap_us", "interval_us", "stimuli_per_electrode_s", "stimuli_per_s"})
+_DELAY_STEP_S = 0.001
+_PATIENCE_S = 2.0
+"""Rates cover a second: what does not fit after two is not due to a late start."""
 
 
 class Admitted:
@@ -56,7 +60,7 @@ class Guard:
     Args:
         limits: in force.
         sites: electrodes that can stimulate.
-        history: of earlier sessions on the same culture, which limits on pace also cover. None: there were none.
+        history: of earlier sessions, which limits on pace also cover; None: there were none.
         now_s: the culture's clock, if there is a history.
     """
 
@@ -65,14 +69,12 @@ class Guard:
     ) -> None:
         self.limits = plain_limits(limits)
         self._sites = frozenset(sites)
-        self._safe_pulses: dict[Pulse, float] = {}
+        self._net_charge_of = lru_cache(1000)(self.check_pulse)
         self._left_on: dict[int, float] = {}
         self._stopped: str | None = None
         self._delivered = 0
-        self._history = History()
-        if history is not None:
-            self._history = history
-            history.resume(round(now_s * NS))
+        self._history = History() if history is None else history
+        self._history.resume(round(now_s * NS))
 
     @property
     def delivered(self) -> int:
@@ -85,28 +87,19 @@ class Guard:
         return self._stopped
 
     def stop(self, reason: str) -> None:
-        """Refuse everything from now on, for the first reason passed; a new session has a new guard."""
+        """Refuse everything from now on; the first reason passed counts."""
         self._stopped = reason if self._stopped is None else self._stopped
 
     def check(self, stimuli: Iterable[Stimulus], now_s: float) -> None:
-        """Raise unless the request as a whole is within the limits; nothing is remembered.
+        """Raise unless a request as a whole is within the limits; nothing is remembered.
 
-        Args:
-            stimuli: in order of time, counted from now.
-            now_s: the culture's clock, float64.
-
-        Raises:
-            UnsafeStimulus: naming the limit, the value, and what to do.
-            InvalidArgument: for anything that is not a stimulus, or a clock less precise than float64.
+        Times ascend and count from `now_s` on the culture's clock, a float64. Raises UnsafeStimulus, naming the limit,
+        the value, and what to do, and InvalidArgument for anything that is not a stimulus or a time.
         """
         self._examine(plain_stimuli(stimuli), seconds("now_s", now_s))
 
     def admit(self, stimuli: Iterable[Stimulus], now_s: float) -> Admitted:
-        """Check a request and remember it as delivered.
-
-        Raises:
-            UnsafeStimulus, InvalidArgument: as `check` does; nothing is then remembered.
-        """
+        """Check a request, raising as `check` does, and remember it as delivered."""
         now_s = seconds("now_s", now_s)
         # A new tuple of immutable values: what was checked is what is delivered.
         admitted = Admitted(plain_stimuli(stimuli), now_s, by=_MAY_ADMIT)
@@ -115,6 +108,24 @@ class Guard:
         self._left_on |= left_on
         self._delivered += len(events)
         return admitted
+
+    def earliest(self, stimuli: Sequence[Stimulus], from_s: float) -> float:
+        """The earliest time from `from_s` on at which stimuli may begin without breaking a limit on pace.
+
+        For a second guard, on the device's own clock: a request that begins late comes closer to the next one than
+        intended, so two that each keep a limit may break it together. Times count from the first stimulus. Raises
+        UnsafeStimulus for stimuli that no delay makes safe.
+        """
+        waited_s = 0.0
+        while True:
+            try:
+                self.check(stimuli, from_s + waited_s)
+            except UnsafeStimulus as error:
+                if error.limit not in _PACE or waited_s >= _PATIENCE_S:
+                    raise
+                waited_s += _DELAY_STEP_S
+            else:
+                return from_s + waited_s
 
     def expect_not_stopped(self) -> None:
         """Raise UnsafeStimulus after an emergency stop."""
@@ -174,19 +185,11 @@ class Guard:
             )
         if len(set(electrodes)) < len(electrodes):
             raise UnsafeStimulus("sites", f"expected each electrode once in a stimulus, got {electrodes}")
-        strange = [electrode for electrode in electrodes if electrode not in self._sites]
-        if strange:
+        if strange := [electrode for electrode in electrodes if electrode not in self._sites]:
             raise UnsafeStimulus(
-                "sites",
-                f"expected stimulation sites of this culture, got electrode {strange[0]}: choose among them",
+                "sites", f"expected stimulation sites of this culture, got electrode {strange[0]}: choose among them"
             )
-        net_charge = self._safe_pulses.get(stimulus.pulse)
-        if net_charge is None:
-            net_charge = self.check_pulse(stimulus.pulse)
-            if len(self._safe_pulses) >= _REMEMBERED_PULSES:
-                self._safe_pulses.clear()
-            self._safe_pulses[stimulus.pulse] = net_charge
-        return net_charge
+        return self._net_charge_of(stimulus.pulse)
 
     def _add_charge(self, left_on: dict[int, float], electrodes: Sequence[int], net_charge: float) -> None:
         """Add the net charge of a pulse to that of all before it, on each electrode."""
@@ -231,14 +234,26 @@ class Guard:
                     "phase_step_us",
                     f"expected phases in steps of {limits.phase_step_us:g} us, got {phase.duration_us:g}: round it",
                 )
-        self._check_shape(pulse, "")
-        made = delivered_pulse(pulse, limits.amplitude_step)
+        self._check_shape(pulse)
+        made, charge_unit = delivered_pulse(pulse, limits.amplitude_step), limits.units[1]
         rounding = "" if made == pulse else f", which the device makes of {pulse}"
         self._check_shape(made, rounding)
-        self._check_charge(made, rounding)
+        for phase in made.phases:
+            if not abs(phase.charge) <= limits.charge_per_phase:
+                raise UnsafeStimulus(
+                    "charge_per_phase",
+                    f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} per phase, "
+                    f"got {phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
+                )
+        if not abs(made.net_charge) <= limits.net_charge:
+            raise UnsafeStimulus(
+                "net_charge",
+                f"expected phases that balance to within {limits.net_charge:g} {charge_unit}, got {made.net_charge:g} "
+                f"({made}{rounding}): give the phases equal and opposite charge",
+            )
         return made.net_charge
 
-    def _check_shape(self, pulse: Pulse, rounding: str) -> None:
+    def _check_shape(self, pulse: Pulse, rounding: str = "") -> None:
         """Check the limits on amplitudes and signs."""
         limits = self.limits
         for phase in pulse.phases:
@@ -248,29 +263,9 @@ class Guard:
                     f"expected -{limits.amplitude:g} to {limits.amplitude:g} {limits.units[0]}, got {phase.amplitude:g}"
                     f"{rounding}: lower it",
                 )
-        if limits.alternates:
-            for before, after in pairwise(pulse.phases):
-                if sign_of(before.amplitude) == sign_of(after.amplitude):
-                    raise UnsafeStimulus(
-                        "alternates", f"expected successive phases of different signs, got {pulse}{rounding}"
-                    )
-
-    def _check_charge(self, pulse: Pulse, rounding: str) -> None:
-        """Check the limits on charge."""
-        limits, charge_unit = self.limits, self.limits.units[1]
-        for phase in pulse.phases:
-            if not abs(phase.charge) <= limits.charge_per_phase:
-                raise UnsafeStimulus(
-                    "charge_per_phase",
-                    f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} per phase, "
-                    f"got {phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
-                )
-        if not abs(pulse.net_charge) <= limits.net_charge:
-            raise UnsafeStimulus(
-                "net_charge",
-                f"expected phases that balance to within {limits.net_charge:g} {charge_unit}, got {pulse.net_charge:g} "
-                f"({pulse}{rounding}): give the phases equal and opposite charge",
-            )
+        signs = [sign_of(phase.amplitude) for phase in pulse.phases]
+        if limits.alternates and any(before == after for before, after in pairwise(signs)):
+            raise UnsafeStimulus("alternates", f"expected successive phases of different signs, got {pulse}{rounding}")
 
     def _check_pace(self, event: Event, requested: History) -> None:
         """Check the limits on pace, after stimuli delivered and those `requested` before it."""

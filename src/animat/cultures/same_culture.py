@@ -13,17 +13,12 @@ _NAMES = ("system_id", "chip_id", "cell_batch_id")
 
 
 def other_culture(recording: Recording, culture: Culture) -> Finding | None:
-    """A warning where a culture is not the one that was recorded; None where it is, or where that cannot be known.
+    """A warning where an open culture is not the recorded one; None where it is, or where that cannot be known.
 
-    Percentiles belong to one culture at one time. Devices are compared by their kind, and by the names that they give
-    themselves and what is on them. A virtual culture whose clock is before its recording, or a CL1 whose clock is
-    before the recording's end, did not live through it: it was restarted, or continued from an earlier state. The
-    SDK's simulator of a CL1 restarts whenever it is opened, and a simulated culture with it. A replay may answer from
-    any recording.
-
-    Args:
-        recording: the one that percentiles are taken from.
-        culture: an open culture.
+    Percentiles, taken from the recording, belong to one culture at one time. Devices are compared by their kind, and by
+    the names that they give themselves and what is on them. A virtual culture whose clock is before its recording, or a
+    CL1 whose clock is before the recording's end, did not live through it: it was restarted, or continued from an
+    earlier state. A replay may answer from any recording.
     """
     here, there = culture.recorded_as, recording.culture
     if here is not None and here.kind == "replay":
@@ -31,26 +26,26 @@ def other_culture(recording: Recording, culture: Culture) -> Finding | None:
     if isinstance(culture, VirtualCulture):
         message = _other_virtual(recording, culture)
     elif here and there and (there.kind, there.is_simulated) != (here.kind, here.is_simulated):
-        message = f"the recordings are of a {there}, but this is a {here}: percentiles differ between cultures"
+        message = _another(f"of a {there}", f"a {here}")
     else:
         message = _other_device(recording, culture)
     before_min = recording.start_min + recording.duration_s / 60 - culture.now_s / 60
     return Finding("other-culture", "warning", message, before_min if before_min > 0 else None) if message else None
 
 
+def _another(there: str, here: str) -> str:
+    return f"the recordings are {there}, but this is {here}: percentiles differ between cultures"
+
+
 def _other_virtual(recording: Recording, culture: VirtualCulture) -> str:
-    now_min, start_min = culture.now_s / 60, recording.start_min
-    recorded = recording.culture
+    now_min, start_min, recorded = culture.now_s / 60, recording.start_min, recording.culture
     differ = [name for name, value in culture.settings.items() if recording.provenance.get(name) != value]
+    here = f"virtual culture {culture.seed}"
     if differ:
         if recorded is None or recorded.kind != "virtual":
-            of = "not of a virtual culture"
-        else:
-            of = f"of virtual culture {recorded.seed}"
-            of += "" if "seed" in differ else f" with a different {' and '.join(differ)}"
-        return (
-            f"the recordings are {of}, but this is virtual culture {culture.seed}: percentiles differ between cultures"
-        )
+            return _another("not of a virtual culture", here)
+        with_another = "" if "seed" in differ else f" with a different {' and '.join(differ)}"
+        return _another(f"of virtual culture {recorded.seed}{with_another}", here)
     if now_min < start_min:
         return (
             f"the culture starts{' afresh' if now_min == 0 else ''} at {now_min:.0f} min, but its percentiles are of "
@@ -64,10 +59,7 @@ def _other_device(recording: Recording, culture: Culture) -> str:
     here, there = culture.provenance, recording.provenance
     for name in _NAMES:
         if name in there and name in here and there[name] != here[name]:
-            return (
-                f"the recordings are of {name} {there[name]}, but this is {name} {here[name]}: percentiles differ "
-                "between cultures"
-            )
+            return _another(f"of {name} {there[name]}", f"{name} {here[name]}")
     now_min, start_min = culture.now_s / 60, recording.start_min
     if culture.name == "cl1" and now_min < start_min + recording.duration_s / 60:
         return (
@@ -79,13 +71,9 @@ def _other_device(recording: Recording, culture: Culture) -> str:
 
 
 def other_patterns(recording: Recording, culture: Culture) -> Finding | None:
-    """A warning where electrodes were stimulated together that are not a pattern of this culture; None if all are.
+    """A warning where electrodes were stimulated together that are not a pattern of this open culture; else None.
 
     A policy was trained on responses to the recorded patterns. The same culture responds differently to others.
-
-    Args:
-        recording: of the culture.
-        culture: an open culture.
     """
     tables = recording.stimuli.electrodes, culture.patterns
     recorded, patterns = ({frozenset(row) - {UNKNOWN} for row in table.tolist()} for table in tables)

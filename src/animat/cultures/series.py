@@ -37,15 +37,12 @@ _MAY_DIFFER = ("stimulation_units",)
 
 
 class Series(NamedTuple):
-    """The result of a series.
-
-    Attributes:
-        files: the recordings, in order of time.
-        missed_min: minutes of the series without a recording, as the next one was already due.
-    """
+    """The result of a series."""
 
     files: list[Path]
+    """The recordings, in order of time."""
     missed_min: list[float]
+    """Minutes of the series without a recording, as the next one was already due."""
 
 
 def record_series(
@@ -64,10 +61,9 @@ def record_series(
     complete or absent, and none is overwritten. A repeated call continues with the next recording due, if the culture's
     clock has kept running; a recording whose successor is already due is missed.
 
-    A closed `VirtualCulture` misses none: its state is written after each recording (`culture.state`), and after any
-    interruption, a repeated call makes exactly the recordings, and state, of an undisturbed run. Existing recordings
-    that the state does not cover are recorded again and compared; without a state, all of them are. The electrodes in
-    use are written to `selection.json`.
+    A closed `VirtualCulture` misses none: its electrodes (`selection.json`) and, after each recording, its state
+    (`culture.state`) are written, and after any interruption a repeated call makes exactly the files of an undisturbed
+    run. Existing recordings that the state does not cover are recorded again and compared.
 
     Args:
         make_culture: returns the culture, either closed, to be opened and closed here, or open, to stay open. Opening a
@@ -101,12 +97,16 @@ def record_series(
         virtual = culture if isinstance(culture, VirtualCulture) and not culture.is_open else None
         n_patterns = len(culture.patterns) if virtual is None else virtual.n_patterns
         check_interval(protocol, sessions, interval_min, n_patterns)
-        files, interval_s = series_files(folder, sessions, interval_min), 60 * interval_min
+        files, interval_s = [folder / recording_name(n * interval_min) for n in range(sessions)], 60 * interval_min
         if virtual is not None:
             Guard(virtual.limits, ()).check_pulse(protocol.pulse)
             _check_recordings(files, virtual, protocol, interval_s, seed)
-            virtual, recorded = _resume(make_culture, virtual, files)
-            culture = virtual
+            recorded = _restore(virtual, folder / STATE_FILE)
+            if not all(file.exists() for file in files[:recorded]):
+                # Recordings before the state were removed: start from the beginning.
+                culture, recorded = make_culture(), 0
+                assert isinstance(culture, VirtualCulture)
+                virtual = culture
         room_bytes = BYTES_PER_MIN * minutes_of(protocol, n_patterns)
         if not all(file.exists() for file in files):
             expect_writable(folder, room_bytes=room_bytes)
@@ -158,37 +158,21 @@ def order_seed(seed: int, session: int) -> int:
     return seed * 10_000 + session
 
 
-def _resume(
-    make_culture: Callable[[], Culture], culture: VirtualCulture, files: list[Path]
-) -> tuple[VirtualCulture, int]:
-    """The culture as it was after the existing recordings, or at the last known state before; and after how many."""
-    state = files[0].with_name(STATE_FILE)
+def _restore(culture: VirtualCulture, state: Path) -> int:
+    """Restore the culture to the last known state, if there is one; returns after how many recordings it was."""
     if not state.exists():
-        return culture, 0
+        return 0
     recorded = culture.restore_state(state).get("sessions")
     if recorded is None:
         raise Mismatch(
             f"{state}: expected the state of a series of recordings, got one after other use (animat live): "
             "choose another folder"
         )
-    if all(file.exists() for file in files[:recorded]):
-        return culture, recorded
-    # Recordings before the state were removed: start from the beginning.
-    new = make_culture()
-    assert isinstance(new, VirtualCulture)
-    return new, 0
-
-
-def series_files(folder: Path, sessions: int, interval_min: float) -> list[Path]:
-    """Paths of the recordings of a series."""
-    return [folder / recording_name(session * interval_min) for session in range(sessions)]
+    return recorded
 
 
 def check_interval(protocol: Protocol, sessions: int, interval_min: float, n_patterns: int | None = None) -> None:
-    """Raise InvalidArgument for no sessions, sessions that overlap or go beyond a year, or too few patterns.
-
-    `n_patterns` is None if there is no culture yet.
-    """
+    """Raise InvalidArgument for no sessions, sessions that overlap or go beyond a year, or too few patterns."""
     if sessions < 1:
         raise InvalidArgument(f"sessions: expected at least 1 recording, got {sessions}")
     if not 0 < interval_min < float("inf"):
@@ -222,10 +206,7 @@ def _check_recordings(
         provenance = culture.settings | {"protocol_seed": str(order_seed(seed, session))}
         start_min = _read_expected(file, provenance, protocol).start_min
         if abs(start_min * 60 - session * interval_s) > 1e-6:
-            raise Mismatch(
-                f"{file}: expected a recording at {session * interval_s / 60:g} min, got one at {start_min:g} min: "
-                "choose another folder"
-            )
+            raise _another(file, f"at {session * interval_s / 60:g} min, got one at {start_min:g} min")
 
 
 def _start_s(files: list[Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
@@ -238,23 +219,17 @@ def _start_s(files: list[Path], culture: Culture, protocol: Protocol, interval_s
         recording = _read_expected(file, provenance, protocol)
         for name in ("label", "electrode"):
             if getattr(recording.channels, name).tolist() != getattr(culture.channels, name).tolist():
-                raise Mismatch(
-                    f"{file}: expected a recording of this culture's channels, got others ({name}s differ): choose "
-                    "another folder"
-                )
+                raise _another(file, f"of this culture's channels, got others ({name}s differ)")
         # Places come from the protocol, and are not patterns.
         if not protocol.places and (strange := other_patterns(recording, culture)) is not None:
-            raise Mismatch(
-                f"{file}: expected a recording with this culture's patterns, got others ({strange.value:g} of them): "
-                "choose another folder"
-            )
+            raise _another(file, f"with this culture's patterns, got others ({strange.value:g} of them)")
         if zero_s is None:
             zero_s = 60 * recording.start_min - session * interval_s
         if culture.now_s < 60 * recording.start_min + recording.duration_s:
-            raise Mismatch(
-                f"{file}: expected a recording before the culture's clock, which is at {culture.now_s / 60:.2f} min, "
-                f"got one at {recording.start_min:.2f} min: the clock was restarted, or it is another culture: choose "
-                "another folder"
+            raise _another(
+                file,
+                f"before the culture's clock, which is at {culture.now_s / 60:.2f} min, got one at "
+                f"{recording.start_min:.2f} min: the clock was restarted, or it is another culture",
             )
     return culture.now_s if zero_s is None else zero_s
 
@@ -263,11 +238,12 @@ def _read_expected(file: Path, provenance: Mapping[str, str], protocol: Protocol
     """Read an existing recording; raises unless it was made by this protocol of a culture with this provenance."""
     recording = read_recording(file)
     if difference := _difference(provenance, protocol, recording):
-        raise Mismatch(
-            f"{file}: expected a recording of the same culture and protocol, got another ({difference}): choose "
-            "another folder"
-        )
+        raise _another(file, f"of the same culture and protocol, got another ({difference})")
     return recording
+
+
+def _another(file: Path, difference: str) -> Mismatch:
+    return Mismatch(f"{file}: expected a recording {difference}: choose another folder")
 
 
 def _difference(expected: Mapping[str, str], protocol: Protocol, recording: Recording) -> str:

@@ -26,6 +26,8 @@ ARTEFACT_MS = 1.0
 range: at the site it saturates for 4 ms, at 500 um it has fallen to 14 uV after 2 ms (assumed, based on reports)."""
 LARGEST_SAMPLES = 2**28
 
+Voltage = Float32[np.ndarray, "samples channels"]
+
 
 @dataclass(frozen=True, eq=False)
 class Traces:
@@ -34,13 +36,12 @@ class Traces:
     Attributes:
         voltage_uv: shape (samples, channels).
         channels: row of the culture's channel table for each column.
-        sampling_rate_hz: of the samples.
         spikes: times of the true spikes' troughs from the first sample; `channel` is a column of `voltage_uv`.
         amplitude_uv: amplitude of each spike on its channel, shape (spikes,).
         stimulus_time_s: starts of the pulses.
     """
 
-    voltage_uv: Float32[np.ndarray, "samples channels"]
+    voltage_uv: Voltage
     channels: Int64[np.ndarray, " channels"]
     sampling_rate_hz: float
     spikes: Spikes
@@ -88,36 +89,28 @@ def record_traces(
     fired_s, fired = culture.fired
     rng = np.random.default_rng([seed, 14])
     voltage_uv = _band_limited_noise(rng, samples, len(rows), rate_hz, noise_uv)
-    pairs = culture.visibility.pairs_of(culture.selection.recording[rows])
+    recorded = culture.selection.recording[rows]
+    pairs = culture.visibility.pairs_of(recorded)
     amplitude_uv = culture.visibility.amplitude_at(pairs.neuron, pairs.distance_um)
-    times, columns, sizes = [], [], []
+    spikes = [np.empty((0, 3))]
     for neuron in np.unique(pairs.neuron):
         seen = pairs.neuron == neuron
         at = np.rint(fired_s[fired == neuron] * rate_hz).astype(np.int64)
         at = at[at < samples]
-        if not len(at):
-            continue
         shape, trough = waveform(
             culture.visibility.trough_to_peak_ms[neuron], culture.visibility.recovery_ms[neuron], rate_hz
         )
         for column, size_uv in zip(pairs.electrode[seen].tolist(), amplitude_uv[seen].tolist(), strict=True):
             _add(voltage_uv[:, column], at - trough, size_uv * shape)
-            times.append(at / rate_hz)
-            columns.append(np.full(len(at), column))
-            sizes.append(np.full(len(at), size_uv))
-    _add_artefacts(voltage_uv, culture, rows, stimuli, stimulus_time_s, rate_hz)
+            spikes.append(np.column_stack(np.broadcast_arrays(at / rate_hz, column, size_uv)))
+    for stimulus, at_s in zip(stimuli, stimulus_time_s.tolist(), strict=True):
+        distance_um = culture.selection.array.distance_um(np.array(stimulus.electrodes), recorded)
+        _add_artefact(voltage_uv[round(at_s * rate_hz) :], distance_um, rate_hz)
     np.clip(voltage_uv, -SATURATION_UV, SATURATION_UV, out=voltage_uv)
-    time_s = np.concatenate([*times, np.empty(0)])
-    column_of = np.concatenate([*columns, np.empty(0, np.int64)]).astype(np.int64)
+    time_s, column_of, spike_uv = np.concatenate(spikes).T
     order = np.lexsort((column_of, time_s))
-    return Traces(
-        voltage_uv=voltage_uv,
-        channels=rows,
-        sampling_rate_hz=rate_hz,
-        spikes=Spikes(time_s[order], column_of[order]),
-        amplitude_uv=np.concatenate([*sizes, np.empty(0)])[order],
-        stimulus_time_s=stimulus_time_s,
-    )
+    true = Spikes(time_s[order], column_of[order].astype(np.int64))
+    return Traces(voltage_uv, rows, rate_hz, true, spike_uv[order], stimulus_time_s)
 
 
 def waveform(
@@ -140,7 +133,7 @@ def waveform(
 
 def _band_limited_noise(
     rng: np.random.Generator, samples: int, channels: int, rate_hz: float, noise_uv: float
-) -> Float32[np.ndarray, "samples channels"]:
+) -> Voltage:
     """White noise, band-limited in the frequency domain, channel by channel to save memory."""
     voltage_uv = np.empty((samples, channels), np.float32)
     frequency_hz = np.fft.rfftfreq(samples, 1 / rate_hz)
@@ -159,20 +152,9 @@ def _add(trace_uv: Float32[np.ndarray, " samples"], first: Int64[np.ndarray, " s
     np.add.at(trace_uv, sample[inside], np.tile(shape, len(first))[inside].astype(np.float32))
 
 
-def _add_artefacts(
-    voltage_uv: Float32[np.ndarray, "samples channels"],
-    culture: VirtualCulture,
-    rows: Int64[np.ndarray, " channels"],
-    stimuli: Sequence[Stimulus],
-    time_s: Float64[np.ndarray, " stimuli"],
-    rate_hz: float,
-) -> None:
-    array = culture.selection.array
-    length = round(0.02 * rate_hz)
-    decay = np.exp(-np.arange(length) / rate_hz * 1e3 / ARTEFACT_MS)
-    for stimulus, at_s in zip(stimuli, time_s.tolist(), strict=True):
-        distance_um = array.distance_um(np.array(stimulus.electrodes), culture.selection.recording[rows])
-        size_uv = np.sum(ARTEFACT_UV / (1 + (distance_um / ARTEFACT_REACH_UM) ** 3), axis=0)
-        first = round(at_s * rate_hz)
-        stretch = voltage_uv[first : first + length]
-        stretch -= (decay[: len(stretch), None] * size_uv[None, :]).astype(np.float32)
+def _add_artefact(voltage_uv: Voltage, distance_um: Float64[np.ndarray, "sites channels"], rate_hz: float) -> None:
+    """Add a pulse's artefact to the samples from its start on."""
+    size_uv = np.sum(ARTEFACT_UV / (1 + (distance_um / ARTEFACT_REACH_UM) ** 3), axis=0)
+    stretch = voltage_uv[: round(0.02 * rate_hz)]
+    decay = np.exp(-np.arange(len(stretch)) / rate_hz * 1e3 / ARTEFACT_MS)
+    stretch -= (decay[:, None] * size_uv[None, :]).astype(np.float32)

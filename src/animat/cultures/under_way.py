@@ -21,11 +21,7 @@ EVERY_S = 3.0
 
 
 class PartialRecording:
-    """A `follow` function for `Culture.record`; a context manager that removes the file at the end.
-
-    Args:
-        folder: of the recordings.
-    """
+    """A `follow` function for `Culture.record`; a context manager that removes the file at the end."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / UNDER_WAY

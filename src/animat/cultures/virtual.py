@@ -8,9 +8,10 @@ import os
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 
 from animat.cultures.base import ComputedCulture
+from animat.cultures.failures import once_opened
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
@@ -38,11 +39,11 @@ WARM_UP_S = 5.0
 class VirtualCulture(ComputedCulture):
     """A simulated culture on a simulated MaxOne; `docs/virtual-culture.md` describes its tissue.
 
-    On first opening the array is scanned and electrodes are chosen. The tissue is then restored to its state before, so
-    that the scan does not age it: spike for spike, a culture with those electrodes as `selection` is the same. The
-    clock starts at 0 there. Time is exact to the nanosecond, however it is divided: the same requests give the same
-    spikes. A pulse acts with a strength in proportion to the charge of its largest cathodic (negative) phase, the
-    published pulse being 1. No artefact blinds the electrodes after a pulse (`animat.cultures.traces` adds it).
+    On first opening the array is scanned and electrodes are chosen; the tissue is then restored to its state before, so
+    that a culture with those electrodes as `selection` is the same, spike for spike. The same requests give the same
+    spikes, however time is divided. A pulse acts with a strength in proportion to the charge of its largest cathodic
+    (negative) phase, the published pulse being 1. No artefact blinds the electrodes after a pulse (`record_traces` adds
+    it).
 
     Args:
         seed: decides the tissue, the spike shapes, and the patterns; zero or more.
@@ -53,9 +54,6 @@ class VirtualCulture(ComputedCulture):
             stay silent, and unseen.
         limits: tighter limits than `SIMULATED_LIMITS`.
         progress: updated during the scan.
-
-    Raises:
-        InvalidArgument: for an invalid setting.
     """
 
     name: ClassVar[str] = "virtual"
@@ -80,62 +78,43 @@ class VirtualCulture(ComputedCulture):
         self._parameters, self._rule, self._scan_s = parameters, rule or SelectionRule(), float(scan_s)
         self._progress = progress or Silent()
         self._selection = selection
-        self._scan: ScannedActivity | None = None
+        self.scan: ScannedActivity | None = None
+        """Results of the scan; None if the electrodes were passed or restored."""
         self._tissue: Tissue | None = None
+        self._visibility: Visibility | None = None
+        self._channels: Channels | None = None
         self._zero_ns = 0
         self._now_ns = 0
         # Spikes later in the step that contains the clock's time, on the tissue's clock.
         self._held_ns, self._held_neuron = np.empty(0, np.int64), np.empty(0, np.int64)
-        self._fired = np.empty(0), np.empty(0, np.int64)
+        self.fired = np.empty(0), np.empty(0, np.int64)
+        """Time from the start and neuron of every spike of the last delivery, whether or not an electrode sees it."""
 
     @property
     def tissue(self) -> Tissue:
-        """The tissue itself, for inspection; advancing it directly breaks the culture's clock.
-
-        Raises:
-            InvalidArgument: for a culture that was never opened.
-        """
-        if self._tissue is None:
-            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
-        return self._tissue
+        """The tissue, once opened, for inspection; advancing it directly breaks the culture's clock."""
+        return once_opened(self._tissue)
 
     @property
     def selection(self) -> Selection:
         """The electrodes in use."""
-        if self._selection is None:
-            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
-        return self._selection
-
-    @property
-    def scan(self) -> ScannedActivity | None:
-        """Results of the scan; None if the electrodes were passed or restored."""
-        return self._scan
+        return once_opened(self._selection)
 
     @property
     def visibility(self) -> Visibility:
         """Which electrode sees which neuron, and how."""
-        _ = self.tissue
-        return self._visibility
-
-    @property
-    def fired(self) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
-        """Time from the start and neuron of every spike of the last delivery, whether or not an electrode sees it."""
-        return self._fired
+        return once_opened(self._visibility)
 
     @property
     def channels(self) -> Channels:
-        """The recording electrodes."""
-        _ = self.selection
-        return self._channels
+        return once_opened(self._channels)
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """The electrodes that can stimulate."""
         return tuple(self.selection.stimulation.tolist())
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
-        """Electrodes of each stimulation pattern."""
         return self.selection.patterns
 
     @property
@@ -165,7 +144,6 @@ class VirtualCulture(ComputedCulture):
 
     @property
     def recorded_as(self) -> RecordedCulture:
-        """Its seed."""
         return RecordedCulture("virtual", self.seed)
 
     @property
@@ -183,11 +161,7 @@ class VirtualCulture(ComputedCulture):
         }
 
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write the complete state, to continue from bit for bit; the file is complete or absent.
-
-        Args:
-            path: the file.
-            remarks: whole numbers to store with it.
+        """Write the complete state, to continue from bit for bit, and whole numbers; the file is complete or absent.
 
         Raises:
             InvalidFile: if it cannot be written.
@@ -214,9 +188,8 @@ class VirtualCulture(ComputedCulture):
         tissue, visibility = self._grown()
         state = read_state(path, self.settings, tissue)
         # Only now: a failed restore leaves the culture unchanged.
-        self._adopt(tissue, visibility)
-        self._selection = state.selection
-        self._zero_ns, self._now_ns = state.zero_ns, state.now_ns
+        self._tissue, self._visibility = tissue, visibility
+        self._selection, self._zero_ns, self._now_ns = state.selection, state.zero_ns, state.now_ns
         self._held_ns, self._held_neuron = state.held_ns, state.held_neuron
         return dict(state.remarks)
 
@@ -229,14 +202,14 @@ class VirtualCulture(ComputedCulture):
                 scan = self._scan_array(tissue, visibility)
                 selection = select_electrodes(MAXONE, scan, self._rule, seed=self.seed)
                 tissue.restore(before)
-                self._scan, self._selection = scan, selection
+                self.scan, self._selection = scan, selection
             self._zero_ns = self._now_ns = round(tissue.now_s * NS)
             # Only now: a culture whose opening was interrupted is still new, and can be opened again.
-            self._adopt(tissue, visibility)
+            self._tissue, self._visibility = tissue, visibility
         else:
             # Compile here, and not while a loop waits: without a compilation cache it takes seconds.
             before = self._tissue.snapshot()
-            self._tissue.advance(self._step_ns / NS)
+            self._tissue.advance(self._tissue.step_ns / NS)
             self._tissue.restore(before)
         self._map_channels()
 
@@ -247,10 +220,6 @@ class VirtualCulture(ComputedCulture):
         tissue = Tissue(self.seed, self._parameters)
         return tissue, Visibility(self.seed, MAXONE, tissue.x_um, tissue.y_um, tissue.is_excitatory)
 
-    def _adopt(self, tissue: Tissue, visibility: Visibility) -> None:
-        self._step_ns = round(tissue.parameters.step_ms * 1e6)
-        self._tissue, self._visibility = tissue, visibility
-
     def _scan_array(self, tissue: Tissue, visibility: Visibility) -> ScannedActivity:
         """Spontaneous activity of the whole array at once; a real array scans its blocks one after the other."""
         rng = np.random.default_rng([self.seed, 12])
@@ -260,10 +229,9 @@ class VirtualCulture(ComputedCulture):
         return ScannedActivity.from_blocks(blocks)
 
     def _map_channels(self) -> None:
-        """Look up the channels that see each neuron."""
         selection = self.selection
         self._channels = Channels.on(selection.array, selection.recording)
-        pairs = self._visibility.pairs_of(selection.recording)
+        pairs = self.visibility.pairs_of(selection.recording)
         order = np.lexsort((pairs.electrode, pairs.neuron))
         self._n_seen_by = np.bincount(pairs.neuron, minlength=len(self.tissue.x_um))
         # One row per neuron, filled from the left: a delivery of 12.5 ms has time for few array operations.
@@ -283,53 +251,49 @@ class VirtualCulture(ComputedCulture):
         stimulus_ns = [round(stimulus.time_s * NS) for stimulus in admitted.stimuli]
         # The tissue may be up to a step ahead; a pulse in the middle of a step acts at its end anyway.
         pulses = [
-            self._pulse(stimulus, max(start_ns + since_ns, tissue_ns))
+            _tissue_pulse(stimulus, max(start_ns + since_ns, tissue_ns))
             for stimulus, since_ns in zip(admitted.stimuli, stimulus_ns, strict=True)
         ]
         # To the end of the step that contains the end, so that every spike before the end is known.
-        target_ns = -(-end_ns // self._step_ns) * self._step_ns
+        target_ns = -(-end_ns // tissue.step_ns) * tissue.step_ns
         if pulses and target_ns <= tissue_ns:
-            target_ns = tissue_ns + self._step_ns
+            target_ns = tissue_ns + tissue.step_ns
         time_ns_of, neuron = self._held_ns, self._held_neuron
         if target_ns > tissue_ns:
-            time_s, fired = tissue.advance((target_ns - tissue_ns) / NS, pulses)
-            fired_ns = np.rint(time_s * NS).astype(np.int64)
+            fired_s, fired = tissue.advance((target_ns - tissue_ns) / NS, pulses)
+            fired_ns = np.rint(fired_s * NS).astype(np.int64)
             time_ns_of = np.concatenate((time_ns_of, fired_ns)) if len(time_ns_of) else fired_ns
             neuron = np.concatenate((neuron, fired)) if len(neuron) else fired
         known = int(time_ns_of.searchsorted(end_ns))
         self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
         self._now_ns = end_ns
-        self._fired = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
+        self.fired = time_s, neuron = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
         return Observed(
             start_s=(start_ns - self._zero_ns) / NS,
             duration_s=(end_ns - start_ns) / NS,
-            spikes=self._on_channels(*self._fired),
+            # Each spike, repeated on every channel that sees its neuron.
+            spikes=Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]]),
             stimulus_time_s=np.array(stimulus_ns, dtype=np.float64) / NS,
         )
 
-    @staticmethod
-    def _pulse(stimulus: Stimulus, time_ns: int) -> TissuePulse:
-        """A stimulus as a pulse of the tissue."""
-        from animat.cultures.tissue import Pulse as TissuePulse
-
-        x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
-        half_um = MAXONE.pitch_um / 2
-        # The charge of the largest cathodic phase, relative to the published pulse.
-        cathodic = max(-phase.charge for phase in stimulus.pulse.phases)
-        strength = max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)
-        return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, strength)
-
-    def _on_channels(self, time_s: Float64[np.ndarray, " spikes"], neuron: Int64[np.ndarray, " spikes"]) -> Spikes:
-        """Each spike, repeated on every channel that sees its neuron."""
-        return Spikes(time_s.repeat(self._n_seen_by[neuron]), self._seen_by[neuron][self._is_seen[neuron]])
-
     def _rest(self, duration_s: float) -> None:
-        now_ns = self._now_ns + round(duration_s * NS)
-        target_ns = -(-now_ns // self._step_ns) * self._step_ns
+        now_ns, tissue = self._now_ns + round(duration_s * NS), self.tissue
+        target_ns = -(-now_ns // tissue.step_ns) * tissue.step_ns
         try:
-            self.tissue.rest(max(0, target_ns - round(self.tissue.now_s * NS)) / NS)
+            tissue.rest(max(0, target_ns - round(tissue.now_s * NS)) / NS)
         finally:
             # A rest takes long to compute: if interrupted (Ctrl-C), the clock shows how far the tissue has come.
-            self._now_ns = min(now_ns, round(self.tissue.now_s * NS))
+            self._now_ns = min(now_ns, round(tissue.now_s * NS))
         held = self._held_ns >= self._now_ns
         self._held_ns, self._held_neuron = self._held_ns[held], self._held_neuron[held]
+
+
+def _tissue_pulse(stimulus: Stimulus, time_ns: int) -> TissuePulse:
+    from animat.cultures.tissue import Pulse as TissuePulse
+
+    x_um, y_um = MAXONE.position_um(np.array(stimulus.electrodes))
+    half_um = MAXONE.pitch_um / 2
+    # The charge of the largest cathodic phase, relative to the published pulse.
+    cathodic = max(-phase.charge for phase in stimulus.pulse.phases)
+    strength = max(0.0, cathodic / -PUBLISHED_PULSE.phases[0].charge)
+    return TissuePulse(time_ns / NS, x_um + half_um, y_um + half_um, strength)

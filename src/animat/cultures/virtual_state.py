@@ -6,23 +6,15 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
 
 from animat.cultures.tissue import Tissue
 from animat.cultures.tissue.coupling import Kicks
-from animat.cultures.tissue.snapshot import (
-    LONGEST_NS,
-    Snapshot,
-    expect_array,
-    expect_rising,
-    expect_whole,
-    expect_within,
-)
+from animat.cultures.tissue.snapshot import LONGEST_NS, Snapshot, expect_array, expect_rising, expect_whole
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown
 from animat.stimulation.array import MAXONE
 from animat.stimulation.selection import Selection
@@ -36,17 +28,8 @@ _AHEAD_NS = 1_000_000_000
 """Limit on how far the tissue is ahead of the culture's clock: a step for each pulse within a step."""
 
 
-@dataclass(frozen=True, eq=False)
-class VirtualState:
-    """The complete state of a virtual culture of known settings.
-
-    Attributes:
-        selection: the electrodes in use.
-        zero_ns, now_ns: the zero and the present time of the culture's clock, on the tissue's clock.
-        held_ns, held_neuron: spikes later in the step that contains the present time, on the tissue's clock.
-        snapshot: of the tissue.
-        remarks: whole numbers stored with it.
-    """
+class VirtualState(NamedTuple):
+    """The complete state of a virtual culture of known settings; all times are on the tissue's clock."""
 
     selection: Selection
     zero_ns: int
@@ -82,16 +65,22 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
     fresh = tissue.snapshot()
     lengths = {f"state_{name}": values.nbytes for name, values in fresh.state._asdict().items()}
     lengths |= dict.fromkeys((*(f"kicks_{name}" for name in Kicks._fields), *_HELD, "head"), _MOST_BYTES)
-    head, arrays = _read(path, lengths)
-    for name, value in settings.items():
-        if head["culture"].get(name) != value:
-            remedy = "remove it to start again, or use the same settings"
-            if name == "tissue_revision":
-                remedy = "continue with the version of animat that wrote it, or remove it to start again"
-            raise Mismatch(
-                f"{path}: expected the state of this culture, got another's, which differs in {name}: {remedy}"
-            )
     try:
+        # Opened here, because numpy leaves a damaged file open.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            _expect_members(file.zip, lengths)
+            arrays = {name: file[name] for name in file.files}
+        head = json.loads(str(arrays.pop("head")))
+        if head["format"] != FORMAT:
+            raise InvalidArgument(f"format {shown(head['format'])}")
+        for name, value in settings.items():
+            if head["culture"].get(name) != value:
+                remedy = "remove it to start again, or use the same settings"
+                if name == "tissue_revision":
+                    remedy = "continue with the version of animat that wrote it, or remove it to start again"
+                raise Mismatch(
+                    f"{path}: expected the state of this culture, got another's, which differs in {name}: {remedy}"
+                )
         snapshot = Snapshot(
             seed=tissue.seed,
             parameters=tissue.parameters,
@@ -105,43 +94,24 @@ def read_state(path: Path, settings: Mapping[str, str], tissue: Tissue) -> Virtu
         zero_ns, now_ns, remarks = head["zero_ns"], head["now_ns"], head["remarks"]
         expect_whole("now_ns", now_ns, max(0, snapshot.now_ns - _AHEAD_NS), snapshot.now_ns)
         expect_whole("zero_ns", zero_ns, 0, now_ns)
-        if not isinstance(remarks, dict):
-            raise InvalidArgument(f"remarks: expected whole numbers by name, got {shown(remarks)}")
         for name, remark in remarks.items():
             expect_whole(f"remarks.{shown(name)}", remark, 0, LONGEST_NS)
         held_ns, held_neuron = (arrays[name] for name in _HELD)
-        for name in _HELD:
-            expect_array(name, arrays[name], np.int64, (len(held_ns),))
-        expect_within("held_ns", held_ns, now_ns, snapshot.now_ns)
+        expect_array("held_ns", held_ns, np.int64, (len(held_ns),), (now_ns, snapshot.now_ns))
+        expect_array("held_neuron", held_neuron, np.int64, (len(held_ns),), (0, len(fresh.state.v_mv) - 1))
         expect_rising("held_ns", held_ns)
-        expect_within("held_neuron", held_neuron, 0, len(fresh.state.v_mv) - 1)
         selection = Selection.from_dict(head["selection"])
         if selection.array != MAXONE:
             raise InvalidArgument(f"selection.array: expected the {MAXONE.name}'s, got {shown(selection.array)}")
-    except (KeyError, TypeError, InvalidArgument) as error:
-        raise InvalidFile(
-            f"{path}: expected the state of a virtual culture of this version, got an invalid one ({error}): "
-            "remove it to start again"
-        ) from error
-    return VirtualState(selection, zero_ns, now_ns, held_ns, held_neuron, snapshot, remarks)
-
-
-def _read(path: Path, lengths: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]:
-    """The state's header and its arrays; refuses a file with other arrays, or with more bytes than in `lengths`."""
-    try:
-        # Opened here, because numpy leaves a damaged file open.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            _expect_members(file.zip, lengths)
-            arrays = {name: file[name] for name in file.files}
-        head = json.loads(str(arrays.pop("head")))
-        if head["format"] != FORMAT or not isinstance(head["culture"], dict):
-            raise ValueError(f"format {shown(head['format'])}")
+    except Mismatch:
+        raise
     except Exception as error:  # numpy, zipfile and zlib have a dozen kinds of errors for a damaged archive
+        reason = f" ({error})" if isinstance(error, InvalidArgument) else ""
         raise InvalidFile(
-            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else: "
+            f"{path}: expected the whole state of a virtual culture, but it is damaged or something else{reason}: "
             "choose another, or move it away to start again"
         ) from error
-    return head, arrays
+    return VirtualState(selection, zero_ns, now_ns, held_ns, held_neuron, snapshot, remarks)
 
 
 def _expect_members(archive: zipfile.ZipFile, lengths: Mapping[str, int]) -> None:

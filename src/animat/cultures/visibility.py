@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -17,9 +17,10 @@ HALF_UM = 15.0
 NOISE_UV = 2.4
 """Root mean square of the chip's noise in 100-3000 Hz (uncertain; see the reference page on the virtual culture)."""
 
+Floats = Float64[np.ndarray, " neurons"]
 
-@dataclass(frozen=True, eq=False)
-class Pairs:
+
+class Pairs(NamedTuple):
     """Which electrode sees which neuron, sorted by electrode, then neuron; arrays of shape (pairs,)."""
 
     electrode: Int64[np.ndarray, " pairs"]
@@ -35,34 +36,22 @@ class Visibility:
     At the soma amplitudes are log-normal about 110 uV, between 60 and 300 uV, so that at 25 um the smallest is 16 uV,
     above five standard deviations of the noise: within its reach an electrode misses no spike. Trough-to-peak times
     are 0.45 +- 0.06 ms for excitatory and 0.25 +- 0.05 ms for inhibitory neurons, recovery times 0.45 +- 0.1 and
-    0.25 +- 0.06 ms: they overlap, as in real cultures.
-
-    Args:
-        seed: decides the shapes.
-        array: the electrodes; its electrode 0 is half a pitch from the corner of the tissue.
-        x_um, y_um: positions of the neurons, from the tissue's corner.
-        is_excitatory: their types.
+    0.25 +- 0.06 ms: they overlap, as in real cultures. Positions count from the tissue's corner, half a pitch from
+    electrode 0.
     """
 
     def __init__(
-        self,
-        seed: int,
-        array: ElectrodeArray,
-        x_um: Float64[np.ndarray, " neurons"],
-        y_um: Float64[np.ndarray, " neurons"],
-        is_excitatory: Bool[np.ndarray, " neurons"],
+        self, seed: int, array: ElectrodeArray, x_um: Floats, y_um: Floats, is_excitatory: Bool[np.ndarray, " neurons"]
     ) -> None:
         rng = np.random.default_rng([seed, 11])
         n = len(x_um)
-        self.array = array
         self.amplitude_uv = amplitudes_at_soma_uv(rng, n)
-        draw = rng.standard_normal((2, n))
-        self.trough_to_peak_ms = np.clip(
-            np.where(is_excitatory, 0.45 + 0.06 * draw[0], 0.25 + 0.05 * draw[0]), 0.12, 0.8
-        )
-        self.recovery_ms = np.clip(np.where(is_excitatory, 0.45 + 0.1 * draw[1], 0.25 + 0.06 * draw[1]), 0.1, 0.9)
-        self._x_um, self._y_um = x_um, y_um
-        self.pairs = self._find_pairs()
+        trough, recovery = rng.standard_normal((2, n))
+        trough_ms = np.where(is_excitatory, 0.45 + 0.06 * trough, 0.25 + 0.05 * trough)
+        self.trough_to_peak_ms = np.clip(trough_ms, 0.12, 0.8)
+        recovery_ms = np.where(is_excitatory, 0.45 + 0.1 * recovery, 0.25 + 0.06 * recovery)
+        self.recovery_ms = np.clip(recovery_ms, 0.1, 0.9)
+        self.pairs = _find_pairs(array, x_um, y_um)
 
     def pairs_of(self, electrodes: Int64[np.ndarray, " electrodes"]) -> Pairs:
         """The pairs of some electrodes, in their order; `electrode` becomes the row in `electrodes`."""
@@ -86,8 +75,7 @@ class Visibility:
         rng: np.random.Generator,
     ) -> ScannedActivity:
         """What electrodes measure of each neuron's spikes: means over spikes, blurred by the noise."""
-        pairs = self.pairs_of(electrodes)
-        rows = len(electrodes)
+        pairs, rows = self.pairs_of(electrodes), len(electrodes)
         weight = spikes_of[pairs.neuron].astype(np.float64)
         count = np.bincount(pairs.electrode, weight, rows)
         amplitude_uv = self.amplitude_at(pairs.neuron, pairs.distance_um)
@@ -109,24 +97,22 @@ class Visibility:
             recovery_ms=mean(self.recovery_ms[pairs.neuron]) + jitter_ms * blur[2],
         )
 
-    def _find_pairs(self) -> Pairs:
-        pitch_um = self.array.pitch_um
-        # Positions relative to electrode 0.
-        x_um, y_um = self._x_um - pitch_um / 2, self._y_um - pitch_um / 2
-        reach = int(np.ceil(REACH_UM / pitch_um))
-        steps = np.arange(-reach, reach + 1)
-        column = np.rint(x_um / pitch_um).astype(np.int64)[:, None, None] + steps[None, :, None]
-        row = np.rint(y_um / pitch_um).astype(np.int64)[:, None, None] + steps[None, None, :]
-        column, row = np.broadcast_arrays(column, row)
-        distance_um = np.hypot(column * pitch_um - x_um[:, None, None], row * pitch_um - y_um[:, None, None])
-        seen = (distance_um <= REACH_UM) & (column >= 0) & (column < self.array.columns)
-        seen &= (row >= 0) & (row < self.array.rows)
-        electrode = (row * self.array.columns + column)[seen]
-        neuron = np.nonzero(seen)[0]
-        order = np.lexsort((neuron, electrode))
-        return Pairs(electrode[order], neuron[order], distance_um[seen][order])
+
+def _find_pairs(array: ElectrodeArray, x_um: Floats, y_um: Floats) -> Pairs:
+    pitch_um = array.pitch_um
+    # Positions relative to electrode 0.
+    x_um, y_um = x_um[:, None, None] - pitch_um / 2, y_um[:, None, None] - pitch_um / 2
+    reach = int(np.ceil(REACH_UM / pitch_um))
+    steps = np.arange(-reach, reach + 1)
+    column = np.rint(x_um / pitch_um).astype(np.int64) + steps[:, None]
+    row = np.rint(y_um / pitch_um).astype(np.int64) + steps
+    distance_um = np.hypot(column * pitch_um - x_um, row * pitch_um - y_um)
+    seen = (distance_um <= REACH_UM) & (column >= 0) & (column < array.columns) & (row >= 0) & (row < array.rows)
+    electrode, neuron = (row * array.columns + column)[seen], np.nonzero(seen)[0]
+    order = np.lexsort((neuron, electrode))
+    return Pairs(electrode[order], neuron[order], distance_um[seen][order])
 
 
-def amplitudes_at_soma_uv(rng: np.random.Generator, neurons: int) -> Float64[np.ndarray, " neurons"]:
+def amplitudes_at_soma_uv(rng: np.random.Generator, neurons: int) -> Floats:
     """Amplitude of each neuron's spikes at its soma: log-normal about 110 uV, between 60 and 300 uV."""
     return np.clip(110.0 * rng.lognormal(0.0, 0.4, neurons), 60.0, 300.0)

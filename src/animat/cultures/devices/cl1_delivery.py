@@ -1,20 +1,24 @@
-"""One delivery on a CL1: pulses run at frames of its clock, while a loop reads the spikes."""
+"""Deliveries on a CL1: pulses run at frames of its clock, while a loop reads the spikes."""
 
 from __future__ import annotations
 
+import json
+import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
-from animat.cultures.pace import Pace
+from animat.cultures.observed import Observed, observed_in_frames
+from animat.cultures.safety import Guard
 from animat.errors import DeviceFailed
+from animat.recordings.formats.cl1_layout import CHANNELS, SITES
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimulus
+from animat.tables import UNKNOWN
 
 FRAMES_PER_S = 25_000
 LEAD_US = 80
@@ -23,66 +27,59 @@ LEAD_FRAMES = LEAD_US * FRAMES_PER_S // 1_000_000
 AHEAD_FRAMES = 2_500
 """Pulses are queued on the device up to 100 ms ahead: the computer may fall behind by as much, and a stop has to remove
 no more than that from the queue."""
+QUEUEING_S = 0.5
+"""How long a stop waits while a pulse is being queued."""
 
-Result = tuple[int, int, Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"], Float64[np.ndarray, " stimuli"]]
+_ROW_OF = np.full(CHANNELS, UNKNOWN, dtype=np.int64)
+_ROW_OF[list(SITES)] = np.arange(len(SITES))
 
 
-class Delivery:
-    """Delivers stimuli through `Neurons.loop` and stim plans.
+class Session:
+    """An open CL1, from opening to closing: delivers stimuli through `Neurons.loop` and stim plans.
 
     A plan runs at a frame, and its pulse comes one lead time later. Pulses are queued within the loop, in order of
-    time. If one is late, all after it are delayed equally, so that intervals between pulses can only grow.
-
-    Args:
-        cl: the SDK.
-        neurons: of the SDK, open.
-        pace: the limits on the device's clock.
-        ticks_per_s: of the loop.
-        margin_frames: shortest time from now to the run of a plan.
-        jitter: arguments of the loop on jitter.
-        log: called with frame and parameters of each queued pulse.
-        lock: held while a pulse is queued.
+    time, at least `margin_frames` ahead. If one is late, all after it are delayed equally, so that intervals between
+    pulses can only grow. A delivery that hangs beyond its session stays halted.
     """
 
-    def __init__(
-        self,
-        cl: Any,
-        neurons: Any,
-        pace: Pace,
-        *,
-        ticks_per_s: int,
-        margin_frames: int,
-        jitter: dict[str, Any],
-        log: Callable[[int, dict[str, Any]], None],
-        lock: AbstractContextManager[Any],
-    ) -> None:
-        self._cl, self._neurons, self._pace = cl, neurons, pace
+    def __init__(self, cl: Any, neurons: Any, ticks_per_s: int, margin_frames: int, jitter: dict[str, Any]) -> None:
+        self.cl, self.neurons = cl, neurons
         self._ticks_per_s, self._margin_frames, self._jitter = ticks_per_s, margin_frames, jitter
-        self._log, self._lock = log, lock
-        self._designs: dict[Pulse, Any] = {}
+        self.guard: Guard
+        """On the device's clock."""
+        self.stream: Any = None
+        """The SDK's data stream for the parameters of each stimulus; None: not recorded."""
+        self._design_of = cache(self._design)
+        self._halted = threading.Event()
+        self._lock = threading.RLock()
 
-    def run(
-        self, stimuli: Sequence[Stimulus], duration_s: float, *, since: int, is_halted: Callable[[], bool]
-    ) -> Result:
-        """Deliver, and read until `duration_s` after the start, extended by the delay of the stimuli.
+    def halt(self) -> None:
+        """Let no later pulse be queued, and interrupt those that are."""
+        # First of all: a delivery checks it, with the lock held, before it queues a pulse.
+        self._halted.set()
+        # Wait while a pulse is being queued, but not for ever: the queue must be cleared even if that hangs.
+        is_held = self._lock.acquire(timeout=QUEUEING_S)
+        try:
+            self.interrupt()
+        finally:
+            if is_held:
+                self._lock.release()
 
-        Args:
-            stimuli: in order of time.
-            duration_s: of reading, which starts when the loop does.
-            since: frame from which times of stimuli count: no later than the start.
-            is_halted: whether to queue nothing more.
+    def interrupt(self) -> None:
+        """Stop pulses in progress on every channel, and clear the queue."""
+        self.neurons.interrupt(self.cl.ChannelSet(*SITES))
 
-        Returns:
-            First frame, frame after the last, frames and channels of the spikes, and the frame of each stimulus start.
+    def deliver(self, stimuli: Sequence[Stimulus], duration_s: float, since: int) -> tuple[Observed, int]:
+        """Deliver, and read until `duration_s` after the loop starts, extended by the delay of the stimuli.
 
-        Raises:
-            DeviceFailed: if it was stopped half way, or a pulse never came.
+        Times of stimuli count from the frame `since`, no later than the start. Also returns how many spikes were not on
+        electrodes; raises DeviceFailed if it was stopped half way, or a pulse never came.
         """
         waiting, requested = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
         queued: list[int] = []
         frames, channels, reported = [], [], defaultdict[int, deque[int]](deque)
         late, start, stop = 0, None, 0
-        for tick in self._neurons.loop(self._ticks_per_s, **self._jitter):
+        for tick in self.neurons.loop(self._ticks_per_s, **self._jitter):
             analysis = tick.analysis
             if start is None:
                 start = int(analysis.start_timestamp)
@@ -91,11 +88,11 @@ class Delivery:
             channels += [spike.channel for spike in analysis.spikes]
             for pulse in sorted(analysis.stims, key=lambda pulse: pulse.timestamp):
                 reported[pulse.channel].append(pulse.timestamp)
-            self._check_going(is_halted, len(queued), len(stimuli))
+            self._check_going(len(queued), len(stimuli))
             while waiting and requested[len(queued)] + late < stop + AHEAD_FRAMES:
                 # A stop from another thread comes either before the pulse is queued, or after, and then removes it.
                 with self._lock:
-                    self._check_going(is_halted, len(queued), len(stimuli))
+                    self._check_going(len(queued), len(stimuli))
                     frame = self._queue(waiting.popleft(), requested[len(queued)] + late)
                 late = frame - requested[len(queued)]
                 queued.append(frame)
@@ -104,12 +101,13 @@ class Delivery:
                 tick.loop.stop()
         if start is None or waiting:
             raise DeviceFailed(f"CL1: expected a loop over {duration_s:g} s, got one that ended early")
-        begun = [self._began(stimulus, frame, reported, start) for stimulus, frame in zip(stimuli, queued, strict=True)]
-        return start, stop, np.array(frames, np.int64), np.array(channels, np.int64), np.array(begun, np.float64)
+        began = [_began(stimulus, due, reported, start) for stimulus, due in zip(stimuli, queued, strict=True)]
+        frame_of, row = np.array(frames, np.int64), _ROW_OF[np.array(channels, np.int64)]
+        observed = observed_in_frames(start, stop, frame_of, row, np.array(began, np.float64), FRAMES_PER_S)
+        return observed, int(np.count_nonzero(row == UNKNOWN))
 
-    @staticmethod
-    def _check_going(is_halted: Callable[[], bool], queued: int, total: int) -> None:
-        if total and is_halted():
+    def _check_going(self, queued: int, total: int) -> None:
+        if total and self._halted.is_set():
             raise DeviceFailed(
                 f"CL1: stopped while delivering: {queued} of {total} stimuli had been sent to the device, and what had "
                 "not begun was interrupted"
@@ -117,39 +115,34 @@ class Delivery:
 
     def _queue(self, stimulus: Stimulus, frame: int) -> int:
         """Queue one stimulus on the device, at a frame or as soon as possible after it; returns the frame."""
-        earliest = int(self._neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
+        earliest = int(self.neurons.timestamp()) + self._margin_frames + LEAD_FRAMES
         alone = [replace(stimulus, time_s=0.0)]
-        frame = round(self._pace.earliest(alone, max(frame, earliest) / FRAMES_PER_S) * FRAMES_PER_S)
-        self._pace.count(alone, frame / FRAMES_PER_S)
-        plan = self._neurons.create_stim_plan()
-        plan.stim(self._cl.ChannelSet(*stimulus.electrodes), self._design(stimulus.pulse), lead_time_us=LEAD_US)
+        frame = round(self.guard.earliest(alone, max(frame, earliest) / FRAMES_PER_S) * FRAMES_PER_S)
+        self.guard.admit(alone, frame / FRAMES_PER_S)
+        plan = self.neurons.create_stim_plan()
+        plan.stim(self.cl.ChannelSet(*stimulus.electrodes), self._design_of(stimulus.pulse), lead_time_us=LEAD_US)
         plan.run(at_timestamp=frame - LEAD_FRAMES)
-        self._log(frame, _parameters(stimulus))
+        if self.stream is not None:
+            self.stream.append(frame, json.dumps(_parameters(stimulus)))
         return frame
 
     def _design(self, pulse: Pulse) -> Any:
-        if pulse not in self._designs:
-            numbers: list[float] = []
-            for phase in pulse.phases:
-                assert phase.amplitude_ua is not None
-                numbers += [round(phase.duration_us), float(phase.amplitude_ua)]
-            self._designs[pulse] = self._cl.StimDesign(*numbers)
-        return self._designs[pulse]
+        return self.cl.StimDesign(*(n for phase in pulse.phases for n in (round(phase.duration_us), phase.amplitude)))
 
-    @staticmethod
-    def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], start: int) -> int:
-        """The frame at which the device reports the first pulse of a stimulus; it must report all its electrodes."""
-        began = []
-        for electrode in stimulus.electrodes:
-            while reported[electrode] and reported[electrode][0] < frame:
-                reported[electrode].popleft()
-            if not reported[electrode]:
-                raise DeviceFailed(
-                    f"CL1: expected a pulse on channel {electrode} {(frame - start) / FRAMES_PER_S:g} s into the "
-                    "delivery, got none: the device left it out"
-                )
-            began.append(reported[electrode].popleft())
-        return min(began)
+
+def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], start: int) -> int:
+    """The frame at which the device reports the first pulse of a stimulus; it must report all its electrodes."""
+    began = []
+    for electrode in stimulus.electrodes:
+        while reported[electrode] and reported[electrode][0] < frame:
+            reported[electrode].popleft()
+        if not reported[electrode]:
+            raise DeviceFailed(
+                f"CL1: expected a pulse on channel {electrode} {(frame - start) / FRAMES_PER_S:g} s into the "
+                "delivery, got none: the device left it out"
+            )
+        began.append(reported[electrode].popleft())
+    return min(began)
 
 
 def _parameters(stimulus: Stimulus) -> dict[str, Any]:

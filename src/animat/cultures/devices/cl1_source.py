@@ -1,20 +1,17 @@
-"""The simulated tissue as a data source of the CL1's SDK: any CL application runs on it as on a device.
-
-from animat.cultures.devices.cl1_source import use_simulated_culture
-use_simulated_culture(seed=1)          # before `cl.open()`; the SDK's simulator then reacts to stimuli
-"""
+"""The simulated tissue as a data source of the CL1's SDK: any CL application runs on it as on a device."""
 
 from __future__ import annotations
 
 import os
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int16
+from jaxtyping import Float32, Float64, Int16
 
 from animat.cultures.devices.cl1_delivery import FRAMES_PER_S
 from animat.cultures.tissue import Pulse, Tissue, TissueParameters
@@ -37,15 +34,6 @@ BEFORE = 25
 """Samples of a spike in the SDK, and how many of them precede its time."""
 
 
-class StimulusEvent(Protocol):
-    """The SDK's description of one pulse on one channel (`cl.sim.DataSourceStim`)."""
-
-    timestamp: int
-    channel: int
-    phase_durations_us: tuple[int, ...]
-    phase_currents_uA: tuple[float, ...]
-
-
 class SimulatedCL1:
     """A tissue under the CL1's 8 x 8 electrodes, read in frames; independent of the SDK.
 
@@ -62,9 +50,6 @@ class SimulatedCL1:
         reach_um: of an electrode; assumed, and wider than a CMOS array's, as its electrodes are larger.
         charge_nc: of a pulse of strength 1; assumed: that of the SDK's default pulse for 1 uA (160 us).
         noise_uv: root mean square of the noise.
-
-    Raises:
-        InvalidArgument: for an invalid setting.
     """
 
     def __init__(
@@ -80,23 +65,19 @@ class SimulatedCL1:
         for name, value in (("pitch_um", pitch_um), ("reach_um", reach_um), ("charge_nc", charge_nc)):
             if not 0 < value < 1e6:
                 raise InvalidArgument(f"{name}: expected above 0, got {value}")
-        parameters = TissueParameters()
-        share = min(1.0, neurons / parameters.neurons)
-        parameters = replace(
-            parameters,
-            neurons=neurons,
-            in_degree_e=max(1, round(parameters.in_degree_e * share)),
-            in_degree_i=max(1, round(parameters.in_degree_i * share)),
-        )
+        whole = TissueParameters()
+        share = min(1.0, neurons / whole.neurons)
+        degree_e, degree_i = (max(1, round(degree * share)) for degree in (whole.in_degree_e, whole.in_degree_i))
+        parameters = TissueParameters(neurons=neurons, in_degree_e=degree_e, in_degree_i=degree_i)
         self._tissue = Tissue(seed, parameters)
         self._seed, self._charge_nc, self._noise_units = seed, charge_nc, noise_uv / UV_PER_UNIT
         self._step_frames = round(parameters.step_ms * 1e-3 * FRAMES_PER_S)
-        width_um, height_um = float(np.max(self._tissue.x_um)), float(np.max(self._tissue.y_um))
-        channel = np.arange(CHANNELS)
-        self.x_um = width_um / 2 + (channel // 8 - 3.5) * pitch_um
-        self.y_um = height_um / 2 + (channel % 8 - 3.5) * pitch_um
+        x_um, y_um, channel = self._tissue.x_um, self._tissue.y_um, np.arange(CHANNELS)
+        self.x_um = x_um.max() / 2 + (channel // 8 - 3.5) * pitch_um
+        self.y_um = y_um.max() / 2 + (channel % 8 - 3.5) * pitch_um
         self._is_electrode = ~np.isin(channel, list(NO_STIMULATION))
-        self._sees = self._neurons_seen(reach_um)
+        distance_um = np.hypot(x_um[:, None] - self.x_um, y_um[:, None] - self.y_um)
+        self._sees = [np.flatnonzero(near).tolist() for near in (distance_um <= reach_um) & self._is_electrode]
         amplitude_uv = amplitudes_at_soma_uv(np.random.default_rng([seed, 11]), len(self._tissue.x_um))
         self._shapes = _waveform()[None, :] * amplitude_uv[:, None].astype(np.float32)
         self._tissue.advance(WARM_UP_S)
@@ -113,16 +94,15 @@ class SimulatedCL1:
         self._unfinished: list[tuple[int, int, int]] = []
         self._block: tuple[int, Int16[np.ndarray, "frames channels"]] | None = None
 
-    def stimulate(self, events: Sequence[StimulusEvent]) -> None:
-        """Schedule pulses; those of one frame on several channels are one stimulus. Late ones act immediately."""
-        channels_of: dict[tuple[int, float], list[int]] = {}
+    def stimulate(self, events: Sequence[Any]) -> None:
+        """Schedule pulses (`cl.sim.DataSourceStim`); those of one frame are one stimulus. Late ones act immediately."""
+        channels_of = defaultdict[tuple[int, float], list[int]](list)
         for event in events:
             if 0 <= event.channel < CHANNELS and self._is_electrode[event.channel]:
                 charges = zip(event.phase_durations_us, event.phase_currents_uA, strict=True)
                 cathodic_nc = max([0.0, *(-us * ua / 1000 for us, ua in charges)])
                 if cathodic_nc > 0:
-                    key = (event.timestamp, min(2.0, cathodic_nc / self._charge_nc))
-                    channels_of.setdefault(key, []).append(event.channel)
+                    channels_of[event.timestamp, min(2.0, cathodic_nc / self._charge_nc)].append(event.channel)
         for (frame, strength), channels in sorted(channels_of.items()):
             at_s = (self._zero_frames + max(0, frame)) / FRAMES_PER_S
             self._pulses.append(Pulse(at_s, self.x_um[sorted(channels)], self.y_um[sorted(channels)], strength))
@@ -130,11 +110,7 @@ class SimulatedCL1:
     def read(
         self, from_frame: int, frame_count: int
     ) -> tuple[Int16[np.ndarray, "frames channels"], list[tuple[int, int, Float32[np.ndarray, " samples"]]]]:
-        """Frames from `from_frame` on, and their spikes in order of time: frame, channel, waveform.
-
-        Raises:
-            InvalidArgument: for frames that were already read.
-        """
+        """Frames from `from_frame` on, not read before, and their spikes in order: frame, channel, waveform."""
         if from_frame < self._next:
             raise InvalidArgument(
                 f"from_frame: expected {self._next} or later, as time only moves forward, got {from_frame}"
@@ -159,13 +135,7 @@ class SimulatedCL1:
         return frames, [(frame, channel, self._shapes[neuron]) for frame, channel, neuron in due]
 
     def share_of_real_time(self) -> float:
-        """Share of real time that computing takes, timed on a tenth of a second in the pieces that the SDK reads.
-
-        The culture's state is then restored. Stimuli and the application's own computing take additional time.
-
-        Raises:
-            InvalidArgument: for a culture that was already read.
-        """
+        """Share of real time that computing takes, timed on a tenth of a second, before anything is read."""
         if self._next:
             raise InvalidArgument(f"culture: expected one not yet read, got one that was read to frame {self._next}")
         before, begun_s = self._tissue.snapshot(), time.perf_counter()
@@ -188,7 +158,6 @@ class SimulatedCL1:
         )
 
     def _advance(self, to_frame: int) -> None:
-        """Advance the tissue to the end of the step in which the frames end."""
         target = -(-(self._zero_frames + to_frame) // self._step_frames) * self._step_frames
         now = round(self._tissue.now_s * FRAMES_PER_S)
         if target <= now:
@@ -200,14 +169,6 @@ class SimulatedCL1:
         for time_s, neuron in zip(spikes.time_s.tolist(), spikes.neuron.tolist(), strict=True):
             frame = round(time_s * FRAMES_PER_S) - self._zero_frames
             self._held += [(max(frame, self._next), channel, neuron) for channel in self._sees[neuron]]
-
-    def _neurons_seen(self, reach_um: float) -> list[list[int]]:
-        """The channels that see each neuron."""
-        x_um, y_um = self._tissue.x_um, self._tissue.y_um
-        near: Bool[np.ndarray, "neurons channels"] = (
-            np.hypot(x_um[:, None] - self.x_um, y_um[:, None] - self.y_um) <= reach_um
-        ) & self._is_electrode
-        return [np.flatnonzero(row).tolist() for row in near]
 
     def _noise(self, from_frame: int, count: int) -> Int16[np.ndarray, "frames channels"]:
         """Noise of these frames, drawn block by block so that it does not depend on the pieces read."""
@@ -243,8 +204,6 @@ def simulated_culture(**settings: Any) -> Any:
     from cl.sim import DataSourceBatch, DataSourceSpike, SimulatorDataSource
 
     class Source(SimulatorDataSource):  # type: ignore[misc]
-        """Opens a tissue in the simulator's process, a new one whenever the SDK opens it."""
-
         def __init__(self) -> None:
             self._culture: SimulatedCL1 | None = None
 
@@ -261,7 +220,7 @@ def simulated_culture(**settings: Any) -> Any:
         def close(self) -> None:
             self._culture = None
 
-        def on_stims(self, stims: Sequence[StimulusEvent]) -> None:
+        def on_stims(self, stims: Sequence[Any]) -> None:
             if self._culture is not None:
                 self._culture.stimulate(stims)
 
@@ -276,8 +235,7 @@ def simulated_culture(**settings: Any) -> Any:
 def use_simulated_culture(**settings: Any) -> None:
     """Make the SDK's simulator read from a simulated culture, from the next `cl.open()` on.
 
-    Args:
-        settings: of `SimulatedCL1`, serialisable as JSON.
+    The settings are those of `SimulatedCL1`, serialisable as JSON.
     """
     import cl.sim
 

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -19,18 +18,21 @@ from animat.cultures.base import Culture
 from animat.cultures.devices.maxone_sequences import FRAMES_PER_S, INITIAL_DELAY, SAMPLE_US, Sequences
 from animat.cultures.devices.maxone_stream import AMPLIFIERS, SpikeStream, ZmqSpikes
 from animat.cultures.devices.maxone_wiring import Wiring, wire
-from animat.cultures.failures import describe_error
+from animat.cultures.failures import as_device_failure, describe_error, once_opened, vendor_module, while_open
 from animat.cultures.history import History
 from animat.cultures.holding import of_the_machine
-from animat.cultures.observed import Observed, Spikes
-from animat.cultures.pace import Pace, from_zero
-from animat.cultures.safety import Admitted, Limits
-from animat.errors import AnimatError, DeviceFailed, InvalidArgument
+from animat.cultures.observed import Observed, observed_in_frames
+from animat.cultures.safety import Admitted, Guard, Limits
+from animat.errors import DeviceFailed, InvalidArgument
 from animat.recordings.recording import Channels, RecordedCulture
 from animat.stimulation.selection import Selection
 from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN
 
+_NO_MODULE = (
+    "maxlab: expected the vendor's Python module, got none: it comes with MaxLab Live (MaxWell Biosystems), and no "
+    "package index has it; run where it is installed"
+)
 DAC_STEPS = 511
 """Converter codes on either side of 0 V."""
 
@@ -59,16 +61,9 @@ MAXONE_LIMITS = Limits(
 class MaxOneCulture(Culture):
     """A culture on a MaxOne: the selected electrodes, with one stimulation unit per site, all driven by one converter.
 
-    Opening routes the array, and fails with the names of stimulation electrodes that were not routed, have no unit, or
-    share one. Recording electrodes that were not routed are left out and counted. All units in use are powered from
-    opening to closing; a stimulus connects those of its electrodes for the duration of its pulse.
-
-    Stimuli within `sequence_s` form one sequence, in which times are exact (50 us) and which is rebuilt each time. A
-    single stimulus is kept on the device as a sequence of its pattern and pulse, and reused. The computer determines
-    when a sequence starts: `stimulus_time_s` is estimated from the newest frame when the server had accepted it. `stop`
-    cuts the power of all units.
-
-    Never run on a device: `docs/hardware.md` lists what was tested, and against what.
+    Times are exact (50 us) within a sequence of stimuli; the computer determines when it starts, so `stimulus_time_s`
+    is an estimate. `stop` cuts the power of all units. Never run on a device: `docs/hardware.md` has more, and lists
+    what was tested, and against what.
 
     Args:
         selection: electrodes to record, to stimulate, and the patterns.
@@ -109,7 +104,8 @@ class MaxOneCulture(Culture):
         self._stream: SpikeStream | None = None
         self._wiring: Wiring | None = None
         self._sequences: Sequences | None = None
-        self._pace: Pace | None = None
+        self._guard: Guard | None = None
+        """On the device's clock."""
         self._begun = History()
         self._lsb_mv = 0.0
         # The first frame, and the last one before closing.
@@ -121,21 +117,20 @@ class MaxOneCulture(Culture):
     @property
     def channels(self) -> Channels:
         """The recording electrodes that were routed, labelled by amplifier number."""
-        return self._wired().channels
+        return once_opened(self._wiring).channels
 
     @property
     def not_routed(self) -> tuple[int, ...]:
         """Recording electrodes that were selected but not routed."""
-        return self._wired().not_routed
+        return once_opened(self._wiring).not_routed
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        """Those of the selection: all are connected, or the culture does not open."""
+        # All are connected, or the culture does not open.
         return tuple(self.selection.stimulation.tolist())
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:
-        """Those of the selection."""
         return self.selection.patterns
 
     @property
@@ -152,7 +147,7 @@ class MaxOneCulture(Culture):
     @property
     def now_s(self) -> float:
         """Time since it was first opened, by the newest frame received."""
-        return (self._streaming().frame() - self._zero_frame) / FRAMES_PER_S
+        return (while_open(self._stream).frame() - self._zero_frame) / FRAMES_PER_S
 
     @property
     def sampling_rate_hz(self) -> float:
@@ -164,7 +159,7 @@ class MaxOneCulture(Culture):
 
     @property
     def provenance(self) -> dict[str, str]:
-        wiring = self._wired()
+        wiring = once_opened(self._wiring)
         units = ", ".join(f"{electrode}: {unit}" for electrode, unit in wiring.unit_of.items())
         return {
             # As in existing recordings, though the module has moved: a series continues only if this text stays.
@@ -182,11 +177,11 @@ class MaxOneCulture(Culture):
         return {"spikes on amplifiers without an electrode": self.spikes_not_recorded, "frames lost on the way": lost}
 
     def _open(self) -> None:
-        self._mx = mx = _vendor()
+        self._mx = mx = vendor_module("maxlab", _NO_MODULE)
         # New for each session: a delivery of an earlier one that hung and resumes sees its own event, which stays set.
         self._halted = threading.Event()
         self.spikes_not_recorded = 0
-        try:
+        with as_device_failure("MaxOne", "open", ": is MaxLab Live's server running?"):
             mx.initialize()
             self._switch_power(True)
             self._wait("waitInit")
@@ -195,19 +190,13 @@ class MaxOneCulture(Culture):
             self._sequences = Sequences(mx, self._wiring.unit_of, self._lsb_mv)
             self._stream = self._given_stream or ZmqSpikes()
             self._stream.start()
-        except AnimatError:
-            raise
-        except Exception as error:
-            raise DeviceFailed(
-                f"MaxOne: expected a device to open, got {describe_error(error)}: is MaxLab Live's server running?"
-            ) from error
         frame = self._stream.frame()
         if self._last_frame < 0:
             self._zero_frame = frame
         elif frame < self._last_frame:
             # The frame count restarted: the clock continues from where it was.
             self._zero_frame += frame - self._last_frame
-        self._pace = Pace(self.limits, self.stimulation_electrodes, self._begun, frame / FRAMES_PER_S)
+        self._guard = Guard(self.limits, self.stimulation_electrodes, self._begun, frame / FRAMES_PER_S)
 
     def _deliver(self, admitted: Admitted, duration_s: float) -> Observed:
         try:
@@ -222,19 +211,17 @@ class MaxOneCulture(Culture):
 
     def _send(self, admitted: Admitted, duration_s: float) -> Observed:
         """Send sequences on time, and read the spikes meanwhile."""
-        stream, sequences, pace = self._streaming(), self._sequences, self._pace
-        assert sequences is not None and pace is not None
-        halted = self._halted
+        stream, halted = while_open(self._stream), self._halted
+        sequences, guard = while_open(self._sequences), while_open(self._guard)
         # The stream keeps spikes, so observation starts at the request, however long sequences take to build.
         start, late = self._zero_frame + round(admitted.now_s * FRAMES_PER_S), 0
-        groups = _groups(admitted.stimuli, self._sequence_s)
-        built = [sequences.of(group) for group in groups]
+        built = [(group, sequences.of(group)) for group in _groups(admitted.stimuli, self._sequence_s)]
         begun: list[int] = []
-        for group, sequence in zip(groups, built, strict=True):
+        for group, sequence in built:
             due = start + round(group[0].time_s * FRAMES_PER_S) + late
-            relative = from_zero(group)
+            relative = [replace(stimulus, time_s=stimulus.time_s - group[0].time_s) for stimulus in group]
             earliest = max(due, stream.frame() + INITIAL_DELAY)
-            earliest = round(pace.earliest(relative, earliest / FRAMES_PER_S) * FRAMES_PER_S)
+            earliest = round(guard.earliest(relative, earliest / FRAMES_PER_S) * FRAMES_PER_S)
             stream.wait(earliest - INITIAL_DELAY)
             if halted.is_set():
                 raise DeviceFailed(
@@ -244,9 +231,8 @@ class MaxOneCulture(Culture):
             sequence.send()
             # The pulse follows the initial delay after the server accepted the command: about now.
             first = stream.frame() + INITIAL_DELAY
-            pace.count(relative, first / FRAMES_PER_S)
-            offsets = [round(stimulus.time_s * FRAMES_PER_S) for stimulus in relative]
-            begun += [first + offset for offset in offsets]
+            guard.admit(relative, first / FRAMES_PER_S)
+            begun += [first + round(stimulus.time_s * FRAMES_PER_S) for stimulus in relative]
             late += first - due
             # Two simultaneous sequences would drive the same converter.
             stream.wait(begun[-1] + round(group[-1].pulse.duration_us / SAMPLE_US))
@@ -258,22 +244,17 @@ class MaxOneCulture(Culture):
         if len(amplifiers) and not 0 <= amplifiers.min() <= amplifiers.max() < AMPLIFIERS:
             strange = amplifiers[(amplifiers < 0) | (amplifiers >= AMPLIFIERS)][0]
             raise DeviceFailed(f"MaxOne: expected spikes on amplifiers 0 to {AMPLIFIERS - 1}, got one on {strange}")
-        row = self._wired().row_of[amplifiers]
+        row = once_opened(self._wiring).row_of[amplifiers]
         self.spikes_not_recorded += int(np.count_nonzero(row == UNKNOWN))
-        frames, row = frames[row != UNKNOWN], row[row != UNKNOWN]
-        order = np.lexsort((row, frames))
-        return Observed(
-            start_s=(start - self._zero_frame) / FRAMES_PER_S,
-            duration_s=(stop - start) / FRAMES_PER_S,
-            spikes=Spikes((frames[order] - start) / FRAMES_PER_S, row[order]),
-            stimulus_time_s=(np.array(begun, dtype=np.float64) - start) / FRAMES_PER_S,
-        )
+        began = np.array(begun, dtype=np.float64)
+        return observed_in_frames(start, stop, frames, row, began, FRAMES_PER_S, zero=self._zero_frame)
 
     def _rest(self, duration_s: float) -> None:
-        stream = self._streaming()
+        stream = while_open(self._stream)
         until = stream.frame() + int(np.ceil(duration_s * FRAMES_PER_S))
         stream.wait(until)
-        stream.forget(until)
+        # What came meanwhile is discarded.
+        stream.take(until, until)
 
     def _halt(self) -> None:
         self._halted.set()
@@ -295,44 +276,21 @@ class MaxOneCulture(Culture):
     def _release(self) -> None:
         stream = self._stream
         # The wiring stays readable; so do `device_limits`, for the next opening.
-        self._mx = self._stream = self._sequences = self._pace = None
+        self._mx = self._stream = self._sequences = self._guard = None
         if stream is not None:
             # -1 if no frame was received.
             self._last_frame = stream.frame() if stream.frame() >= 0 else self._last_frame
             stream.stop()
 
     def _switch_power(self, on: bool) -> None:
-        """Switch the power of all stimulation units, if there is a device."""
         mx = self._mx
         if mx is not None and (reply := mx.send(mx.Core().enable_stimulation_power(on))) != "Ok":
-            raise DeviceFailed(
-                f"MaxOne: expected stimulation power to be switched {'on' if on else 'off'}, got {reply!r}"
-            )
+            state = "on" if on else "off"
+            raise DeviceFailed(f"MaxOne: expected stimulation power to be switched {state}, got {reply!r}")
 
     def _wait(self, name: str) -> None:
-        """Wait as long as `maxlab.Timing` specifies under a name."""
         if self._settle and self._mx is not None:
             time.sleep(float(getattr(getattr(self._mx, "Timing", None), name, 5.0)))
-
-    def _wired(self) -> Wiring:
-        if self._wiring is None:
-            raise InvalidArgument("culture: expected one that was opened, got a new one: use it as `with culture:`")
-        return self._wiring
-
-    def _streaming(self) -> SpikeStream:
-        if self._stream is None:
-            raise InvalidArgument("culture: expected an open one, got a closed one: use it as `with culture:`")
-        return self._stream
-
-
-def _vendor() -> ModuleType:
-    try:
-        return import_module("maxlab")
-    except ImportError as error:
-        raise DeviceFailed(
-            "maxlab: expected the vendor's Python module, got none: it comes with MaxLab Live (MaxWell Biosystems), "
-            "and no package index has it; run where it is installed"
-        ) from error
 
 
 def _step_mv(reply: Any) -> float:

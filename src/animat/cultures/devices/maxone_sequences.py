@@ -34,11 +34,6 @@ class Sequences:
     """Builds sequences of stimuli, and keeps one on the device for each pattern and pulse delivered singly.
 
     Trains are not assembled from kept sequences, as intervals between sequences depend on the computer and are inexact.
-
-    Args:
-        mx: the vendor's module.
-        unit_of: unit of each stimulation electrode.
-        lsb_mv: the converter's step.
     """
 
     def __init__(self, mx: Any, unit_of: Mapping[int, int], lsb_mv: float) -> None:
@@ -52,18 +47,13 @@ class Sequences:
         """A sequence that delivers these stimuli, the first `INITIAL_DELAY` samples after sending."""
         if len(stimuli) > 1:
             # A sequence leaves the device with its last reference; those of earlier deliveries are no longer running.
-            self._passing = self._passing[-100:]
-            sequence = self._new(persistent=False)
-            self._append_all(sequence, stimuli)
-            self._passing.append(sequence)
-            return sequence
-        stimulus = stimuli[0]
-        key = stimulus.electrodes, stimulus.pulse
+            self._passing = [*self._passing[-100:], self._build(stimuli, is_kept=False)]
+            return self._passing[-1]
+        key = stimuli[0].electrodes, stimuli[0].pulse
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self.delete()
-            self._kept[key] = self._new(persistent=True)
-            self._append_all(self._kept[key], stimuli)
+            self._kept[key] = self._build(stimuli, is_kept=True)
         return self._kept[key]
 
     def delete(self) -> None:
@@ -74,23 +64,22 @@ class Sequences:
         self._kept.clear()
         self._passing.clear()
 
-    def _new(self, *, persistent: bool) -> Any:
+    def _build(self, stimuli: Sequence[Stimulus], *, is_kept: bool) -> Any:
         self._made += 1
-        return self._mx.Sequence(f"animat_{self._made}", initial_delay=INITIAL_DELAY, persistent=persistent)
-
-    def _append_all(self, sequence: Any, stimuli: Sequence[Stimulus]) -> None:
-        at, first = 0, stimuli[0].time_s
+        sequence = self._mx.Sequence(f"animat_{self._made}", initial_delay=INITIAL_DELAY, persistent=is_kept)
+        at = 0
         for stimulus in stimuli:
-            begins = round((stimulus.time_s - first) * FRAMES_PER_S)
+            begins = round((stimulus.time_s - stimuli[0].time_s) * FRAMES_PER_S)
             if begins > at:
                 sequence.append(self._mx.DelaySamples(begins - at))
-            at = begins + self._append(sequence, stimulus, is_kept=len(stimuli) == 1)
+            at = begins + self._append(sequence, stimulus, is_kept)
+        return sequence
 
-    def _append(self, sequence: Any, stimulus: Stimulus, *, is_kept: bool) -> int:
+    def _append(self, sequence: Any, stimulus: Stimulus, is_kept: bool) -> int:
         """Append one stimulus; returns its duration in samples."""
         mx, units = self._mx, [self._unit_of[electrode] for electrode in stimulus.electrodes]
         self._event += 1
-        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_event_data(stimulus, is_kept=is_kept))))
+        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_event_data(stimulus, is_kept))))
         for unit in units:
             sequence.append(mx.StimulationUnit(unit).power_up(True).connect(True).set_voltage_mode().dac_source(0))
         lasted = 0
@@ -106,7 +95,7 @@ class Sequences:
         return lasted
 
 
-def _event_data(stimulus: Stimulus, *, is_kept: bool) -> dict[str, Any]:
+def _event_data(stimulus: Stimulus, is_kept: bool) -> dict[str, Any]:
     """Data of a stimulus for the device's file; a kept sequence has none that differ between its uses."""
     data: dict[str, Any] = {"electrodes": list(stimulus.electrodes)}
     if stimulus.pattern >= 0:

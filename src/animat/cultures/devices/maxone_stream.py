@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Int64
 
-from animat.cultures.failures import describe_error
+from animat.cultures.failures import describe_error, vendor_module
 from animat.errors import DeviceFailed
 
 ADDRESS = "tcp://localhost:7205"
@@ -39,28 +39,17 @@ class SpikeStream(Protocol):
         """The number of the newest frame received."""
 
     def wait(self, frame: int) -> None:
-        """Return when that frame has been received, immediately if it is past.
-
-        Raises:
-            DeviceFailed: if no more frames come.
-        """
+        """Return when that frame has been received; raises DeviceFailed if no more frames come."""
 
     def take(self, start: int, stop: int) -> tuple[Int64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
         """Frames and channels of the spikes with start <= frame < stop; earlier ones are discarded."""
-
-    def forget(self, before: int) -> None:
-        """Discard spikes before a frame."""
 
 
 class ZmqSpikes:
     """The stream of MaxLab Live's server through ZeroMQ (the package pyzmq), read by a thread.
 
-    A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame. The
-    layout of spikes depends on the server's version, and is recognised by frames near the message's. Frames lost in
-    transmission are counted in `lost_frames`.
-
-    Args:
-        address: of the server.
+    A message has up to three parts: the frame's number, the samples of all channels, and the spikes of that frame.
+    Frames lost in transmission are counted in `lost_frames`.
     """
 
     def __init__(self, address: str = ADDRESS) -> None:
@@ -75,12 +64,8 @@ class ZmqSpikes:
         self.lost_frames = 0
 
     def start(self) -> None:
-        try:
-            import zmq
-        except ImportError as error:
-            raise DeviceFailed(
-                "culture: expected the package pyzmq to read a maxone, which is not installed: pip install pyzmq"
-            ) from error
+        missing = "culture: expected the package pyzmq to read a maxone, which is not installed: pip install pyzmq"
+        zmq = vendor_module("zmq", missing)
         self._frame, self._failed, self.lost_frames = -1, None, 0
         self._spikes.clear()
         self._going.set()
@@ -119,10 +104,6 @@ class ZmqSpikes:
         table = np.array([spike for spike in spikes if start <= spike[0] < stop], dtype=np.int64).reshape(-1, 2)
         return table[:, 0], table[:, 1]
 
-    def forget(self, before: int) -> None:
-        while self._spikes and self._spikes[0][0] < before:
-            self._spikes.popleft()
-
     def _listen(self, zmq: Any) -> None:
         try:
             with zmq.Context() as context, context.socket(zmq.SUB) as socket:
@@ -141,11 +122,7 @@ class ZmqSpikes:
             self._failed = error
 
     def hear(self, parts: list[bytes]) -> None:
-        """Process one message.
-
-        Raises:
-            DeviceFailed: for a layout of no known version.
-        """
+        """Process one message; raises DeviceFailed for a layout of no known version."""
         if len(parts[0]) != FRAME.itemsize:
             raise DeviceFailed(f"MaxOne: expected a frame's number in 8 bytes, got {len(parts[0])}")
         number = int(np.frombuffer(parts[0], FRAME)[0])

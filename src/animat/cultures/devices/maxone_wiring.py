@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -18,32 +18,24 @@ from animat.tables import UNKNOWN
 UNITS = 32
 
 
-@dataclass(frozen=True, eq=False)
-class Wiring:
-    """The wiring of a selection.
-
-    Attributes:
-        channels: recording electrodes that were routed.
-        row_of: row of `channels` for each amplifier, -1 if it has none.
-        not_routed: recording electrodes that were selected but not routed.
-        unit_of: stimulation unit of each stimulation electrode.
-    """
+class Wiring(NamedTuple):
+    """The wiring of a selection."""
 
     channels: Channels
+    """Recording electrodes that were routed."""
     row_of: Int64[np.ndarray, " amplifiers"]
+    """Row of `channels` for each amplifier, -1 if it has none."""
     not_routed: tuple[int, ...]
+    """Recording electrodes that were selected but not routed."""
     unit_of: dict[int, int]
+    """Stimulation unit of each stimulation electrode."""
 
 
 def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wiring:
     """Route, connect, check, download, and compensate offsets; the units are left powered but not connected.
 
-    Args:
-        mx: the vendor's module, initialised.
-        wait: called after a step with the vendor's name of the waiting time.
-
-    Raises:
-        DeviceFailed: naming the stimulation electrodes that were not routed, have no unit, or share one.
+    `wait` is called after a step with the vendor's name of the waiting time. Raises DeviceFailed, naming the
+    stimulation electrodes that were not routed, have no unit, or share one.
     """
     array = mx.Array("stimulation")
     array.reset()
@@ -53,8 +45,7 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
     array.select_stimulation_electrodes(stimulation)
     array.route()
     amplifier_of = _routed(array)
-    lost = [electrode for electrode in stimulation if electrode not in amplifier_of]
-    if lost:
+    if lost := [electrode for electrode in stimulation if electrode not in amplifier_of]:
         raise DeviceFailed(
             f"MaxOne: expected all {len(stimulation)} stimulation electrodes to be routed, but not {_named(lost)}: "
             "choose others nearby, or fewer recording electrodes"
@@ -71,46 +62,35 @@ def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wirin
     amplifier = np.array([amplifier_of[electrode] for electrode in routed], dtype=np.int64)
     row_of = np.full(AMPLIFIERS, UNKNOWN, dtype=np.int64)
     row_of[amplifier] = np.arange(len(routed))
-    return Wiring(
-        channels=Channels.on(selection.array, np.array(routed, dtype=np.int64), amplifier),
-        row_of=row_of,
-        not_routed=tuple(electrode for electrode in recording if electrode not in amplifier_of),
-        unit_of=unit_of,
-    )
+    not_routed = tuple(electrode for electrode in recording if electrode not in amplifier_of)
+    return Wiring(Channels.on(selection.array, np.array(routed, np.int64), amplifier), row_of, not_routed, unit_of)
 
 
 def _routed(array: Any) -> dict[int, int]:
     """The amplifier of each electrode that was routed."""
-    amplifier_of: dict[int, int] = {}
-    taken: set[int] = set()
-    for mapping in array.get_config().mappings:
-        amplifier, electrode = int(mapping.channel), int(mapping.electrode)
+    mappings = [(int(mapping.electrode), int(mapping.channel)) for mapping in array.get_config().mappings]
+    for _, amplifier in mappings:
         if not 0 <= amplifier < AMPLIFIERS:
             raise DeviceFailed(f"MaxOne: expected amplifiers from 0 to {AMPLIFIERS - 1}, got {amplifier}")
-        # Some versions list an amplifier twice: which electrode it then reads is unknown.
-        if amplifier in taken:
-            amplifier_of = {e: a for e, a in amplifier_of.items() if a != amplifier}
-        else:
-            amplifier_of[electrode] = amplifier
-        taken.add(amplifier)
-    return amplifier_of
+    # Some versions list an amplifier twice: which electrode it then reads is unknown.
+    listed = Counter(amplifier for _, amplifier in mappings)
+    return {electrode: amplifier for electrode, amplifier in mappings if listed[amplifier] == 1}
 
 
 def _connect(array: Any, electrodes: list[int]) -> dict[int, int]:
     """Connect each electrode to a separate unit; raises DeviceFailed if some have none or share one."""
-    unit_of: dict[int, int] = {}
+    electrode_of: dict[int, int] = {}
     without, shared = [], []
     for electrode in electrodes:
         array.connect_electrode_to_stimulation(electrode)
         reply = str(array.query_stimulation_at_electrode(electrode)).strip()
-        if not reply.isdigit() or int(reply) >= UNITS:
+        unit = int(reply) if reply.isdigit() else UNITS
+        if unit >= UNITS:
             without.append(electrode)
-            continue
-        other = next((e for e, unit in unit_of.items() if unit == int(reply)), None)
-        if other is None:
-            unit_of[electrode] = int(reply)
+        elif unit in electrode_of:
+            shared.append(f"electrodes {electrode_of[unit]} and {electrode} share unit {unit}")
         else:
-            shared.append(f"electrodes {other} and {electrode} share unit {reply}")
+            electrode_of[unit] = electrode
     if without:
         raise DeviceFailed(
             f"MaxOne: expected a stimulation unit for each stimulation electrode, but there is none for "
@@ -121,7 +101,7 @@ def _connect(array: Any, electrodes: list[int]) -> dict[int, int]:
             f"MaxOne: expected a separate stimulation unit for each stimulation electrode, but {'; '.join(shared)}: "
             "choose another near one of each pair"
         )
-    return unit_of
+    return {electrode: unit for unit, electrode in electrode_of.items()}
 
 
 def _named(electrodes: list[int]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,6 @@ from animat.errors import InvalidArgument
 
 SMALLEST_KICK_MV = 0.5
 """Smaller kicks are left out: they are negligible next to the noise."""
-REMEMBERED_PATTERNS = 10_000
-
 LARGEST_STRENGTH = 2.0
 """Pulses up to twice the full strength are modelled."""
 
@@ -28,10 +27,7 @@ class Pulse:
     Attributes:
         time_s: start, on the tissue's clock.
         x_um, y_um: positions of the electrodes, shape (electrodes,).
-        strength: 1 for the full pulse; kicks and the number of axons reached grow with it in proportion.
-
-    Raises:
-        InvalidArgument: for positions of different shapes, or a strength outside 0 to 2.
+        strength: 0 to 2, 1 for the full pulse; kicks and the number of axons reached grow with it in proportion.
     """
 
     time_s: float
@@ -52,14 +48,10 @@ class Pulse:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class Reach:
-    """What a pulse reaches on its electrodes; a neuron is listed once for each electrode that reaches it.
+class Reach(NamedTuple):
+    """What a full pulse reaches on its electrodes; a neuron is listed once for each electrode that reaches it.
 
-    Attributes:
-        near, kick_mv: neurons near an electrode, and the depolarisation of each by a full pulse, shape (near,).
-        axons, axon_rank, axon_latency_ms, axon_key: neurons whose axons may pass an electrode, their ranks (a pulse of
-            strength s reaches those below s), latencies, and keys of their random draws, shape (axons,).
+    A pulse of strength s reaches the axons whose rank is below s; `axon_key` decides their random draws.
     """
 
     near: Int64[np.ndarray, " near"]
@@ -91,33 +83,25 @@ class Coupling:
         self._seed, self._parameters, self._network = seed, parameters, network
         self._kick_factor = rng.lognormal(0.0, parameters.kick_sigma, len(network))
         self._own_latency_ms = parameters.axon_latency_spread_ms * rng.uniform(0, 1, len(network))
-        self._electrodes: dict[tuple[int, int], Reach] = {}
-        self._patterns: dict[tuple[tuple[int, int], ...], Reach] = {}
+        self._reach_of_one = cache(self._find_reach)
+        self._reach_of_all = lru_cache(10_000)(self._join_reaches)
 
     def reach(self, x_um: Float64[np.ndarray, " electrodes"], y_um: Float64[np.ndarray, " electrodes"]) -> Reach:
         """What a pulse on the electrodes at (x, y) reaches; positions are distinguished to 0.1 um."""
         places = tuple((round(10 * x), round(10 * y)) for x, y in zip(x_um.tolist(), y_um.tolist(), strict=True))
-        if places not in self._patterns:
-            reaches = [self._reach_of_one(place) for place in places]
-            if len(self._patterns) >= REMEMBERED_PATTERNS:
-                self._patterns.clear()
-            self._patterns[places] = Reach(
-                **{f.name: np.concatenate([getattr(reach, f.name) for reach in reaches]) for f in fields(Reach)}
-            )
-        return self._patterns[places]
+        return self._reach_of_all(places)
 
     def kicks(self, pulse: Pulse, pulse_step: int) -> Kicks:
         """The kicks of a pulse at `pulse_step`, in no particular order.
 
-        An axonal spike occurs with probability `axon_reliability` and arrives after a fixed latency and a jitter. Both
-        draws are functions of the pulse's step, so they do not depend on how time is divided.
+        An axonal spike occurs with probability `axon_reliability` and arrives after a fixed latency and a jitter, both
+        drawn as functions of the pulse's step: they do not depend on how time is divided.
         """
         parameters = self._parameters
         if len(pulse.x_um) == 0:
             return NO_KICKS
         reach = self.reach(pulse.x_um, pulse.y_um)
-        draw, jitter = np.empty(len(reach.axons)), np.empty(len(reach.axons))
-        axonal_draws(reach.axon_key, pulse_step, draw, jitter)
+        draw, jitter = axonal_draws(reach.axon_key, pulse_step)
         passes = (draw < parameters.axon_reliability) & (reach.axon_rank < pulse.strength)
         latency_ms = reach.axon_latency_ms[passes] + parameters.axon_jitter_ms * jitter[passes]
         arrival = pulse_step + np.maximum(np.rint(latency_ms / parameters.step_ms), 0).astype(np.int64)
@@ -127,9 +111,10 @@ class Coupling:
             np.concatenate([reach.kick_mv * pulse.strength, np.full(len(arrival), AXONAL_KICK_MV)], dtype=np.float32),
         )
 
-    def _reach_of_one(self, place: tuple[int, int]) -> Reach:
-        if place in self._electrodes:
-            return self._electrodes[place]
+    def _join_reaches(self, places: tuple[tuple[int, int], ...]) -> Reach:
+        return Reach(*map(np.concatenate, zip(*map(self._reach_of_one, places), strict=True)))
+
+    def _find_reach(self, place: tuple[int, int]) -> Reach:
         parameters, network = self._parameters, self._network
         distance_um = np.hypot(network.x_um - place[0] / 10, network.y_um - place[1] / 10)
         kick_mv = parameters.kick_mv * self._kick_factor / (1 + (distance_um / parameters.kick_reach_um) ** 2)
@@ -141,9 +126,7 @@ class Coupling:
         key = rng.integers(0, 2**64, len(network), dtype=np.uint64)
         axons = np.flatnonzero(rank < LARGEST_STRENGTH)
         latency_ms = parameters.axon_latency_ms + self._own_latency_ms + distance_um / parameters.conduction_um_per_ms
-        reach = Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
-        self._electrodes[place] = reach
-        return reach
+        return Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
 
 
 def in_order(*kicks: Kicks) -> Kicks:

@@ -11,12 +11,7 @@ MARK_S = 10
 
 
 class Drift:
-    """g(t) = 1 + o(t), with o a slow Ornstein-Uhlenbeck process that starts at 0.
-
-    Args:
-        seed: decides the drift.
-        parameters: with `drift_share` and `drift_min` of o.
-    """
+    """g(t) = 1 + o(t), with o a slow Ornstein-Uhlenbeck process that starts at 0."""
 
     def __init__(self, seed: int, parameters: TissueParameters) -> None:
         self._draws = np.random.default_rng([seed, 2])

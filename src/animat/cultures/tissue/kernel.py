@@ -1,30 +1,20 @@
-"""The stepping loop of the virtual tissue, compiled.
+"""The stepping loop of the virtual tissue, compiled, and the arrays that it works on.
 
 No fast-math: every operation is rounded as written, so the same state gives the same spikes bit for bit, however many
-steps a call takes and however wide the processor's vectors are. The loops over neurons are short and each writes few
-arrays, because the compiler vectorises such loops.
+steps a call takes and however wide the processor's vectors are. The compiler vectorises loops over neurons only if they
+are short and write few arrays. Numba caches by the date of this file alone: all that it compiles belongs here.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt64
 
 from animat.compilation import cached_njit
-from animat.cultures.tissue.arrays import Arrivals, Constants, State, Wiring
-
-ORDER = (
-    "step_over_membrane refractory_steps drive_mv noise_key axon_key community shared_key needed "
-    "start target weight delay_steps",
-    "v_mv drive_mv shared_mv ampa nmda gaba potassium adaptation_mv refractory arriving_ampa arriving_nmda "
-    "arriving_gaba last_spike x u available scaling last_scaled load missing last_driven",
-    "filled target",
-)
-"""Arrays of `Wiring`, `State` and `Arrivals`. Numba caches the compiled loop by the date of this file alone,
-so changes there belong here too (a test compares them)."""
 
 f4 = np.float32
 ONE, HALF, TWELFTH = f4(1.0), f4(0.5), f4(1 / 12)
@@ -40,6 +30,66 @@ STRETCH = 128
 SUM_OF_FOUR_MEAN = f4(2 * 65535)
 SUM_OF_FOUR_SD = float(np.sqrt((65536.0**2 - 1) / 3))
 """Mean and standard deviation of the sum of four uniform 16-bit integers."""
+
+
+class Wiring(NamedTuple):
+    """Properties of each neuron, and its synapses; see `Network`."""
+
+    step_over_membrane: Float32[np.ndarray, " neurons"]
+    refractory_steps: Int32[np.ndarray, " neurons"]
+    drive_mv: Float32[np.ndarray, " neurons"]
+    noise_key: UInt64[np.ndarray, " neurons"]
+    axon_key: UInt64[np.ndarray, " neurons"]
+    community: Int32[np.ndarray, " neurons"]
+    shared_key: UInt64[np.ndarray, " communities"]
+    needed: Float64[np.ndarray, " neurons"]
+    start: Int64[np.ndarray, " neurons_and_one"]
+    target: Int32[np.ndarray, " synapses"]
+    weight: Float32[np.ndarray, " synapses"]
+    delay_steps: Int32[np.ndarray, " synapses"]
+
+
+class State(NamedTuple):
+    """Everything that changes. Columns of `x` and `u` are for excitatory and for inhibitory targets.
+
+    `drive` is the noisy drive, `shared` the community's contribution to its mean, in mV; `refractory` the steps left;
+    `arriving_*` a ring buffer of future arrivals, one row per step: conductance for AMPA and GABA, for NMDA the share
+    of the gap to saturation that will be filled. `x`, `u` and `available` are values just after each neuron's last
+    spike, `scaling` just after the last spike of any excitatory neuron, `load` and `missing` (the share that conduction
+    lacks) just after the last spike that a stimulus started in the axon.
+    """
+
+    v_mv: Float32[np.ndarray, " neurons"]
+    drive_mv: Float32[np.ndarray, " neurons"]
+    shared_mv: Float32[np.ndarray, " communities"]
+    ampa: Float32[np.ndarray, " neurons"]
+    nmda: Float32[np.ndarray, " neurons"]
+    gaba: Float32[np.ndarray, " neurons"]
+    potassium: Float32[np.ndarray, " neurons"]
+    adaptation_mv: Float32[np.ndarray, " neurons"]
+    refractory: Int32[np.ndarray, " neurons"]
+    arriving_ampa: Float32[np.ndarray, "ring neurons"]
+    arriving_nmda: Float32[np.ndarray, "ring neurons"]
+    arriving_gaba: Float32[np.ndarray, "ring neurons"]
+    last_spike: Int64[np.ndarray, " neurons"]
+    x: Float64[np.ndarray, "neurons 2"]
+    u: Float64[np.ndarray, "neurons 2"]
+    available: Float64[np.ndarray, " neurons"]
+    scaling: Float64[np.ndarray, " 1"]
+    last_scaled: Int64[np.ndarray, " 1"]
+    load: Float64[np.ndarray, " neurons"]
+    missing: Float64[np.ndarray, " neurons"]
+    last_driven: Int64[np.ndarray, " neurons"]
+
+
+class Arrivals(NamedTuple):
+    """The non-empty places of the rings, as most are empty; the first `filled` entries of a row are targets, each once.
+
+    The first axis is excitation (AMPA and NMDA arrive together) and inhibition.
+    """
+
+    filled: Int32[np.ndarray, "2 ring"]
+    target: Int32[np.ndarray, "2 ring neurons"]
 
 
 compiled = cached_njit(error_model="numpy", fastmath=False)
@@ -71,7 +121,7 @@ def sum_of_four(bits: np.uint64) -> np.float32:
 
 
 @inlined
-def move_membrane(constants: Constants, state: State, step_over_membrane: Float32[np.ndarray, " neurons"]) -> None:
+def move_membrane(constants: np.record, state: State, step_over_membrane: Float32[np.ndarray, " neurons"]) -> None:
     """One step of V, exact for conductances held over the step, up to (1 - exp(-z)) / z = 1 / (1 + z/2 + z^2/12)."""
     v_mv, drive_mv, ampa, nmda, gaba = state.v_mv, state.drive_mv, state.ampa, state.nmda, state.gaba
     potassium, refractory = state.potassium, state.refractory
@@ -99,13 +149,10 @@ def move_membrane(constants: Constants, state: State, step_over_membrane: Float3
 
 @inlined
 def move_noise(
-    constants: Constants,
-    drive_mv: Float32[np.ndarray, " neurons"],
-    mean_mv: Float32[np.ndarray, " neurons"],
-    key: UInt64[np.ndarray, " neurons"],
-    step: int,
+    constants: np.record, wiring: Wiring, state: State, mean_mv: Float32[np.ndarray, " neurons"], step: int
 ) -> None:
     """`NOISE_STEPS` of the Ornstein-Uhlenbeck drive, whose noise depends only on the neuron and the step."""
+    drive_mv, key = state.drive_mv, wiring.noise_key
     keep, scale = constants.keep_noise, constants.noise_scale_mv
     for i in range(drive_mv.size):
         noise_mv = scale * sum_of_four(mixed(key[i], step))
@@ -113,7 +160,7 @@ def move_noise(
 
 
 @inlined
-def move_shared(constants: Constants, wiring: Wiring, state: State, step: int) -> None:
+def move_shared(constants: np.record, wiring: Wiring, state: State, step: int) -> None:
     """`SHARED_STEPS` of the slow Ornstein-Uhlenbeck noise that the neurons of a community share."""
     shared_mv = state.shared_mv
     for community in range(shared_mv.size):
@@ -143,7 +190,7 @@ def count_down(refractory: Int32[np.ndarray, " neurons"]) -> None:
 
 
 @inlined
-def arrive(constants: Constants, state: State, arrivals: Arrivals, slot: int) -> None:
+def arrive(constants: np.record, state: State, arrivals: Arrivals, slot: int) -> None:
     """Add this step's arrivals to the conductances, and empty its row of the rings."""
     to_ampa, to_nmda, to_gaba = state.arriving_ampa[slot], state.arriving_nmda[slot], state.arriving_gaba[slot]
     for place in range(arrivals.filled[0, slot]):
@@ -159,14 +206,7 @@ def arrive(constants: Constants, state: State, arrivals: Arrivals, slot: int) ->
 
 
 @inlined
-def note(arrivals: Arrivals, kind: int, row: int, target: int) -> None:
-    """Record a place of a ring that is no longer empty."""
-    arrivals.target[kind, row, arrivals.filled[kind, row]] = target
-    arrivals.filled[kind, row] += 1
-
-
-@inlined
-def over_threshold(constants: Constants, state: State, first: int, last: int) -> np.int32:
+def over_threshold(constants: np.record, state: State, first: int, last: int) -> np.int32:
     """Number of neurons from `first` up to `last` above threshold; refractory ones are at the reset potential."""
     v_mv, adaptation_mv, threshold_mv = state.v_mv, state.adaptation_mv, constants.threshold_mv
     count = np.int32(0)
@@ -182,7 +222,7 @@ def recovered(value: float, rest: float, elapsed_s: float, time_constant_s: floa
 
 
 @inlined
-def missing_of(constants: Constants, state: State, i: int, step: int) -> float:
+def missing_of(constants: np.record, state: State, i: int, step: int) -> float:
     """The share of spikes that neuron i's stimulated axon fails to conduct: it follows the load, slowly."""
     since_s = (step - state.last_driven[i]) * constants.step_s
     load_kept, missing_kept = math.exp(-since_s / constants.load_s), math.exp(-since_s / constants.conduction_s)
@@ -191,7 +231,7 @@ def missing_of(constants: Constants, state: State, i: int, step: int) -> float:
 
 
 @inlined
-def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: int) -> bool:
+def conducts(constants: np.record, wiring: Wiring, state: State, i: int, step: int) -> bool:
     """Whether neuron i's stimulated axon conducts its spike to the soma, which loads the axon."""
     missing = missing_of(constants, state, i, step)
     if uniform(mixed(wiring.axon_key[i], step)) < missing:
@@ -204,7 +244,7 @@ def conducts(constants: Constants, wiring: Wiring, state: State, i: int, step: i
 
 @inlined
 def fire(
-    constants: Constants, wiring: Wiring, state: State, arrivals: Arrivals, i: int, step: int, gain: float
+    constants: np.record, wiring: Wiring, state: State, arrivals: Arrivals, i: int, step: int, gain: float
 ) -> None:
     """Let neuron i spike: release, depress, reduce availability, send along every synapse, reset."""
     kind = 0 if i < constants.n_excitatory else 1
@@ -226,29 +266,21 @@ def fire(
 
     n, n_e = state.v_mv.size, constants.n_excitatory
     last_row = state.arriving_ampa.shape[0] - 1
-    first, last = wiring.start[i], wiring.start[i + 1]
-    if kind == 0:
-        to_ampa, to_nmda = state.arriving_ampa.ravel(), state.arriving_nmda.ravel()
-        for synapse in range(first, last):
-            target = wiring.target[synapse]
-            arriving = wiring.weight[synapse] * (to_e if target < n_e else to_i)
-            row = (step + wiring.delay_steps[synapse]) & last_row
-            place = row * n + target
-            if to_ampa[place] == 0 and arriving != 0:
-                note(arrivals, 0, row, target)
-            to_ampa[place] += arriving
+    sent_to = (state.arriving_ampa if kind == 0 else state.arriving_gaba).ravel()
+    to_nmda = state.arriving_nmda.ravel()
+    for synapse in range(wiring.start[i], wiring.start[i + 1]):
+        target = wiring.target[synapse]
+        arriving = wiring.weight[synapse] * (to_e if target < n_e else to_i)
+        row = (step + wiring.delay_steps[synapse]) & last_row
+        place = row * n + target
+        if sent_to[place] == 0 and arriving != 0:
+            # The place is no longer empty.
+            arrivals.target[kind, row, arrivals.filled[kind, row]] = target
+            arrivals.filled[kind, row] += 1
+        sent_to[place] += arriving
+        if kind == 0:
             # Two arrivals in one step each fill a share of the remaining gap, as if they came one after the other.
             to_nmda[place] += min(constants.nmda_fill * arriving, ONE) * (ONE - to_nmda[place])
-    else:
-        to_gaba = state.arriving_gaba.ravel()
-        for synapse in range(first, last):
-            target = wiring.target[synapse]
-            arriving = wiring.weight[synapse] * (to_e if target < n_e else to_i)
-            row = (step + wiring.delay_steps[synapse]) & last_row
-            place = row * n + target
-            if to_gaba[place] == 0 and arriving != 0:
-                note(arrivals, 1, row, target)
-            to_gaba[place] += arriving
 
     state.v_mv[i] = constants.reset_mv
     state.potassium[i] += constants.hyperpolarisation
@@ -257,7 +289,7 @@ def fire(
 
 
 @inlined
-def release_of(constants: Constants, state: State, i: int, kind: int, towards: int, elapsed_s: float) -> float:
+def release_of(constants: np.record, state: State, i: int, kind: int, towards: int, elapsed_s: float) -> float:
     """Recover u and x since the last spike, release u x, and store their values after it."""
     use = constants.use[kind, towards]
     x = recovered(state.x[i, towards], 1.0, elapsed_s, constants.recovery_s[kind, towards])
@@ -285,28 +317,25 @@ def advance(
     spike_step: Int64[np.ndarray, " capacity"],
     spike_neuron: Int64[np.ndarray, " capacity"],
 ) -> tuple[int, int, int]:
-    """Advance by up to `n_steps`; stops early when a step's spikes might no longer fit the output.
+    """Advance by up to `n_steps`, and return how many steps were taken, kicks passed, and spikes written.
 
-    Unpacking a named tuple takes a call twice as long as a plain one, which matters for calls of 60 steps of 2 us.
+    It stops early when a step's spikes might no longer fit the output. Unpacking a named tuple takes a call twice as
+    long as a plain one, which matters for calls of 60 steps of 2 us.
 
     Args:
-        record, wires, values, arriving: the tissue: constants from `pack`, and plain tuples of `Wiring`, `State` and
-            `Arrivals`; the last two are changed in place.
-        first_step, n_steps: the tissue's clock, in steps, and the number of steps.
+        record: from `prepare_constants`.
+        wires, values, arriving: plain tuples of `Wiring`, `State` and `Arrivals`; the last two are changed in place.
+        first_step: the tissue's clock, in steps.
         gain: factor on excitatory weights during this call.
         kick_step, kick_neuron, kick_mv: kicks in order of their steps, none before `first_step`.
         spike_step, spike_neuron: output, with room for at least one spike per neuron.
-
-    Returns:
-        The numbers of steps taken, kicks passed, and spikes written.
     """
     constants, wiring, state, arrivals = record[0], Wiring(*wires), State(*values), Arrivals(*arriving)
     n = state.v_mv.size
     last_row = state.arriving_ampa.shape[0] - 1
     mean_mv = np.empty(n, np.float32)
     fill_mean(wiring, state, mean_mv)
-    kicks = 0
-    spikes = 0
+    kicks = spikes = 0
     for step in range(first_step, first_step + n_steps):
         if spikes + n > spike_step.size:
             return step - first_step, kicks, spikes
@@ -324,7 +353,7 @@ def advance(
             move_shared(constants, wiring, state, step)
             fill_mean(wiring, state, mean_mv)
         if step % NOISE_STEPS == 0:
-            move_noise(constants, state.drive_mv, mean_mv, wiring.noise_key, step)
+            move_noise(constants, wiring, state, mean_mv, step)
         decay(state.ampa, constants.lose_ampa)
         decay(state.nmda, constants.lose_nmda)
         decay(state.gaba, constants.lose_gaba)
@@ -346,12 +375,11 @@ def advance(
 
 @compiled
 def axonal_draws(
-    key: UInt64[np.ndarray, " axons"],
-    step: int,
-    draw: Float64[np.ndarray, " axons"],
-    jitter: Float64[np.ndarray, " axons"],
-) -> None:
+    key: UInt64[np.ndarray, " axons"], step: int
+) -> tuple[Float64[np.ndarray, " axons"], Float64[np.ndarray, " axons"]]:
     """Random draws of a pulse at `step`: a uniform and a nearly standard normal number for each axon's key."""
+    draw, jitter = np.empty(key.size), np.empty(key.size)
     for j in range(key.size):
         draw[j] = uniform(mixed(key[j], 2 * step))
         jitter[j] = sum_of_four(mixed(key[j], 2 * step + 1)) / SUM_OF_FOUR_SD
+    return draw, jitter

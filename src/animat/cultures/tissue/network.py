@@ -9,24 +9,19 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from animat.cultures.tissue.parameters import TissueParameters
 
+Neurons = Float64[np.ndarray, " neurons"]
+
 
 @dataclass(frozen=True, eq=False)
 class Network:
     """Neurons, excitatory ones first, and synapses; those of neuron i are rows start[i] to start[i + 1], by delay.
 
-    Attributes:
-        x_um, y_um: positions, shape (neurons,).
-        is_excitatory: type of each neuron, shape (neurons,).
-        community: which patch of the plane each neuron belongs to, shape (neurons,).
-        drive_mv: constant drive of each neuron, shape (neurons,).
-        start: first synapse of each neuron, and the end of the last, shape (neurons + 1,).
-        target: postsynaptic neuron of each synapse, shape (synapses,).
-        weight: its peak conductance in units of the leak, before release, shape (synapses,).
-        delay_steps: its delay, at least one step, shape (synapses,).
+    `community` is the patch of the plane that a neuron belongs to; `weight` is a synapse's peak conductance in units of
+    the leak, before release.
     """
 
-    x_um: Float64[np.ndarray, " neurons"]
-    y_um: Float64[np.ndarray, " neurons"]
+    x_um: Neurons
+    y_um: Neurons
     is_excitatory: Bool[np.ndarray, " neurons"]
     community: Int64[np.ndarray, " neurons"]
     drive_mv: Float32[np.ndarray, " neurons"]
@@ -46,10 +41,6 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
     s_j c_ij ((1 - a) exp(-d / reach) / Z_i + a / C_i), where a is the long-range share, s_j the log-normal propensity
     of j to send, c_ij 1 within a community and `between_share` between two, and Z_i and C_i the sums of
     c exp(-d / reach) and of c over the neurons of j's type; the weight is log-normal about its mean.
-
-    Args:
-        seed: decides every draw.
-        parameters: sizes, reach, weights.
     """
     rng = np.random.default_rng([seed, 1])
     n, n_e = parameters.neurons, parameters.n_excitatory
@@ -101,10 +92,7 @@ def grow(seed: int, parameters: TissueParameters) -> Network:
 
 
 def _communities(
-    rng: np.random.Generator,
-    x_um: Float64[np.ndarray, " neurons"],
-    y_um: Float64[np.ndarray, " neurons"],
-    parameters: TissueParameters,
+    rng: np.random.Generator, x_um: Neurons, y_um: Neurons, parameters: TissueParameters
 ) -> tuple[Int64[np.ndarray, " neurons"], Float64[np.ndarray, " communities"]]:
     """Each neuron's community, that of the nearest centre, and each community's additional drive in mV."""
     communities = parameters.communities

@@ -7,14 +7,12 @@ from typing import Annotated
 from pydantic import Field
 
 from animat.errors import InvalidArgument
-from animat.records import Number, Positive, Share, Whole, record
+from animat.records import FromZero, Number, Positive, Share, Whole, record
 
 REVISION = 6
 """Revision of the tissue's numerics. Raise it by one when the same seed, parameters and pulses give different spikes,
 whatever the reason (an equation, an order of operations, a table, a draw): recordings, states and studies of another
 revision are then refused instead of being continued as if they were of this tissue."""
-
-FromZero = Annotated[Number, Field(ge=0)]
 
 
 @record
@@ -182,10 +180,8 @@ class TissueParameters:
     def __post_init__(self) -> None:
         if self.load_min == self.conduction_min:
             raise InvalidArgument(f"load_min, conduction_min: expected different values, got {self.load_min} twice")
-        for degree, available in (
-            (self.in_degree_e, self.n_excitatory),
-            (self.in_degree_i, self.neurons - self.n_excitatory),
-        ):
+        n_inhibitory = self.neurons - self.n_excitatory
+        for degree, available in ((self.in_degree_e, self.n_excitatory), (self.in_degree_i, n_inhibitory)):
             if not 0 <= degree < available:
                 raise InvalidArgument(
                     f"in_degree_e, in_degree_i: expected fewer synapses than the {available} neurons of that type, "

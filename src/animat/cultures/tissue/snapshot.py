@@ -1,7 +1,4 @@
-"""A tissue's state at one time, and whether a tissue can reach it.
-
-The compiled kernel checks no index and no clock: its arguments must have been checked before.
-"""
+"""A tissue's state at one time, and whether a tissue can reach it: the kernel checks neither indices nor clocks."""
 
 from __future__ import annotations
 
@@ -10,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from animat.cultures.tissue.arrays import State, Wiring
 from animat.cultures.tissue.coupling import Kicks
+from animat.cultures.tissue.kernel import State, Wiring
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.errors import InvalidArgument, shown
 
@@ -21,7 +18,6 @@ KICKS_WITHIN_NS = 1_000_000_000
 """Pending kicks arrive within this time: axons are shorter."""
 LARGEST = 1e6
 """No potential (mV) and no conductance (in units of the leak) comes near it."""
-_SHARES = ("x", "u", "available", "load", "missing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,45 +33,31 @@ class Snapshot:
 
 
 def expect_sound(snapshot: Snapshot, like: State, wiring: Wiring, step_ns: int) -> None:
-    """Refuse a snapshot whose clock, shapes, indices or values no tissue can have.
-
-    Args:
-        snapshot: to be restored.
-        like: a state of the same tissue, whose shapes and types the snapshot's must have.
-        wiring: of the tissue.
-        step_ns: its time step.
-
-    Raises:
-        InvalidArgument: naming the number or the array.
-    """
+    """Refuse a snapshot with a clock, shapes, indices or values that no tissue can have; `like` is such a state."""
     expect_whole("tissue_now_ns", snapshot.now_ns, 0, LONGEST_NS)
     step = snapshot.now_ns // step_ns
     expect_whole("tissue_step", snapshot.step, step, step)
-    for name, values in snapshot.state._asdict().items():
-        expect_array(name, values, getattr(like, name).dtype, getattr(like, name).shape)
-        if values.dtype.kind == "f":
-            # Rounding may take a share past its limit by a last bit.
-            low, high = (-1e-9, 1 + 1e-9) if name in _SHARES else (-LARGEST, LARGEST)
-            expect_within(name, values, low, high)
-    for name in ("arriving_ampa", "arriving_nmda", "arriving_gaba"):
+    state, kicks = snapshot.state, snapshot.kicks
+    ranges: dict[str, tuple[float, float]] = {
+        # Rounding may take a share past its limit by a last bit.
+        **dict.fromkeys(("x", "u", "available", "load", "missing"), (-1e-9, 1 + 1e-9)),
         # The kernel records each target once: arrivals that cancel out would be recorded twice.
-        expect_within(name, getattr(snapshot.state, name), 0.0, LARGEST)
-    alone = (snapshot.state.arriving_nmda > 0) & (snapshot.state.arriving_ampa == 0)
-    if alone.any():
-        raise InvalidArgument(
-            f"arriving_nmda: expected NMDA to arrive with AMPA, got {int(alone.sum())} arrivals without"
-        )
-    expect_within("refractory", snapshot.state.refractory, 0, int(wiring.refractory_steps.max(initial=0)))
-    for name in ("last_spike", "last_scaled", "last_driven"):
-        expect_within(name, getattr(snapshot.state, name), 0, step)
-    # A tissue that never spikes approaches the rest value, 1.13 with the default parameters.
-    expect_within("scaling", snapshot.state.scaling, 0.0, snapshot.parameters.scaling_rest * (1 + 1e-9))
-    for name, values in snapshot.kicks._asdict().items():
-        expect_array(f"kicks.{name}", values, np.float32 if name == "mv" else np.int64, (len(snapshot.kicks.step),))
-    expect_within("kicks.neuron", snapshot.kicks.neuron, 0, len(wiring.needed) - 1)
-    expect_within("kicks.mv", snapshot.kicks.mv, -LARGEST, LARGEST)
-    expect_within("kicks.step", snapshot.kicks.step, step, step + KICKS_WITHIN_NS // step_ns)
-    expect_rising("kicks.step", snapshot.kicks.step)
+        **dict.fromkeys(("arriving_ampa", "arriving_nmda", "arriving_gaba"), (0.0, LARGEST)),
+        **dict.fromkeys(("last_spike", "last_scaled", "last_driven"), (0, step)),
+        "refractory": (0, int(wiring.refractory_steps.max(initial=0))),
+        # A tissue that never spikes approaches the rest value, 1.13 with the default parameters.
+        "scaling": (0.0, snapshot.parameters.scaling_rest * (1 + 1e-9)),
+    }
+    for name, values in state._asdict().items():
+        expected = getattr(like, name)
+        expect_array(name, values, expected.dtype, expected.shape, ranges.get(name, (-LARGEST, LARGEST)))
+    if alone := np.count_nonzero((state.arriving_nmda > 0) & (state.arriving_ampa == 0)):
+        raise InvalidArgument(f"arriving_nmda: expected NMDA to arrive with AMPA, got {alone} arrivals without")
+    one_each = (len(kicks.step),)
+    expect_array("kicks.step", kicks.step, np.int64, one_each, (step, step + KICKS_WITHIN_NS // step_ns))
+    expect_array("kicks.neuron", kicks.neuron, np.int64, one_each, (0, len(wiring.needed) - 1))
+    expect_array("kicks.mv", kicks.mv, np.float32, one_each, (-LARGEST, LARGEST))
+    expect_rising("kicks.step", kicks.step)
 
 
 def expect_whole(name: str, value: object, low: int, high: int) -> None:
@@ -85,16 +67,15 @@ def expect_whole(name: str, value: object, low: int, high: int) -> None:
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(value)}")
 
 
-def expect_array(name: str, values: np.ndarray[Any, Any], dtype: Any, shape: tuple[int, ...]) -> None:
-    """Refuse an array of another type or shape."""
+def expect_array(
+    name: str, values: np.ndarray[Any, Any], dtype: Any, shape: tuple[int, ...], within: tuple[float, float]
+) -> None:
+    """Refuse an array of another type or shape, or with values, NaN among them, outside a range."""
     if values.dtype != dtype or values.shape != shape:
         raise InvalidArgument(
             f"{name}: expected {np.dtype(dtype)} of shape {shape}, got {values.dtype} of shape {values.shape}"
         )
-
-
-def expect_within(name: str, values: np.ndarray[Any, Any], low: float, high: float) -> None:
-    """Refuse values, NaN among them, that do not lie from `low` to `high`."""
+    low, high = within
     outside = ~((values >= low) & (values <= high))
     if outside.any():
         raise InvalidArgument(f"{name}: expected values from {low:g} to {high:g}, got {values[outside].flat[0]}")

@@ -7,29 +7,23 @@ from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from animat.cultures.tissue import kernel
-from animat.cultures.tissue.arrays import State, arrivals_of, pack
 from animat.cultures.tissue.coupling import NO_KICKS, Coupling, Kicks, Pulse, in_order
 from animat.cultures.tissue.drift import MARK_S, Drift
+from animat.cultures.tissue.kernel import State
 from animat.cultures.tissue.network import grow
 from animat.cultures.tissue.parameters import TissueParameters
-from animat.cultures.tissue.preparation import fresh_state, prepare_constants, prepare_wiring
+from animat.cultures.tissue.preparation import arrivals_of, fresh_state, prepare_constants, prepare_wiring
 from animat.cultures.tissue.snapshot import Snapshot, expect_sound
 from animat.errors import InvalidArgument, Mismatch
 
 NS = 1_000_000_000
-MINUTE_NS = 60 * NS
 
 
 class Spikes(NamedTuple):
-    """Spikes in order of time.
-
-    Attributes:
-        time_s: on the tissue's clock, shape (spikes,).
-        neuron: neuron of each spike, shape (spikes,).
-    """
+    """Spikes in order of time, on the tissue's clock."""
 
     time_s: Float64[np.ndarray, " spikes"]
     neuron: Int64[np.ndarray, " spikes"]
@@ -42,15 +36,16 @@ class Tissue:
     """A simulated culture of neurons without electrodes; `docs/virtual-culture.md` has its equations.
 
     Conductance-based leaky integrate-and-fire neurons with Tsodyks-Markram synapses. The same seed, parameters and
-    pulses give the same spikes bit for bit, however time is divided. Positions are in micrometres from the array's
-    corner. Channels, files and protocols are unknown here.
+    pulses give the same spikes bit for bit, however time is divided. Positions count from the array's corner.
 
     Args:
         seed: decides the network, every draw of noise, and the drift over hours; zero or more.
         parameters: of the model.
 
-    Raises:
-        InvalidArgument: for a negative seed.
+    Attributes:
+        x_um, y_um: position of each neuron along the array's long and short side, shape (neurons,).
+        is_excitatory: type of each neuron, shape (neurons,).
+        step_ns: the time step.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:
@@ -58,40 +53,24 @@ class Tissue:
             raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
         self.seed = seed
         self.parameters = parameters or TissueParameters()
-        self._network = grow(seed, self.parameters)
+        self._network = network = grow(seed, self.parameters)
+        self.x_um, self.y_um = network.x_um.copy(), network.y_um.copy()
+        self.is_excitatory = network.is_excitatory.copy()
         self._coupling = Coupling(seed, self.parameters, self._network)
         self._drift = Drift(seed, self.parameters)
-        self._constants = pack(prepare_constants(self.parameters))
+        self._constants = prepare_constants(self.parameters)
         self._wiring = prepare_wiring(seed, self.parameters, self._network)
         self._adopt(fresh_state(seed, self.parameters, self._network, self._wiring))
-        self._step_ns = round(self.parameters.step_ms * 1e6)
-        self._step_s = self._step_ns / NS
-        self._now_ns = 0
-        self._step = 0
-        self._kicks = NO_KICKS
-        capacity = max(4 * self.parameters.neurons, 20_000)
-        self._spike_step = np.empty(capacity, np.int64)
-        self._spike_neuron = np.empty(capacity, np.int64)
+        self.step_ns = round(self.parameters.step_ms * 1e6)
+        self._step_s = self.step_ns / NS
+        self._now_ns, self._step, self._kicks = 0, 0, NO_KICKS
+        # Step and neuron of each spike, as the kernel writes them.
+        self._output = tuple(np.empty((2, max(4 * self.parameters.neurons, 20_000)), np.int64))
 
     @property
     def now_s(self) -> float:
         """The tissue's clock: the time advanced and rested since its creation."""
         return self._now_ns / NS
-
-    @property
-    def x_um(self) -> Float64[np.ndarray, " neurons"]:
-        """Position of each neuron along the array's long side."""
-        return self._network.x_um.copy()
-
-    @property
-    def y_um(self) -> Float64[np.ndarray, " neurons"]:
-        """Position of each neuron along the array's short side."""
-        return self._network.y_um.copy()
-
-    @property
-    def is_excitatory(self) -> Bool[np.ndarray, " neurons"]:
-        """Whether each neuron is excitatory."""
-        return self._network.is_excitatory.copy()
 
     def advance(self, duration_s: float, pulses: Sequence[Pulse] = ()) -> Spikes:
         """Let time pass, stimulate meanwhile, and return the spikes.
@@ -111,39 +90,26 @@ class Tissue:
             new = [self._kicks_of(pulse, end_ns) for pulse in sorted(pulses, key=lambda pulse: pulse.time_s)]
             self._kicks = in_order(self._kicks, *new)
         self._now_ns = end_ns
-        last_step = end_ns // self._step_ns
+        last_step = end_ns // self.step_ns
         parts = []
         while self._step < last_step:
-            mark = self._step * self._step_ns // (MARK_S * NS)
-            mark_end = -(-(mark + 1) * MARK_S * NS // self._step_ns)
-            taken, passed, spikes = kernel.advance(
-                *self._run,
-                self._step,
-                min(last_step, mark_end) - self._step,
-                self._drift.gain(mark),
-                *self._kicks,
-                self._spike_step,
-                self._spike_neuron,
-            )
+            mark = self._step * self.step_ns // (MARK_S * NS)
+            mark_end = -(-(mark + 1) * MARK_S * NS // self.step_ns)
+            steps, gain = min(last_step, mark_end) - self._step, self._drift.gain(mark)
+            taken, passed, n = kernel.advance(*self._run, self._step, steps, gain, *self._kicks, *self._output)
             self._step += taken
             if passed:
                 self._kicks = Kicks(*(column[passed:] for column in self._kicks))
-            parts.append(Spikes(self._spike_step[:spikes] * self._step_s, self._spike_neuron[:spikes].copy()))
+            step, neuron = self._output
+            parts.append(Spikes(step[:n] * self._step_s, neuron[:n].copy()))
         # Usually one part: concatenating it with nothing would add 1 % to the cost of 12.5 ms.
         return parts[0] if len(parts) == 1 else Spikes(*map(np.concatenate, zip(NO_SPIKES, *parts, strict=True)))
 
     def rest(self, duration_s: float) -> None:
-        """Let time pass like `advance`, without keeping the spikes: any duration takes the memory of a minute.
-
-        Args:
-            duration_s: how long, zero or more.
-
-        Raises:
-            InvalidArgument: for a negative duration.
-        """
+        """Let time pass like `advance`, without keeping the spikes: any duration takes the memory of a minute."""
         end_ns = self._now_ns + _nanoseconds(duration_s)
         while self._now_ns < end_ns:
-            self.advance(min(end_ns - self._now_ns, MINUTE_NS) / NS)
+            self.advance(min(end_ns - self._now_ns, 60 * NS) / NS)
 
     def snapshot(self) -> Snapshot:
         """A copy of the state, for `restore`."""
@@ -162,7 +128,7 @@ class Tissue:
                 f"snapshot: expected one of this tissue (seed {self.seed}), got one of seed {snapshot.seed} or with "
                 "other parameters: create a tissue with those"
             )
-        expect_sound(snapshot, self._state, self._wiring, self._step_ns)
+        expect_sound(snapshot, self._state, self._wiring, self.step_ns)
         self._adopt(State(*(values.copy() for values in snapshot.state)))
         self._now_ns, self._step, self._kicks = snapshot.now_ns, snapshot.step, snapshot.kicks
 
@@ -177,7 +143,7 @@ class Tissue:
                 f"pulses: expected times from {self.now_s:g} s to before {end_ns / NS:g} s on the tissue's clock, "
                 f"got {pulse.time_s:g} s"
             )
-        return self._coupling.kicks(pulse, -(-pulse_ns // self._step_ns))
+        return self._coupling.kicks(pulse, -(-pulse_ns // self.step_ns))
 
 
 def _nanoseconds(duration_s: float) -> int:
