@@ -118,7 +118,6 @@ def run_over_cultures(
 
 
 def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
-    """Write the names of the cultures' folders, and the errors of those that failed."""
     write_whole(folder / MANIFEST, json.dumps({"cultures": list(names), "failed": failed}, indent=1) + "\n")
 
 
@@ -157,19 +156,14 @@ def _run_side_by_side(
     runs: Mapping[str, Callable[..., StudyRun]], at_once: int, shared: Executor | None, progress: Progress
 ) -> tuple[dict[str, StudyRun], dict[str, str]]:
     """Run studies, `at_once` at a time; returns the finished ones and the errors of the others, in their order."""
-    finished: dict[str, StudyRun] = {}
-    failed: dict[str, str] = {}
     total = _TotalProgress(progress, len(runs))
     with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:
         futures = {threads.submit(run, progress=_StudyProgress(total, name)): name for name, run in runs.items()}
         try:
             for future in as_completed(futures):
-                name = futures[future]
-                try:
-                    finished[name] = future.result()
-                except AnimatError as error:
-                    failed[name] = str(error)
-                total.end(name)
+                if not isinstance(future.exception(), AnimatError):
+                    future.result()
+                total.end(futures[future])
         except BaseException:
             total.is_stopped = True
             threads.shutdown(wait=False, cancel_futures=True)
@@ -177,22 +171,18 @@ def _run_side_by_side(
                 # Otherwise the studies would wait for their running jobs.
                 shared.kill_workers()
             raise
-    ordered = {name: finished[name] for name in runs if name in finished}
-    return ordered, {name: failed[name] for name in runs if name in failed}
+    errors = {name: future.exception() for future, name in futures.items()}
+    finished = {name: future.result() for future, name in futures.items() if errors[name] is None}
+    return finished, {name: str(error) for name, error in errors.items() if error is not None}
 
 
 class _TotalProgress:
-    """The progress of many studies together.
-
-    Attributes:
-        is_stopped: once set, each study is stopped at its next report.
-    """
+    """The progress of many studies together; once it `is_stopped`, each study ends at its next report."""
 
     def __init__(self, progress: Progress, studies: int) -> None:
         self.is_stopped = False
-        self._progress, self._studies = progress, studies
+        self._progress, self._studies, self._ended = progress, studies, 0
         self._shares: dict[str, float] = {}
-        self._ended = 0
         self._lock = threading.Lock()
 
     def end(self, name: str) -> None:
@@ -226,25 +216,26 @@ class _StudyProgress:
 
 def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
     """Each comparison over cultures, all of which have the same comparisons in the same order."""
-    return tuple(_over(rows) for rows in zip(*comparisons, strict=True))
-
-
-def _over(rows: tuple[ComparedReturns, ...]) -> OverCultures:
-    first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
-    low, high = bootstrap_interval(second - first) if len(rows) > 1 else (None, None)
-    return OverCultures(
-        comparison=rows[0].comparison,
-        robot=rows[0].robot,
-        cultures=len(rows),
-        mean_first=float(first.mean()),
-        mean_second=float(second.mean()),
-        difference=float((second - first).mean()),
-        low_95=low,
-        high_95=high,
-        larger_in=int((second > first).sum()),
-        holds_in=sum(row.outcome == SECOND for row in rows),
-        tested=sum(row.outcome != TOO_FEW for row in rows),
-    )
+    found = []
+    for rows in zip(*comparisons, strict=True):
+        first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
+        low, high = bootstrap_interval(second - first) if len(rows) > 1 else (None, None)
+        found.append(
+            OverCultures(
+                comparison=rows[0].comparison,
+                robot=rows[0].robot,
+                cultures=len(rows),
+                mean_first=float(first.mean()),
+                mean_second=float(second.mean()),
+                difference=float((second - first).mean()),
+                low_95=low,
+                high_95=high,
+                larger_in=int((second > first).sum()),
+                holds_in=sum(row.outcome == SECOND for row in rows),
+                tested=sum(row.outcome != TOO_FEW for row in rows),
+            )
+        )
+    return tuple(found)
 
 
 def bootstrap_interval(values: Float64[np.ndarray, " cultures"]) -> tuple[float, float]:

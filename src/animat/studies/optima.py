@@ -88,8 +88,7 @@ class FindOptima(StudyTask):
             kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
             resolution, episodes = min(ROUGH, resolution), 0
         if timeline is not None:
-            series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
-            timeline = replace(timeline, responses=tuple(series))
+            timeline = replace(timeline, responses=tuple(read_series(study, folder)))
         requests = [
             self._request(kind, at, timeline) for kind in kinds for at in (minutes if kind.through_neurons else [last])
         ]
@@ -99,8 +98,10 @@ class FindOptima(StudyTask):
         for each in requests:
             if each.case is not None:
                 batches.setdefault(each.kind if self.over_time else each.case[0].n_actions is None, []).append(each)
-        compared = [] if self.over_time else _compared(study, first, last)
-        bootstrapped = [each for each in requests if each.counted is not None and (each.kind, each.at_min) in compared]
+        # Threshold mappings have an interval at the minutes at which their arms are evaluated.
+        arms = [] if self.over_time else [arm for arm in study.arms if arm.has_steps]
+        evaluated = {(arm.kind, at) for arm in arms for at in study.minutes_of(arm, first, last)}
+        bootstrapped = [each for each in requests if each.counted and (each.kind.kind, each.at_min) in evaluated]
         done, steps = 0, sum(map(len, batches.values())) + len(bootstrapped)
         for batch in batches.values():
             part = Part(progress, done, len(batch), steps)
@@ -146,29 +147,23 @@ class _Request:
     optimum: Optimum | None = None
 
     def to_row(self, robot: str) -> StudyOptimum:
-        """A row of the table."""
-        kind, few = self.kind, "; ".join(self.left_out) or None
-        return StudyOptimum(robot, kind.mapping, kind.percentiles, self.at_min, **_fields(self.optimum), left_out=few)
-
-
-def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]]:
-    """Threshold mappings at the minutes at which their arms are evaluated: these optima have an interval."""
-    return [
-        (kind, at)
-        for kind in rough_kinds(study)
-        for arm in study.arms_of(kind)
-        for at in study.minutes_of(arm, first, last)
-    ]
-
-
-def _fields(optimum: Optimum | None) -> dict[str, Any]:
-    """An optimum's columns of the table, from the best return to the nodes; all None if there is no optimum."""
-    fields = {} if optimum is None else optimum.to_dict()
-    interval = None if optimum is None else optimum.interval
-    names = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
-    return {
-        "best_return": fields.get("value"),
-        "low_95": None if interval is None else interval.low,
-        "high_95": None if interval is None else interval.high,
-        **{name: fields.get(name) for name in names},
-    }
+        known: dict[str, Any] = {} if self.optimum is None else self.optimum.to_dict()
+        interval = known.get("interval") or {}
+        names = (
+            "grid_error",
+            "monte_carlo",
+            "standard_error",
+            "without_clock",
+            "without_clock_standard_error",
+            "nodes",
+        )
+        return StudyOptimum(
+            robot,
+            *self.kind.kind,
+            self.at_min,
+            known.get("value"),
+            interval.get("low"),
+            interval.get("high"),
+            **{name: known.get(name) for name in names},
+            left_out="; ".join(self.left_out) or None,
+        )

@@ -27,12 +27,13 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
-from animat.report.style import FORMATS, Figure, save_figure
+from animat.report.style import Figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
 from animat.studies import figure_tables
-from animat.studies.episodes import POLICY, DataFrame, mean_returns
+from animat.studies.episodes import POLICY, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded, span_min
+from animat.studies.figures import save_formats
 from animat.studies.optima import kinds_of
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
@@ -134,7 +135,7 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     files = []
     for i, (name, figure) in enumerate(figures.items()):
         progress.update(0.3 + 0.7 * i / len(figures), 1, name)
-        files += [save_figure(figure, folder / "figures" / f"{of}-{name}.{ending}") for ending in FORMATS]
+        files += save_formats(figure, folder, f"figures/{of}-{name}")
     return files
 
 
@@ -154,8 +155,8 @@ def _curves(
         random, optimum = [], []
         for at_min in _minutes_in_training(study, arm, timeline, learning.shape[1]):
             random.append((rough if arm.through_neurons else known).random(arm, at_min))
-            best = known.optimum(arm, at_min) or rough.optimum(arm, at_min)
-            optimum.append(None if best is None else best.best_return)
+            best = known.best_return(arm, at_min)
+            optimum.append(rough.best_return(arm, at_min) if best is None else best)
         levels = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = learning[0, :, 0]
         returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, spec))
@@ -188,28 +189,23 @@ def _courses(
     study: Study, table: DataFrame, known: References, rough: References, timeline: SimulatorTimeline
 ) -> list[Courses]:
     every_min: list[float] = timeline.start_min.tolist()
-    over_time = table[(table["agent"] == POLICY) & table["over_time"]]
+    over_time = rows_where(table, agent=POLICY, over_time=True)
     panels = []
     for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
         courses = []
         for arm in study.arms_of(kind):
-            of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
+            of_minute = rows_where(over_time, arm=arm.name).groupby("at_min")
             returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
             courses.append(Course(arm.name, np.array(every_min), returns))
-        roughly = [rough.optimum(kind, at_min) for at_min in every_min]
-        levels = [None if each is None else each.best_return for each in roughly]
-        optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
+        optimum = [rough.best_return(kind, at_min) for at_min in every_min]
+        fine = ((at_min, known.best_return(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
                 mapping_label(*kind.kind),
                 tuple(courses),
                 np.array([rough.random(kind, at_min) for at_min in every_min]),
-                None if levels[0] is None else np.array(levels, np.float64),
-                tuple(
-                    (at_min, optimum.best_return)
-                    for at_min, optimum in optima
-                    if optimum and optimum.best_return is not None
-                ),
+                None if optimum[0] is None else np.array(optimum, np.float64),
+                tuple((at_min, best) for at_min, best in fine if best is not None),
             )
         )
     return panels

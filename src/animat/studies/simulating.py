@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -51,8 +51,7 @@ class Fit(StudyTask):
                 '(to allow it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
-        save_timeline(timeline, folder / TIMELINE)
-        return [folder / TIMELINE, _write_responses(folder / RESPONSES, series)]
+        return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
 def fit_simulators(study: Study, series: list[Responses]) -> SimulatorTimeline:
@@ -125,15 +124,13 @@ def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
     return fidelities
 
 
-def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
+def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
     """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
     from safetensors.numpy import save
 
-    simulators = timeline.simulators
-    names = [field.name for field in fields(simulators)]  # type: ignore[arg-type]
-    arrays = {name: np.ascontiguousarray(getattr(simulators, name)) for name in names}
+    arrays = {name: np.ascontiguousarray(array) for name, array in vars(timeline.simulators).items()}
     metadata = {
-        "kind": type(simulators).__name__,
+        "kind": type(timeline.simulators).__name__,
         "start_min": timeline.start_min.tolist(),
         "conditions": [asdict(condition) for condition in timeline.conditions],
         "window_ms": timeline.window_ms,
@@ -145,7 +142,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "fitted": timeline.fitted,
         **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
-    write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
+    return write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:

@@ -6,18 +6,17 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, final, get_args, get_type_hints
+from typing import Any, final, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import InvalidArgument
 from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
-from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
+from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes, rows_where
 from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import compare_with_heuristic
@@ -31,8 +30,6 @@ from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
 from animat.training.policy import Policy
 from animat.writing import atomic_write
-
-T = TypeVar("T")
 
 LEVEL = 0.01
 """The p below which an arm counts as better: by the normal approximation and uncorrected, as in the paper."""
@@ -115,49 +112,44 @@ class References:
     def __init__(
         self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame, *, over_time: bool = False
     ) -> None:
-        self._optima = {
-            (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
-            for optimum in read_complete_optima(folder, spec.name, "over-time" if over_time else "optima")
-        }
-        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
+        optima = read_complete_optima(folder, spec.name, "over-time" if over_time else "optima")
+        self._optima = {_key(optimum, optimum.at_min): optimum for optimum in optima}
+        random = rows_where(table, robot=spec.name, agent=RANDOM, over_time=over_time)
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_kind = random[random["arm"] == mapping_label(*kind.kind)]
-            for at_min, returns in of_kind.groupby("at_min")["return"]:
-                self._random[*kind.kind, at_min] = float(returns.to_numpy().mean())
+            for at_min, returns in rows_where(random, arm=mapping_label(*kind.kind)).groupby("at_min")["return"]:
+                self._random[_key(kind, at_min)] = float(returns.to_numpy().mean())
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._find(self._random, arm, at_min)
+        return self._random.get(_key(arm, at_min))
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """The optimal return; None for the control, which has none, and where it leaves out conditions."""
-        return None if arm.delivery == "shuffled" else self._find(self._optima, arm, at_min)
+        """The optimum; None for the control, which has none, and where it leaves out conditions."""
+        return None if arm.delivery == "shuffled" else self._optima.get(_key(arm, at_min))
+
+    def best_return(self, arm: Arm, at_min: float) -> float | None:
+        """The optimal return, where there is an `optimum`."""
+        optimum = self.optimum(arm, at_min)
+        return None if optimum is None else optimum.best_return
 
     def score(self, arm: Arm, at_min: float, mean: float) -> float | None:
         """The normalised score; None if it is not known, or nothing can be learned."""
-        random, optimum = self.random(arm, at_min), self.optimum(arm, at_min)
-        if random is None or optimum is None or optimum.best_return is None:
-            return None
-        try:
-            return normalised_score(mean, random, optimum.best_return)
-        except InvalidArgument:
-            return None
+        random, best = self.random(arm, at_min), self.best_return(arm, at_min)
+        return None if random is None or best is None or not best > random else normalised_score(mean, random, best)
 
-    @staticmethod
-    def _find(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
-        if arm.through_neurons:
-            return known.get((*arm.kind, at_min))
-        # Without neurons every minute is the same.
-        return next((value for (mapping, _, _), value in known.items() if mapping == arm.mapping), None)
+
+def _key(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
+    """What identifies a reference; without neurons every minute is the same."""
+    return (of.mapping, of.percentiles, at_min) if of.mapping != "none" else ("none", "", 0.0)
 
 
 def performances(
     table: DataFrame, robot: str, arm: Arm, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
     """Each policy's mean return over its first `episodes`, or all, at a minute: the paper's measure of a policy."""
-    of_robot = table[(table["robot"] == robot) & (table["arm"] == arm.name) & (table["agent"] == POLICY)]
-    return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
+    rows = rows_where(table, robot=robot, arm=arm.name, agent=POLICY, at_min=at_min, over_time=False)
+    return mean_returns(rows, episodes)
 
 
 def _finite(end: float) -> float | None:
@@ -175,7 +167,6 @@ def _scores(
                 means = performances(table, spec.name, arm, at_min)
                 mean = float(means.mean())
                 middle = interquartile_mean(means, within=spec.robot().return_range)
-                optimum = known.optimum(arm, at_min)
                 yield Score(
                     robot=spec.name,
                     arm=arm.name,
@@ -189,17 +180,13 @@ def _scores(
                     low_95=_finite(middle.low),
                     high_95=_finite(middle.high),
                     random=known.random(arm, at_min),
-                    optimum=None if optimum is None else optimum.best_return,
+                    optimum=known.best_return(arm, at_min),
                     normalised_score=known.score(arm, at_min, mean),
                 )
 
 
-FIRST, SECOND, NONE, TOO_FEW = (
-    "first better",
-    "second better",
-    f"none found (p ≥ {LEVEL:g})",
-    "too few policies to tell",
-)
+FIRST, SECOND, NONE = "first better", "second better", f"none found (p ≥ {LEVEL:g})"
+TOO_FEW = "too few policies to tell"
 
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
 """Whether each outcome agrees with the paper, in which the second arm was always better."""
@@ -235,7 +222,6 @@ def _comparisons(
         known = references[robot]
         printed = PRINTED.get((compared.name, robot)) if study.paper else None
         outcome = outcome_of(test)
-        optima = [known.optimum(arm, at_min) for arm in (first, second)]
         yield ComparedReturns(
             comparison=compared.name,
             robot=robot,
@@ -249,10 +235,10 @@ def _comparisons(
             score_first=known.score(first, at_min, float(a.mean())),
             score_second=known.score(second, at_min, float(b.mean())),
             random_second=known.random(second, at_min),
-            optimum_first=None if optima[0] is None else optima[0].best_return,
-            optimum_second=None if optima[1] is None else optima[1].best_return,
-            optimum_error_first=_optimum_error(optima[0]),
-            optimum_error_second=_optimum_error(optima[1]),
+            optimum_first=known.best_return(first, at_min),
+            optimum_second=known.best_return(second, at_min),
+            optimum_error_first=_optimum_error(known.optimum(first, at_min)),
+            optimum_error_second=_optimum_error(known.optimum(second, at_min)),
             u=test.u,
             p_normal=test.p_normal,
             p_exact=test.p_exact,
@@ -269,9 +255,8 @@ def _comparisons(
 
 def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
     for kind in kinds_of(study):
-        through = mapping_label(*kind.kind)
-        of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
-        for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
+        of_kind = rows_where(table, robot=spec.name, arm=mapping_label(*kind.kind), over_time=False)
+        for at_min, of_minute in of_kind[of_kind["agent"] != POLICY].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
             for arm in study.arms_of(kind):
                 means = performances(table, spec.name, arm, at_min)
@@ -281,7 +266,6 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
                 means = mean_returns(of_agent)
                 # Each actor is one sample; for a single actor, each of its episodes is.
                 rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
-            optimum = known.optimum(kind, at_min)
             for name, actors, samples in rows:
                 mean = float(samples.mean())
                 yield ControlReturns(
@@ -294,7 +278,7 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
                     mean_return=mean,
                     standard_error=float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None,
                     random=known.random(kind, at_min),
-                    optimum=None if optimum is None else optimum.best_return,
+                    optimum=known.best_return(kind, at_min),
                     normalised_score=known.score(kind, at_min, mean),
                 )
 

@@ -36,8 +36,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study's specification.
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it. A key that is left out has
-    its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations
-    (`expand_lists`).
+    its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations.
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -68,7 +67,7 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
 
 
 def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
-    """The data with former keys renamed; other mistakes are left to later checks."""
+    """The data with former keys renamed."""
     data = _rename_keys(data, FORMER[""])
     for name, names in FORMER.items():
         table = data.get(name)
@@ -94,24 +93,18 @@ def study_to_toml(study: Study) -> str:
 
 def _lines(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
     """A table's lines: first its plain values, as TOML requires, then the tables in it."""
-    inner = {key: value for key, value in table.items() if _is_table(value) or _is_tables(value)}
-    lines = [f"{key} = {_format_value(v)}" for key, v in table.items() if key not in inner and v is not None]
-    for key, value in inner.items():
+    plain: list[str] = []
+    inner: list[str] = []
+    for key, value in table.items():
         name = ".".join((*path, key))
-        if _is_table(value):
-            lines += ["", f"[{name}]", *_lines(value, (*path, key))]
-        else:
+        if isinstance(value, dict) and value:
+            inner += ["", f"[{name}]", *_lines(value, (*path, key))]
+        elif isinstance(value, tuple | list) and value and isinstance(value[0], dict):
             for each in value:
-                lines += ["", f"[[{name}]]", *_lines(each, (*path, key))]
-    return lines
-
-
-def _is_table(value: Any) -> bool:
-    return isinstance(value, dict) and bool(value)
-
-
-def _is_tables(value: Any) -> bool:
-    return isinstance(value, tuple | list) and bool(value) and isinstance(value[0], dict)
+                inner += ["", f"[[{name}]]", *_lines(each, (*path, key))]
+        elif value is not None:
+            plain.append(f"{key} = {_format_value(value)}")
+    return plain + inner
 
 
 def _format_value(value: Any) -> str:
@@ -122,11 +115,7 @@ def _format_value(value: Any) -> str:
 
 
 def expand_lists(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A specification's plain data with each combination of listed values as a separate entry.
-
-    `{key}` in an entry's name is replaced by each value. Tables of the wrong type are left to later checks. Raises
-    InvalidArgument for a name that does not distinguish the combinations, or for too many of them.
-    """
+    """Plain data with each combination of listed values as a separate entry; in its name `{key}` becomes the value."""
     expanded = dict(data)
     for table in TABLES:
         if isinstance(entries := data.get(table), list):

@@ -47,8 +47,7 @@ class Fit(StudyTask):
         timeline = fit_simulators(self.study, read_series(self.study, folder))
         if len(timeline.conditions) < 2:
             raise UnusableData(one_condition(timeline))
-        save_timeline(timeline, folder / timeline_file(self.study))
-        return [folder / timeline_file(self.study)]
+        return [save_timeline(timeline, folder / timeline_file(self.study))]
 
 
 @dataclass(frozen=True)
@@ -91,11 +90,9 @@ class TrainTrials(StudyTask):
     def reads(self) -> tuple[str, ...]:
         """Places of the files that it reads, which other jobs wrote."""
         study, first = with_settings(self.study, self.trials[0].settings), self.chunks[0]
-        places = (
-            [learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials] if first else []
-        )
+        places = [learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials if first]
         if study.arms[0].through_neurons:
-            places += {timeline_file(each) for each in (study, replace(study, simulators=_judge(self.study, study)))}
+            places += {timeline_file(each) for each in (study, _judge(self.study, study))}
         return tuple(place.as_posix() for place in places)
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
@@ -105,7 +102,7 @@ class TrainTrials(StudyTask):
         training = training_of(studies[0], self.study.robots[0], studies[0].arms[0])
         training = replace(training, seed=self.seeds[0], policies=len(self.members))
         timeline = _timeline(folder, studies[0])
-        judging = _timeline(folder, replace(studies[0], simulators=_judge(self.study, studies[0])))
+        judging = _timeline(folder, _judge(self.study, studies[0]))
         together = Trials(training, timeline, algorithms, self.members)
 
         numbers = ",".join(str(trial.number) for trial in self.trials)
@@ -150,9 +147,9 @@ def learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
     return place / f"t{trial.number}-p{member}-{chunks}.npz"
 
 
-def _judge(own: Study, trial: Study) -> Any:
-    """The simulators that judge a trial: of the study's own kind, with the trial's conditions."""
-    return replace(trial.simulators, kind=own.simulators.kind)
+def _judge(own: Study, trial: Study) -> Study:
+    """The study that judges a trial: with simulators of the study's own kind, for the trial's conditions."""
+    return replace(trial, simulators=replace(trial.simulators, kind=own.simulators.kind))
 
 
 def _timeline(folder: Path, study: Study) -> SimulatorTimeline | None:
