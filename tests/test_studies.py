@@ -334,7 +334,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rule = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=100)
-    monkeypatch.setattr("animat.cultures.virtual.VirtualCulture", partial(small_culture, rule=rule))
+    monkeypatch.setattr("animat.studies.recording.VirtualCulture", partial(small_culture, rule=rule))
     study = Study(culture=Source(sessions=2, interval_min=2.0, trials=2))
 
     def record(name: str) -> Receipt:

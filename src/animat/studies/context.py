@@ -63,7 +63,8 @@ def run_context_study(
     rows: list[ContextRow] = []
     lost: list[LostRow] = []
     with claim_folder(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
-        took_s = run_jobs(plan_context_study(study), folder, manifest["fingerprint"], workers, executor, progress)
+        jobs = plan_context_study(study)
+        took_s = run_jobs(jobs, folder, manifest["fingerprint"], progress, workers=workers, executor=executor)
         for robot, culture in product(study.robots, study.cultures):
             files = (folder / f"culture-{culture}" / robot / name for name in (SIMULATED, MEASURED))
             simulated, measured = (json.loads(file.read_text()) for file in files)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import final
 
@@ -72,17 +73,10 @@ class ContextStudy:
                 raise InvalidArgument(f"robots: expected JAX robots with one or two commands, got {name!r}")
 
 
-def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
-    """All steps at a small scale: a first look, not a result."""
-    return ContextStudy(
-        cultures=tuple(cultures),
-        policies=2,
-        iterations_share=0.1,
-        episodes=30,
-        episodes_measured=1,
-        optimum_resolution=0.25,
-        seed=seed,
-    )
+quick_context_study = partial(
+    ContextStudy, policies=2, iterations_share=0.1, episodes=30, episodes_measured=1, optimum_resolution=0.25
+)
+"""All steps at a small scale: a first look, not a result."""
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,7 @@ from animat.evaluation.rollouts import Episodes
 from animat.studies.results import read_arrays, write_arrays
 
 COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "return", "iterations", "ended")
-"""Columns of the table:
-
-- robot: its name in the study.
-- arm: the arm's name; for controls the mapping they act through (`mapping_label`).
-- agent: `POLICY`, or the control's name.
-- actor: which of several, from 0; for policies p0, p1, ...
-- at_min: the recording whose simulator responds.
-- over_time: whether it is one of the few episodes at every recording.
-- episode: from 0.
-- return, iterations: of the episode.
-- ended: `terminated` by itself, or `truncated` at the episode limit.
+"""Columns of the table, described in docs/studies.md; for controls `arm` is the `mapping_label` they act through.
 
 For robots with a goal (`animat.goals.tally.Outcome`) also: `SUCCEEDED`, 1 or 0; `MARGIN`; and the `SATISFACTION` of
 each objective, from 0, in %.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from animat.environment import Environment
 from animat.evaluation.controls import controls_of
@@ -109,8 +109,7 @@ class Control(StudyTask):
         return [write_episodes(controls_file(folder, self.spec, arm), parts)]
 
 
-@dataclass(frozen=True, eq=False)
-class Setting:
+class Setting(NamedTuple):
     """What policies run in: an environment, the simulators of every minute (None without neurons), action labels."""
 
     environment: Environment[Any]
@@ -155,7 +154,11 @@ def span_min(timeline: SimulatorTimeline | None) -> tuple[float, float]:
     return (0.0, 0.0) if timeline is None else (float(timeline.start_min[0]), float(timeline.start_min[-1]))
 
 
-def _networks(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Networks:
+def policies_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> list[Policy]:
+    """The policies of an arm on a robot."""
     out = policies_folder(folder, spec, arm)
-    policies = [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
-    return networks_of(policies, greedy=study.actions == "most probable")
+    return [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
+
+
+def _networks(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Networks:
+    return networks_of(policies_of(study, folder, spec, arm), greedy=study.actions == "most probable")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -38,14 +39,19 @@ def rough_kinds(study: Study) -> list[Arm]:
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
 
-def read_complete_optima(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
-    """The optima over all conditions, leaving out those over fewer, which do not apply to the policies."""
-    return [optimum for optimum in read_optima(folder, robot, what) if optimum.left_out is None]
-
-
 def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOptimum, ...]:
     """All optima that the job wrote."""
     return read_typed(optima_file(folder, robot, what), tuple[StudyOptimum, ...])
+
+
+def complete_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, float], StudyOptimum]:
+    """The optima of one robot over all conditions, by `key_of`; those over fewer do not apply to the policies."""
+    return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.left_out is None}
+
+
+def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
+    """What identifies an optimum on a robot: without neurons every minute is the same."""
+    return (of.mapping, of.percentiles, at_min) if of.mapping != "none" else ("none", "", 0.0)
 
 
 def missing_capabilities(study: Study) -> list[str]:

@@ -31,7 +31,7 @@ from animat.report.style import Figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
 from animat.studies import figure_tables
-from animat.studies.episodes import POLICY, DataFrame, mean_returns, rows_where
+from animat.studies.episodes import POLICY, mean_returns, rows_where
 from animat.studies.evaluating import as_recorded, span_min
 from animat.studies.figures import save_formats
 from animat.studies.optima import kinds_of
@@ -100,15 +100,15 @@ class RobotPictures(StudyTask):
         rough = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
-        curves = _curves(study, folder, self.spec, known, rough, timeline)
+        curves = _curves(known, rough, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(figure_tables.write_learning(folder, name, curves))
         if study.comparisons:
-            pairs = [_pair(study, row, table, known) for row in results.comparisons if row.robot == name]
+            pairs = [_pair(row, known) for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
         if timeline is not None and len(timeline) > 1:
-            courses = _courses(study, table, known, rough, timeline)
+            courses = _courses(known, rough, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
             drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
             figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
@@ -139,19 +139,10 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     return files
 
 
-def _curves(
-    study: Study,
-    folder: Path,
-    spec: RobotSpec,
-    known: References,
-    rough: References,
-    timeline: SimulatorTimeline | None,
-) -> list[LearningCurve]:
-    curves = []
-    for arm in study.arms:
-        if not arm.trained:
-            continue
-        learning = learning_of(study, folder, spec, arm)
+def _curves(known: References, rough: References, timeline: SimulatorTimeline | None) -> list[LearningCurve]:
+    curves, study = [], known.study
+    for arm in (arm for arm in study.arms if arm.trained):
+        learning = learning_of(study, known.folder, known.spec, arm)
         random, optimum = [], []
         for at_min in _minutes_in_training(study, arm, timeline, learning.shape[1]):
             random.append((rough if arm.through_neurons else known).random(arm, at_min))
@@ -159,7 +150,7 @@ def _curves(
             optimum.append(rough.best_return(arm, at_min) if best is None else best)
         levels = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = learning[0, :, 0]
-        returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, spec))
+        returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, known.spec))
         curves.append(LearningCurve(arm.name, iterations, returns, *levels))
     return curves
 
@@ -179,21 +170,19 @@ def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | N
     return [float(timeline.start_min[row]) for row in rows]
 
 
-def _pair(study: Study, row: ComparedReturns, table: DataFrame, known: References) -> Pair:
-    first, second = study.arm(row.first), study.arm(row.second)
-    a, b = (performances(table, row.robot, arm, row.at_min, row.episodes) for arm in (first, second))
+def _pair(row: ComparedReturns, known: References) -> Pair:
+    first, second = known.study.arm(row.first), known.study.arm(row.second)
+    a, b = (performances(known.table, row.robot, arm, row.at_min, row.episodes) for arm in (first, second))
     return Pair(row, a, b, known.random(first, row.at_min))
 
 
-def _courses(
-    study: Study, table: DataFrame, known: References, rough: References, timeline: SimulatorTimeline
-) -> list[Courses]:
+def _courses(known: References, rough: References, timeline: SimulatorTimeline) -> list[Courses]:
     every_min: list[float] = timeline.start_min.tolist()
-    over_time = rows_where(table, agent=POLICY, over_time=True)
+    over_time = rows_where(known.table, agent=POLICY, over_time=True)
     panels = []
-    for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
+    for kind in (kind for kind in kinds_of(known.study) if kind.through_neurons):
         courses = []
-        for arm in study.arms_of(kind):
+        for arm in known.study.arms_of(kind):
             of_minute = rows_where(over_time, arm=arm.name).groupby("at_min")
             returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
             courses.append(Course(arm.name, np.array(every_min), returns))

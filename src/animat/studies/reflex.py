@@ -11,6 +11,7 @@ from animat.evaluation.statistics import Interval
 from animat.report.results import ReflexComparison, StudyOptimum
 from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual
+from animat.studies.optima import complete_optima, key_of
 from animat.studies.specification import RobotSpec, Study, mapping_label
 
 
@@ -22,21 +23,17 @@ def compare_with_reflex(
     Without an optimal return over all conditions there is no context gap, and hence no row.
     """
     at = rows_where(table, robot=spec.name, over_time=False)
-    known = {
-        (each.mapping, each.percentiles, each.at_min): each
-        for each in optima
-        if each.robot == spec.name and each.left_out is None and each.best_return is not None
-    }
+    known = complete_optima(each for each in optima if each.robot == spec.name)
     for arm in filter(is_usual, study.arms):
         controls = rows_where(at, arm=mapping_label(*arm.kind))
         for at_min, coupled in rows_where(controls, agent=COUPLING).groupby("at_min")["return"]:
-            best = known.get((*arm.kind, at_min))
+            best = known.get(key_of(arm, at_min))
             policies = rows_where(at, arm=arm.name, agent=POLICY, at_min=at_min)
-            if best is None or not len(policies):
+            if best is None or best.best_return is None or not len(policies):
                 continue
             random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
             # The context gap takes only the value and its error.
-            optimum = Optimum(best.best_return or 0.0, best.grid_error or 0.0, *[math.nan] * 4, episodes=0, nodes=0)
+            optimum = Optimum(best.best_return, best.grid_error or 0.0, *[math.nan] * 4, episodes=0, nodes=0)
             context = context_gap(coupled.to_numpy(), random, optimum)
             yield ReflexComparison(
                 spec.name,

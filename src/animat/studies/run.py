@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import mapping_named
@@ -80,21 +81,15 @@ def run_study(
     specification = _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)
     with claim_folder(folder, "study", manifest, MANIFEST, {SPECIFICATION: specification}):
         jobs = plan_study(study, base)
-        took_s = run_jobs(jobs, folder, manifest["fingerprint"], workers, executor, progress, has_gpu=gpu is not None)
+        how = {"workers": workers, "executor": executor, "has_gpu": gpu is not None}
+        took_s = run_jobs(jobs, folder, manifest["fingerprint"], progress, **how)
     return StudyRun(folder, folder / REPORT, len(jobs), took_s)
 
 
 def run_jobs(
-    jobs: Sequence[Job],
-    folder: Path,
-    fingerprint: str,
-    workers: int | None,
-    executor: Executor | None,
-    progress: Progress | None,
-    *,
-    has_gpu: bool = False,
+    jobs: Sequence[Job], folder: Path, fingerprint: str, progress: Progress | None, **how: Any
 ) -> dict[str, float]:
-    """Run the jobs of a folder that are not done; returns the CPU seconds of each."""
+    """Run the jobs of a folder that are not done, with options of `Jobs.run`; returns the CPU seconds of each."""
     left = Jobs(jobs, folder, folder / RECEIPTS, fingerprint)
     took_s: dict[str, float] = {}
     if left.waiting:
@@ -102,7 +97,7 @@ def run_jobs(
             raise InvalidFile(
                 f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
             )
-        took_s = left.run(workers=workers, executor=executor, progress=progress or Silent(), has_gpu=has_gpu)
+        took_s = left.run(progress=progress or Silent(), **how)
     shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     return took_s
 

@@ -17,18 +17,17 @@ from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes, rows_where
-from animat.studies.evaluating import as_recorded, span_min
+from animat.studies.evaluating import as_recorded, policies_of, span_min
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import compare_with_heuristic
-from animat.studies.optima import kinds_of, missing_capabilities, read_complete_optima, read_optima
+from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
 from animat.studies.paper import PRINTED
-from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
+from animat.studies.places import controls_file, episodes_file, results_file, table_file
 from animat.studies.reflex import compare_with_reflex
 from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
-from animat.training.policy import Policy
 from animat.writing import atomic_write
 
 LEVEL = 0.01
@@ -52,9 +51,9 @@ class Tabulate(StudyTask):
         known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
         results = Results(
-            scores=tuple(_scores(study, table, first, last, known)),
+            scores=tuple(row for of_robot in known.values() for row in _scores(of_robot, first, last)),
             comparisons=tuple(_comparisons(study, table, last, known)),
-            controls=tuple(row for spec in study.robots for row in _controls(study, table, spec, known[spec.name])),
+            controls=tuple(row for of_robot in known.values() for row in _controls(of_robot)),
             heuristic=tuple(row for spec in study.robots for row in compare_with_heuristic(study, table, spec)),
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
@@ -112,21 +111,21 @@ class References:
     def __init__(
         self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame, *, over_time: bool = False
     ) -> None:
-        optima = read_complete_optima(folder, spec.name, "over-time" if over_time else "optima")
-        self._optima = {_key(optimum, optimum.at_min): optimum for optimum in optima}
+        self.study, self.folder, self.spec, self.table = study, folder, spec, table
+        self._optima = complete_optima(read_optima(folder, spec.name, "over-time" if over_time else "optima"))
         random = rows_where(table, robot=spec.name, agent=RANDOM, over_time=over_time)
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
             for at_min, returns in rows_where(random, arm=mapping_label(*kind.kind)).groupby("at_min")["return"]:
-                self._random[_key(kind, at_min)] = float(returns.to_numpy().mean())
+                self._random[key_of(kind, at_min)] = float(returns.to_numpy().mean())
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._random.get(_key(arm, at_min))
+        return self._random.get(key_of(arm, at_min))
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
         """The optimum; None for the control, which has none, and where it leaves out conditions."""
-        return None if arm.delivery == "shuffled" else self._optima.get(_key(arm, at_min))
+        return None if arm.delivery == "shuffled" else self._optima.get(key_of(arm, at_min))
 
     def best_return(self, arm: Arm, at_min: float) -> float | None:
         """The optimal return, where there is an `optimum`."""
@@ -137,11 +136,6 @@ class References:
         """The normalised score; None if it is not known, or nothing can be learned."""
         random, best = self.random(arm, at_min), self.best_return(arm, at_min)
         return None if random is None or best is None or not best > random else normalised_score(mean, random, best)
-
-
-def _key(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
-    """What identifies a reference; without neurons every minute is the same."""
-    return (of.mapping, of.percentiles, at_min) if of.mapping != "none" else ("none", "", 0.0)
 
 
 def performances(
@@ -157,32 +151,29 @@ def _finite(end: float) -> float | None:
     return end if math.isfinite(end) else None
 
 
-def _scores(
-    study: Study, table: DataFrame, first: float, last: float, references: Mapping[str, References]
-) -> Iterator[Score]:
-    for spec in study.robots:
-        known = references[spec.name]
-        for arm in study.arms:
-            for at_min, episodes in sorted(study.minutes_of(arm, first, last).items()):
-                means = performances(table, spec.name, arm, at_min)
-                mean = float(means.mean())
-                middle = interquartile_mean(means, within=spec.robot().return_range)
-                yield Score(
-                    robot=spec.name,
-                    arm=arm.name,
-                    mapping=arm.mapping,
-                    at_min=at_min,
-                    policies=len(means),
-                    episodes=episodes,
-                    mean_return=mean,
-                    standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
-                    interquartile_mean=middle.value,
-                    low_95=_finite(middle.low),
-                    high_95=_finite(middle.high),
-                    random=known.random(arm, at_min),
-                    optimum=known.best_return(arm, at_min),
-                    normalised_score=known.score(arm, at_min, mean),
-                )
+def _scores(known: References, first: float, last: float) -> Iterator[Score]:
+    spec = known.spec
+    for arm in known.study.arms:
+        for at_min, episodes in sorted(known.study.minutes_of(arm, first, last).items()):
+            means = performances(known.table, spec.name, arm, at_min)
+            mean = float(means.mean())
+            middle = interquartile_mean(means, within=spec.robot().return_range)
+            yield Score(
+                robot=spec.name,
+                arm=arm.name,
+                mapping=arm.mapping,
+                at_min=at_min,
+                policies=len(means),
+                episodes=episodes,
+                mean_return=mean,
+                standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
+                interquartile_mean=middle.value,
+                low_95=_finite(middle.low),
+                high_95=_finite(middle.high),
+                random=known.random(arm, at_min),
+                optimum=known.best_return(arm, at_min),
+                normalised_score=known.score(arm, at_min, mean),
+            )
 
 
 FIRST, SECOND, NONE = "first better", "second better", f"none found (p ≥ {LEVEL:g})"
@@ -253,7 +244,8 @@ def _comparisons(
         )
 
 
-def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
+def _controls(known: References) -> Iterator[ControlReturns]:
+    study, table, spec = known.study, known.table, known.spec
     for kind in kinds_of(study):
         of_kind = rows_where(table, robot=spec.name, arm=mapping_label(*kind.kind), over_time=False)
         for at_min, of_minute in of_kind[of_kind["agent"] != POLICY].groupby("at_min"):
@@ -285,8 +277,7 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
 
 def learning_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Float64[np.ndarray, "policies parts 3"]:
     """The learning curves of an arm's policies: iterations, episodes and mean return, as in `Policy.learning_curve`."""
-    out = policies_folder(folder, spec, arm)
-    curves = [Policy.load(out / f"p{i}.safetensors").learning_curve[:, :3] for i in range(study.policies)]
+    curves = [policy.learning_curve[:, :3] for policy in policies_of(study, folder, spec, arm)]
     return np.stack(curves).astype(np.float64)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from animat import plain_file
 from animat.errors import InvalidArgument, InvalidFile
-from animat.records import read_record
+from animat.records import in_file, read_record
 from animat.studies.source import MOST_ENTRIES
 from animat.studies.specification import Study
 from animat.training.settings import FORMER as FORMER_SETTINGS
@@ -60,10 +60,8 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
         if isinstance(table := data.get(name), dict):
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")
             raise InvalidFile(f"{path}: {name}: expected [[{name}]] for each, and its name in it, got {wrote}")
-    try:
+    with in_file(path):
         return read_record(Study, expand_lists(_with_current_keys(data)))
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error
 
 
 def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from animat.differences import with_fingerprint
 from animat.errors import InvalidFile, UnusableData
@@ -31,7 +30,7 @@ from animat.training.specification import CHUNKS
 from animat.tuning.journal import TrialResult, read_journal, write_journal
 from animat.tuning.results import Final, TuningResult, write_results
 from animat.tuning.search import Search, expect_optuna, importance_of
-from animat.tuning.space import first_settings, own_settings, with_settings
+from animat.tuning.space import choices_of, first_settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
 
@@ -70,7 +69,7 @@ def tune(
     folder, base, progress = Path(folder).absolute(), Path(base).absolute(), progress or Silent()
     study = tuning.study
     # Checked before the folder is created.
-    check_custom(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
+    check_custom(study.robots, choices_of("mapping", tuning.space, study))
     sources = hash_files(source_files(study, base), base)
     versions = {**describe_study(study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
     manifest = with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
@@ -103,9 +102,8 @@ class _Run:
         study, space = self._tuning.study, self._tuning.space
         if not study.needs_neurons:
             return
-        own = own_settings(study)
         names = ("simulator", "conditions", "readouts")
-        choices = [dict.fromkeys((own[name], *_choices(space.get(name)))) for name in names]
+        choices = [choices_of(name, space, study) for name in names]
         variants = [with_settings(study, dict(zip(names, chosen, strict=True))) for chosen in product(*choices)]
         fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
         self._run_jobs([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
@@ -216,7 +214,3 @@ class _Run:
 
     def _cost_s(self, policies: int, chunks: int) -> float:
         return policies * self._tuning.study.robots[0].trained_for * chunks / CHUNKS / ITERATIONS_PER_S
-
-
-def _choices(among: Any) -> tuple[Any, ...]:
-    return among if isinstance(among, tuple) else ()

@@ -120,8 +120,7 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
                 f"{where}: expected it to include the study's own setting, {own[name]!r}, which is tried first; got "
                 f"{shown(among)}"
             )
-    fitting = [value if isinstance(value := space.get(name), tuple) else (own[name],) for name in FITTING]
-    for chosen in itertools.product(*fitting):
+    for chosen in itertools.product(*(choices_of(name, space, study) for name in FITTING)):
         try:
             with_settings(study, dict(zip(FITTING, chosen, strict=True)))
         except InvalidArgument as error:
@@ -154,6 +153,12 @@ def own_settings(study: Study) -> dict[str, Any]:
         "mapping": study.arms[0].mapping,
         **{name: getattr(study.simulators, field) for name, field in _OF_SIMULATORS.items()},
     }
+
+
+def choices_of(name: str, space: Space, study: Study) -> tuple[Any, ...]:
+    """The choices of a setting; only the study's own if it is not searched."""
+    among = space.get(name)
+    return among if isinstance(among, tuple) else (own_settings(study)[name],)
 
 
 def first_settings(study: Study, space: Space) -> list[Settings]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from animat.errors import InvalidArgument, InvalidFile
-from animat.records import Seed, Whole, read_record, record
+from animat.records import Seed, Whole, in_file, read_record, record
 from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
 from animat.studies.toml import read_toml, study_from
@@ -101,7 +101,5 @@ def read_tuning(path: str | os.PathLike[str]) -> Tuning:
     if not data:
         raise InvalidFile(f"{path}: expected a study's settings in addition to [tune], such as [[robots]], got none")
     study = study_from(data, path)
-    try:
+    with in_file(path):
         return tuning_of(study, read_record(Tune, tune, "tune"))
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error

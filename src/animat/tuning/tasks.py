@@ -90,7 +90,7 @@ class TrainTrials(StudyTask):
     def reads(self) -> tuple[str, ...]:
         """Places of the files that it reads, which other jobs wrote."""
         study, first = with_settings(self.study, self.trials[0].settings), self.chunks[0]
-        places = [learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials if first]
+        places = [_learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials if first]
         if study.arms[0].through_neurons:
             places += {timeline_file(each) for each in (study, _judge(self.study, study))}
         return tuple(place.as_posix() for place in places)
@@ -107,7 +107,7 @@ class TrainTrials(StudyTask):
 
         numbers = ",".join(str(trial.number) for trial in self.trials)
         checkpoint = place / f"t{numbers}-p{self.members[0]}-to-{last}-of-{CHUNKS}.npz"
-        learners = [learner_file(place, trial, first, self.members[0]) for trial in self.trials if first]
+        learners = [_learner_file(place, trial, first, self.members[0]) for trial in self.trials if first]
         files = [checkpoint] if checkpoint.exists() else learners
         done = together.resume(*files) if files else 0
         written = time.monotonic()
@@ -131,7 +131,7 @@ class TrainTrials(StudyTask):
             file = returns_file(place, trial, last, self.members[0])
             files.append(write_whole(file, json.dumps(returns) + "\n"))
             if self.is_continued:
-                files.append(learner_file(place, trial, last, self.members[0]))
+                files.append(_learner_file(place, trial, last, self.members[0]))
                 together.save_checkpoint(files[-1], i)
         checkpoint.unlink(missing_ok=True)
         return files
@@ -139,11 +139,10 @@ class TrainTrials(StudyTask):
 
 def returns_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
     """The JSON file with the mean return of each of a trial's policies after so many chunks; null if not finite."""
-    return place / f"t{trial.number}-p{member}-{chunks}.json"
+    return _learner_file(place, trial, chunks, member).with_suffix(".json")
 
 
-def learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
-    """The file of a trial's learners after so many chunks."""
+def _learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
     return place / f"t{trial.number}-p{member}-{chunks}.npz"
 
 
