@@ -128,9 +128,8 @@ def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str,
     results = {name: read_typed(results_file(each.folder), Results) for name, each in finished.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
-    compared = [(name, row) for name, rows in comparisons.items() for row in rows]
-    scores = [(name, score) for name, each in results.items() for score in each.scores]
-    write_named_records(folder / COMPARISONS, compared, ComparedReturns, "culture")
+    scores = {name: each.scores for name, each in results.items()}
+    write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
     write_records(folder / SUMMARY, OverCultures, summary)
     write_named_records(folder / SCORES, scores, Score, "culture")
     parquet = (folder / SCORES).with_suffix(".parquet")

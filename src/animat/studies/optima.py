@@ -15,7 +15,7 @@ from animat.progress import Part, Progress
 from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
 from animat.robots.grid import why_no_grid
-from animat.studies.evaluating import as_recorded, setting_of, span_min
+from animat.studies.evaluating import as_recorded, setting_of
 from animat.studies.places import optima_file
 from animat.studies.results import read_typed, write_typed
 from animat.studies.simulating import read_series
@@ -86,8 +86,7 @@ class FindOptima(StudyTask):
         file = optima_file(folder, self.spec.name, "over-time" if self.over_time else "optima")
         if why_no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
-        study, timeline = as_recorded(self.study, folder)
-        first, last = span_min(timeline)
+        study, timeline, first, last = as_recorded(self.study, folder)
         kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
         resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:

@@ -32,12 +32,12 @@ from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
 from animat.studies import figure_tables
 from animat.studies.episodes import POLICY, mean_returns, rows_where
-from animat.studies.evaluating import as_recorded, span_min
+from animat.studies.evaluating import as_recorded
 from animat.studies.figures import save_formats
 from animat.studies.optima import kinds_of
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
-from animat.studies.results import read_typed
+from animat.studies.results import read_arrays, read_typed
 from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
@@ -92,7 +92,7 @@ class RobotPictures(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         robot, name = self.spec.robot(), self.spec.name
-        study, timeline = as_recorded(self.study, folder)
+        study, timeline, *_ = as_recorded(self.study, folder)
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
@@ -116,7 +116,7 @@ class RobotPictures(StudyTask):
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)
         figures["controls"] = draw_controls(controls, f"{name}: controls")
-        recorded = {each.name: Paths.load(paths_file(folder, self.spec, each)) for each in study.arms}
+        recorded = {each.name: Paths(**read_arrays(paths_file(folder, self.spec, each))) for each in study.arms}
         tables.append(
             figure_tables.write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded)
         )
@@ -163,11 +163,12 @@ def round_of(study: Study, spec: RobotSpec) -> int:
 def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, chunks: int) -> list[float]:
     """The minute of the recording in use in each chunk of training."""
     if timeline is None or not arm.through_neurons:
-        return [span_min(timeline)[1]] * chunks
-    start, _ = span_min(timeline)
+        # Without neurons every minute is the same.
+        return [0.0] * chunks
+    every_min = timeline.start_min.tolist()
     share = 1 / chunks if arm.shadowing else 0.0
-    rows = [timeline.row_at(start + study.training_min * share * chunk) for chunk in range(chunks)]
-    return [float(timeline.start_min[row]) for row in rows]
+    rows = [timeline.row_at(every_min[0] + study.training_min * share * chunk) for chunk in range(chunks)]
+    return [every_min[row] for row in rows]
 
 
 def _pair(row: ComparedReturns, known: References) -> Pair:

@@ -65,16 +65,16 @@ def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
 
 
-def write_named_records(path: Path, named: Iterable[tuple[str, Any]], kind: type, name: str) -> Path:
-    """Write records as a CSV file with an extra first column `name`, whose value comes with each record."""
+def write_named_records(path: Path, named: Mapping[str, Iterable[Any]], kind: type, name: str) -> Path:
+    """Write records as a CSV file with an extra first column `name`, whose value is the key of each record."""
     head = [name, *(field.name for field in fields(kind))]
-    return write_table(path, head, ((first, *astuple(row)) for first, row in named))
+    return write_table(path, head, ((first, *astuple(row)) for first, rows in named.items() for row in rows))
 
 
 MISSING = f"fastparquet is not installed: {install_command('parquet')}"
 
 
-def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name: str) -> bool:
+def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, name: str) -> bool:
     """Write records as `write_named_records` does, with None as NaN; returns False if fastparquet is missing."""
     try:
         import fastparquet
@@ -84,9 +84,9 @@ def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name
 
     hints = get_type_hints(kind)
     dtypes = {int: "int64", str: object, str | None: object}
-    columns = {name: pd.Series([first for first, _ in named], dtype=object)}
+    columns = {name: pd.Series([first for first, rows in named.items() for _ in rows], dtype=object)}
     for each in fields(kind):
-        values = [getattr(row, each.name) for _, row in named]
+        values = [getattr(row, each.name) for rows in named.values() for row in rows]
         columns[each.name] = pd.Series(values, dtype=dtypes.get(hints[each.name], "float64"))
     strings = [column for column, values in columns.items() if values.dtype == object]
     encodings = {column: "utf8" if column in strings else "infer" for column in columns}

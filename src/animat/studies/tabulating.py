@@ -17,7 +17,7 @@ from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
 from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes, rows_where
-from animat.studies.evaluating import as_recorded, policies_of, span_min
+from animat.studies.evaluating import as_recorded, policies_of
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import compare_with_heuristic
 from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
@@ -45,8 +45,7 @@ class Tabulate(StudyTask):
     """Summarise the table of episodes and write `tables/`: typed results for later tasks, and everything as CSV."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        study, timeline = as_recorded(self.study, folder)
-        first, last = span_min(timeline)
+        study, timeline, first, last = as_recorded(self.study, folder)
         table = all_episodes(study, folder)
         known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))

@@ -143,9 +143,7 @@ class _Run:
             jobs = [
                 self._job(
                     f"rung-{rung + 1}/trials-{','.join(str(trial.number) for trial in group)}",
-                    TrainTrials(
-                        self._tuning.study, group, members, seeds, tune.episodes, (first, last), place, last < CHUNKS
-                    ),
+                    TrainTrials(self._tuning.study, group, members, seeds, tune.episodes, (first, last), place),
                 )
                 for group in group_by_shape(racing, tune.policies)
             ]
@@ -185,7 +183,7 @@ class _Run:
         jobs = [
             self._job(
                 f"final/trial-{trial.number}/p{members[0]}",
-                TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS, False),
+                TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS),
             )
             for trial in finalists
             for members in split

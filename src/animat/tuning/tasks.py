@@ -72,8 +72,7 @@ class TrainTrials(StudyTask):
         seeds: seeds of training and of the episodes.
         episodes: episodes per policy.
         chunks: the chunks of training, from the first up to but excluding the last.
-        place: folder of the learners and the returns, relative to the tuning's.
-        is_continued: whether the learners are stored for the next rung.
+        place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.
     """
 
     sizes = ("algorithm",)
@@ -84,7 +83,6 @@ class TrainTrials(StudyTask):
     episodes: int
     chunks: tuple[int, int]
     place: str
-    is_continued: bool
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -130,7 +128,7 @@ class TrainTrials(StudyTask):
                 returns = means.tolist() if np.isfinite(means).all() else None
             file = returns_file(place, trial, last, self.members[0])
             files.append(write_whole(file, json.dumps(returns) + "\n"))
-            if self.is_continued:
+            if last < CHUNKS:
                 files.append(_learner_file(place, trial, last, self.members[0]))
                 together.save_checkpoint(files[-1], i)
         checkpoint.unlink(missing_ok=True)
