@@ -15,7 +15,7 @@ from animat.differences import first_difference, folder_mismatch, read_descripti
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
-from animat.plain_file import expect_no_file
+from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
 from animat.robots.host import HostRobot
 from animat.studies.places import OWN_FOLDERS
@@ -77,9 +77,7 @@ def hash_files(files: list[Path], base: Path) -> dict[str, str]:
         stimuli = stimuli_beside(file)
         for each in [file] if stimuli is None else [file, stimuli]:
             try:
-                hashes[_relative(each, base)] = sha256(each)
-            except FileNotFoundError as error:
-                raise InvalidFile(f"{each}: no such file") from error
+                hashes[_relative(each, base)] = sha256(expect_plain_file(each))
             except OSError as error:
                 raise InvalidFile(f"{each}: cannot be read: {error.strerror or error}") from error
     return dict(sorted(hashes.items()))

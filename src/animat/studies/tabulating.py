@@ -46,7 +46,7 @@ class Tabulate(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline, first, last = as_recorded(self.study, folder)
-        table = all_episodes(study, folder)
+        table = all_episodes(study, folder, study.robots)
         known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
         results = Results(
@@ -81,10 +81,10 @@ class Tabulate(StudyTask):
         return [*files, table_file(folder, "episodes")]
 
 
-def all_episodes(study: Study, folder: Path, robots: Iterable[RobotSpec] | None = None) -> DataFrame:
-    """The table of episodes of all robots, or of some."""
+def all_episodes(study: Study, folder: Path, robots: Iterable[RobotSpec]) -> DataFrame:
+    """The table of episodes of some robots."""
     files = []
-    for spec in study.robots if robots is None else robots:
+    for spec in robots:
         files += [episodes_file(folder, spec, arm) for arm in study.arms]
         files += [controls_file(folder, spec, kind) for kind in kinds_of(study)]
     return read_episodes(files)

@@ -67,19 +67,19 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
 def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
     """The data with former keys renamed."""
     data = _rename_keys(data, FORMER[""])
-    for name, names in FORMER.items():
-        table = data.get(name)
-        if isinstance(table, dict):
-            data[name] = _rename_keys(table, names)
-        elif isinstance(table, list):
-            data[name] = [_rename_keys(each, names) if isinstance(each, dict) else each for each in table]
+    data |= {name: _rename_keys(data[name], names) for name, names in FORMER.items() if name in data}
     culture = data.get("culture")
     if isinstance(culture, dict) and culture.get("channels") == FORMER_CHANNELS:
         data["culture"] = {key: value for key, value in culture.items() if key != "channels"}
     return data
 
 
-def _rename_keys(table: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
+def _rename_keys(table: Any, names: dict[str, str]) -> Any:
+    """The same for a table, or each in a list; anything else is refused later."""
+    if isinstance(table, list):
+        return [_rename_keys(each, names) for each in table]
+    if not isinstance(table, dict):
+        return table
     # If both names are present, the former one stays and is refused as an unknown key.
     return {key if names.get(key, key) in table else names[key]: value for key, value in table.items()}
 

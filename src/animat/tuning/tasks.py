@@ -67,10 +67,9 @@ class TrainTrials(StudyTask):
     that is easiest to control would win. All trials use the same random numbers.
 
     Attributes:
-        trials: the trials.
-        members: numbers of their policies.
-        seeds: seeds of training and of the episodes.
-        episodes: episodes per policy.
+        members: numbers of the trials' policies.
+        seeds: of training and of the episodes.
+        episodes: per policy.
         chunks: the chunks of training, from the first up to but excluding the last.
         place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.
     """
