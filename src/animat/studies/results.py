@@ -88,8 +88,7 @@ def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, na
     for each in fields(kind):
         values = [getattr(row, each.name) for rows in named.values() for row in rows]
         columns[each.name] = pd.Series(values, dtype=dtypes.get(hints[each.name], "float64"))
-    strings = [column for column, values in columns.items() if values.dtype == object]
-    encodings = {column: "utf8" if column in strings else "infer" for column in columns}
+    encodings = {column: "utf8" if values.dtype == object else "infer" for column, values in columns.items()}
     with atomic_write(path) as beside:
         fastparquet.write(str(beside), pd.DataFrame(columns), object_encoding=encodings, write_index=False)
     return True

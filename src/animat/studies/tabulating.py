@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, final, get_args, get_type_hints
 
@@ -47,12 +48,12 @@ class Tabulate(StudyTask):
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         study, timeline, first, last = as_recorded(self.study, folder)
         table = all_episodes(study, folder, study.robots)
-        known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
+        known = [References(study, folder, spec, table) for spec in study.robots]
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
         results = Results(
-            scores=tuple(row for of_robot in known.values() for row in _scores(of_robot, first, last)),
-            comparisons=tuple(_comparisons(study, table, last, known)),
-            controls=tuple(row for of_robot in known.values() for row in _controls(of_robot)),
+            scores=tuple(row for of_robot in known for row in _scores(of_robot, first, last)),
+            comparisons=tuple(_comparisons(study, last, known)),
+            controls=tuple(row for of_robot in known for row in _controls(of_robot)),
             heuristic=tuple(row for spec in study.robots for row in compare_with_heuristic(study, table, spec)),
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
@@ -197,22 +198,16 @@ def _optimum_error(optimum: StudyOptimum | None) -> float | None:
     return max(optimum.grid_error, *(abs(each.value or 0.0) for each in optimum.findings()), 0.0)
 
 
-def _comparisons(
-    study: Study, table: DataFrame, last: float, references: Mapping[str, References]
-) -> Iterator[ComparedReturns]:
-    made = []
-    for compared in study.comparisons:
-        at_min = last if compared.at_min is None else compared.at_min
-        sides = study.arm(compared.first), study.arm(compared.second)
-        for spec in study.robots:
-            a, b = (performances(table, spec.name, side, at_min, compared.episodes) for side in sides)
-            made.append((compared, spec.name, sides, at_min, a, b, compare(a, b)))
-    corrected = holm({f"{compared.name}/{robot}": test.p_normal for compared, robot, *_, test in made})
-    for compared, robot, (first, second), at_min, a, b, test in made:
-        known = references[robot]
-        printed = PRINTED.get((compared.name, robot)) if study.paper else None
+def _comparisons(study: Study, last: float, references: Iterable[References]) -> Iterator[ComparedReturns]:
+    rows = []
+    for compared, known in product(study.comparisons, references):
+        robot, at_min = known.spec.name, last if compared.at_min is None else compared.at_min
+        first, second = study.arm(compared.first), study.arm(compared.second)
+        a, b = (performances(known.table, robot, arm, at_min, compared.episodes) for arm in (first, second))
+        test = compare(a, b)
         outcome = outcome_of(test)
-        yield ComparedReturns(
+        printed = PRINTED.get((compared.name, robot)) if study.paper else None
+        row = ComparedReturns(
             comparison=compared.name,
             robot=robot,
             first=first.name,
@@ -232,7 +227,7 @@ def _comparisons(
             u=test.u,
             p_normal=test.p_normal,
             p_exact=test.p_exact,
-            p_holm=corrected[f"{compared.name}/{robot}"],
+            p_holm=math.nan,
             effect=test.effect.value,
             effect_low_95=test.effect.low,
             effect_high_95=test.effect.high,
@@ -241,6 +236,9 @@ def _comparisons(
             paper_p=None if printed is None else printed.p,
             as_in_paper=None if printed is None else AS_IN_PAPER[outcome],
         )
+        rows.append(row)
+    corrected = holm({f"{row.comparison}/{row.robot}": row.p_normal for row in rows})
+    return (replace(row, p_holm=corrected[f"{row.comparison}/{row.robot}"]) for row in rows)
 
 
 def _controls(known: References) -> Iterator[ControlReturns]:
