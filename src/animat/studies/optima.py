@@ -27,6 +27,9 @@ ROUGH = 0.5
 COARSER = 0.8
 """Grid steps along each axis for bootstrapped responses, at most, as a fraction of the optimum's."""
 
+_COPIED = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
+"""Columns of the table that an `Optimum` has under the same name."""
+
 
 def kinds_of(study: Study) -> list[Arm]:
     """One arm for each mapping and percentile setting, delivered as chosen: each has its own optimum."""
@@ -154,14 +157,6 @@ class _Request:
     def to_row(self, robot: str) -> StudyOptimum:
         known: dict[str, Any] = {} if self.optimum is None else self.optimum.to_dict()
         interval = known.get("interval") or {}
-        names = (
-            "grid_error",
-            "monte_carlo",
-            "standard_error",
-            "without_clock",
-            "without_clock_standard_error",
-            "nodes",
-        )
         return StudyOptimum(
             robot,
             *self.kind.kind,
@@ -169,6 +164,6 @@ class _Request:
             known.get("value"),
             interval.get("low"),
             interval.get("high"),
-            **{name: known.get(name) for name in names},
+            **{name: known.get(name) for name in _COPIED},
             left_out="; ".join(self.left_out) or None,
         )
