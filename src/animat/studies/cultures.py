@@ -155,16 +155,30 @@ def _run_side_by_side(
     runs: Mapping[str, Callable[..., StudyRun]], at_once: int, shared: Executor | None, progress: Progress
 ) -> tuple[dict[str, StudyRun], dict[str, str]]:
     """Run studies, `at_once` at a time; returns the finished ones and the errors of the others, in their order."""
-    total = _TotalProgress(progress, len(runs))
+    ended = set[str]()
+    reporting, stopped = threading.Lock(), threading.Event()
+
+    def report() -> None:
+        if stopped.is_set():
+            # This ends the study that reports.
+            raise AnimatError("stopped")
+        with reporting:
+            running = [(name, share.done) for name, share in shares.items() if share.done and name not in ended]
+            parts = [f"{len(ended)} of {len(runs)} cultures", *(f"{name} {100 * done:.0f} %" for name, done in running)]
+            progress.update(len(ended) + sum(done for _, done in running), len(runs), "; ".join(parts))
+
+    shares = {name: _Share(report) for name in runs}
     with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:
-        futures = {threads.submit(run, progress=_StudyProgress(total, name)): name for name, run in runs.items()}
+        futures = {threads.submit(run, progress=shares[name]): name for name, run in runs.items()}
         try:
             for future in as_completed(futures):
                 if not isinstance(future.exception(), AnimatError):
                     future.result()
-                total.end(futures[future])
+                with reporting:
+                    ended.add(futures[future])
+                report()
         except BaseException:
-            total.is_stopped = True
+            stopped.set()
             threads.shutdown(wait=False, cancel_futures=True)
             if isinstance(shared, PinnedProcesses):
                 # Otherwise the studies would wait for their running jobs.
@@ -175,42 +189,16 @@ def _run_side_by_side(
     return finished, {name: str(error) for name, error in errors.items() if error is not None}
 
 
-class _TotalProgress:
-    """The progress of many studies together; once it `is_stopped`, each study ends at its next report."""
+class _Share:
+    """The progress of one of several studies, which reports them all together."""
 
-    def __init__(self, progress: Progress, studies: int) -> None:
-        self.is_stopped = False
-        self._progress, self._studies, self._ended = progress, studies, 0
-        self._shares: dict[str, float] = {}
-        self._lock = threading.Lock()
-
-    def end(self, name: str) -> None:
-        """Count a study that has finished or failed."""
-        with self._lock:
-            self._shares.pop(name, None)
-            self._ended += 1
-            self._report()
-
-    def update(self, name: str, share: float) -> None:
-        """Set the share of a study that is done."""
-        if self.is_stopped:
-            raise AnimatError("stopped")
-        with self._lock:
-            self._shares[name] = share
-            self._report()
-
-    def _report(self) -> None:
-        running = "; ".join(f"{name} {100 * share:.0f} %" for name, share in self._shares.items())
-        note = f"{self._ended} of {self._studies} cultures" + (f"; {running}" if running else "")
-        self._progress.update(self._ended + sum(self._shares.values()), self._studies, note)
-
-
-class _StudyProgress:
-    def __init__(self, total: _TotalProgress, name: str) -> None:
-        self._total, self._name = total, name
+    def __init__(self, report: Callable[[], None]) -> None:
+        self.done = 0.0
+        self._report = report
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self._total.update(self._name, done / total)
+        self.done = done / total
+        self._report()
 
 
 def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
