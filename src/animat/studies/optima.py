@@ -156,14 +156,7 @@ class _Request:
 
     def to_row(self, robot: str) -> StudyOptimum:
         known: dict[str, Any] = {} if self.optimum is None else self.optimum.to_dict()
-        interval = known.get("interval") or {}
-        return StudyOptimum(
-            robot,
-            *self.kind.kind,
-            self.at_min,
-            known.get("value"),
-            interval.get("low"),
-            interval.get("high"),
-            **{name: known.get(name) for name in _COPIED},
-            left_out="; ".join(self.left_out) or None,
-        )
+        interval, few = known.get("interval") or {}, "; ".join(self.left_out) or None
+        bracket = known.get("value"), interval.get("low"), interval.get("high")
+        copied: dict[str, Any] = {name: known.get(name) for name in _COPIED}
+        return StudyOptimum(robot, *self.kind.kind, self.at_min, *bracket, **copied, left_out=few)

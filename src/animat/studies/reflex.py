@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
+from math import nan
 
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.optimum import Optimum
@@ -33,7 +33,7 @@ def compare_with_reflex(
                 continue
             random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
             # The context gap takes only the value and its error.
-            optimum = Optimum(best.best_return, best.grid_error or 0.0, *[math.nan] * 4, episodes=0, nodes=0)
+            optimum = Optimum(best.best_return, best.grid_error or 0.0, nan, nan, nan, nan, 0, 0)
             context = context_gap(coupled.to_numpy(), random, optimum)
             yield ReflexComparison(
                 spec.name,

@@ -155,8 +155,8 @@ class _Run:
                 if returns is None:
                     results[trial.number] = replace(result, state="diverged")
                 else:
-                    more = {"chunks": (*result.chunks, last), "returns": (*result.returns, tuple(returns))}
-                    results[trial.number] = replace(result, **more)
+                    chunks, every = (*result.chunks, last), (*result.returns, tuple(returns))
+                    results[trial.number] = replace(result, chunks=chunks, returns=every)
             if last < CHUNKS:
                 complete = [result for result in results.values() if result.state == "complete"]
                 complete.sort(key=lambda result: (-sum(result.returns[-1]), result.trial))
