@@ -17,6 +17,7 @@ from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
+from animat.recordings.reading import list_recordings
 from animat.robots.host import HostRobot
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
@@ -63,8 +64,6 @@ def source_files(study: Study, base: Path) -> list[Path]:
         raise InvalidArgument("culture: expected one culture, got many; animat study runs such a study")
     if study.culture.kind != "files":
         return []
-    from animat.recordings.reading import list_recordings
-
     return list_recordings([base / name for name in study.culture.files])
 
 

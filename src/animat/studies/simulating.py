@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
@@ -126,8 +128,6 @@ def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
     """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
-    from safetensors.numpy import save
-
     arrays = {name: np.ascontiguousarray(array) for name, array in vars(timeline.simulators).items()}
     metadata = {
         "kind": type(timeline.simulators).__name__,
@@ -147,8 +147,6 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
 
 def load_timeline(path: Path) -> SimulatorTimeline:
     """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(path, framework="numpy") as file:
             metadata: dict[str, Any] = json.loads(file.metadata()["animat"])

@@ -29,7 +29,7 @@ from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
 from animat.tuning.journal import TrialResult, read_journal, write_journal
 from animat.tuning.results import Final, TuningResult, write_results
-from animat.tuning.search import Search, expect_optuna, importance_of
+from animat.tuning.search import Search, expect_optuna
 from animat.tuning.space import choices_of, first_settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
@@ -83,7 +83,7 @@ def tune(
         trials = run.search()
         finals = run.finals(trials)
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        return write_results(folder, tuning, trials, finals, importance_of(tuning.space, trials))
+        return write_results(folder, tuning, trials, finals)
 
 
 class _Run:
