@@ -132,9 +132,8 @@ def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str,
     write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
     write_records(folder / SUMMARY, OverCultures, summary)
     write_named_records(folder / SCORES, scores, Score, "culture")
-    parquet = (folder / SCORES).with_suffix(".parquet")
-    is_written = write_parquet(parquet, scores, Score, "culture")
-    return CulturesRun(folder, finished, failed, comparisons, summary, parquet if is_written else None)
+    parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), scores, Score, "culture")
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
 
 
 @contextmanager

@@ -49,7 +49,9 @@ def plan_study(study: Study, base: Path) -> list[Job]:
             task = Evaluate(study, spec, arm)
             of_robot.append(Job(f"evaluate/{spec.name}/{arm.slug}", task, (*names, *neurons), 4))
         for kind in kinds_of(study):
-            plain = plain_arm(study, kind)
+            # The most plainly trained arm of a kind represents it.
+            arms = study.arms_of(kind)
+            plain = max(arms, key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))
             name = f"controls/{spec.name}/{kind.thresholds}"
             of_robot.append(Job(name, Control(study, spec, plain), (*groups[plain], *neurons), 15))
         resolution = spec.optimum_resolution or study.optimum_resolution
@@ -64,8 +66,3 @@ def plan_study(study: Study, base: Path) -> list[Job]:
     pictures = [job.name for job in jobs if job.name.startswith("pictures/")]
     jobs.append(Job("report", Publish(study), (*pictures, "tables"), 1, (MANIFEST,)))
     return jobs
-
-
-def plain_arm(study: Study, kind: Arm) -> Arm:
-    """The most plainly trained arm of a kind, whose policies represent it."""
-    return max(study.arms_of(kind), key=lambda arm: (arm.trained, arm.delivery == "chosen", arm.shadowing is True))

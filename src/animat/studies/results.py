@@ -74,12 +74,12 @@ def write_named_records(path: Path, named: Mapping[str, Iterable[Any]], kind: ty
 MISSING = f"fastparquet is not installed: {install_command('parquet')}"
 
 
-def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, name: str) -> bool:
-    """Write records as `write_named_records` does, with None as NaN; returns False if fastparquet is missing."""
+def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, name: str) -> Path | None:
+    """Write records as `write_named_records` does, with None as NaN; returns None if fastparquet is missing."""
     try:
         import fastparquet
     except ImportError:
-        return False
+        return None
     import pandas as pd
 
     hints = get_type_hints(kind)
@@ -91,4 +91,4 @@ def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, na
     encodings = {column: "utf8" if values.dtype == object else "infer" for column, values in columns.items()}
     with atomic_write(path) as beside:
         fastparquet.write(str(beside), pd.DataFrame(columns), object_encoding=encodings, write_index=False)
-    return True
+    return path

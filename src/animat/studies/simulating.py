@@ -90,16 +90,12 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
 def _moved(study: Study, start_min: list[float]) -> list[Finding]:
     """A finding for each comparison at a minute at which no recording starts."""
     settled = study.at_recordings(start_min).comparisons
-    return [
-        Finding(
-            "comparison-minute",
-            "note",
-            f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min",
-            new.at_min,
-        )
-        for old, new in zip(study.comparisons, settled, strict=True)
-        if old.at_min is not None and old.at_min != new.at_min
-    ]
+    moved = []
+    for old, new in zip(study.comparisons, settled, strict=True):
+        if old.at_min is not None and old.at_min != new.at_min:
+            text = f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min"
+            moved.append(Finding("comparison-minute", "note", text, new.at_min))
+    return moved
 
 
 def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Responses]:
