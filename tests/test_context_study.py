@@ -92,7 +92,7 @@ def test_a_recording_is_over_when_the_next_one_is_due(
     monkeypatch.setattr("animat.cultures.series._check_recordings", looked_for)
     # Recordings that take too long are refused before earlier ones are looked for.
     with pytest.raises(NotImplementedError, match="earlier recordings"):
-        RecordCulture(1, n_commands).run(tmp_path, Silent())
+        RecordCulture(ContextStudy(), 1, n_commands).run(tmp_path, Silent())
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ def test_the_papers_burst_rule_is_reported_with_what_it_would_leave_out() -> Non
 
 def test_a_caption_promises_a_threshold_only_where_there_is_one() -> None:
     with_bursts, without = responses_of([1.0] * 20, bursts_hz=(9.0,) * 5), responses_of([1.0] * 20)
-    _, caption = CULTURE["bursts"]
+    caption = CULTURE["bursts"].text
     assert "to the right of the dashed threshold" in caption.format(**_facts_of_culture([with_bursts]))
     assert "so there is no threshold." in caption.format(**_facts_of_culture([without]))
 

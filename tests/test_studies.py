@@ -334,7 +334,7 @@ def test_a_virtual_culture_s_recordings_are_the_same_files_wherever_it_was_kille
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rule = SelectionRule(recording_sites=150, stimulation_sites=16, patterns=100)
-    monkeypatch.setattr("animat.cultures.virtual.VirtualCulture", partial(small_culture, rule=rule))
+    monkeypatch.setattr("animat.studies.recording.VirtualCulture", partial(small_culture, rule=rule))
     study = Study(culture=Source(sessions=2, interval_min=2.0, trials=2))
 
     def record(name: str) -> Receipt:
@@ -406,7 +406,7 @@ def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
 @pytest.mark.oracle
 def test_the_first_recording_is_the_first_in_time_not_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`recording_0010_min` comes before `recording_02.5_min` by name."""
-    monkeypatch.setattr("animat.studies.pictures.save_figure", lambda figure, path: path)
+    monkeypatch.setattr("animat.studies.figures.save_figure", lambda figure, path: path)
     folder = tmp_path / "study"
     for minute, channels in ((2.5, 24), (10.0, 16)):
         made = synthetic_recording(1, patterns=20, channels=channels)

@@ -5,6 +5,19 @@ Placeholders in braces are filled in for the study (`animat.studies.publishing`)
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+from animat.studies.places import RESPONSES
+
+
+class Caption(NamedTuple):
+    """The title and caption of a figure, and the files of its numbers; `{of}` is the robot's name."""
+
+    title: str
+    text: str
+    numbers: tuple[str, ...] = ()
+
+
 HEADLINE = (
     "Each row is an arm, described in the table below, at the last recording that it was evaluated on; further right "
     "is better. Small dots: each policy's mean return. Large dot: their interquartile mean (the mean of the middle "
@@ -12,46 +25,52 @@ HEADLINE = (
     "Bars: the optimal return, which no controller can exceed, where it is known. {policies} policies per arm."
 )
 
-CULTURE: dict[str, tuple[str, str]] = {
-    "array": (
+CULTURE = {
+    "array": Caption(
         "the array",
         "The array from above. Each dot is a recording site; the brighter it is, the more it fires. A circle marks "
         "each stimulated electrode. The first recording, {channels} channels.",
+        ("tables/culture-array.csv",),
     ),
-    "raster": (
+    "raster": Caption(
         "spikes around stimuli",
         "Above: each spike of a short stretch of the first recording; rows are channels. Below: what follows each "
         "stimulus, one row per stimulus; the darker, the more spikes. Responses are read between the two yellow lines.",
     ),
-    "psth": (
+    "psth": Caption(
         "post-stimulus time histogram",
         "Mean rate per channel against the time from the stimulus, over all stimuli of the first recording, whose "
         "number is given above. Responses are read in the shaded window.",
+        ("tables/culture-psth.csv",),
     ),
-    "bursts": (
+    "bursts": Caption(
         "burst separation",
         "The {responses} responses of the first recording: how often each size x occurs, x against the share of "
         "active channels, one dot per response, and how often each share occurs. A burst activates many channels at "
         "once. {cut}",
+        ("tables/culture-bursts.csv", RESPONSES),
     ),
-    "responses": (
+    "responses": Caption(
         "responses to each stimulus",
         "How large the responses to each stimulus are, without bursts (n: how many). The further apart the histograms "
         "lie, the more a controller can do. The dashed line is P50, the median over all stimuli. These are the numbers "
         "of the first recording, from which its neuron simulator is made. Outlines, with a dotted P50: the last "
         "recording, where there are several; they show how far the culture moved in between.",
+        (RESPONSES, "tables/culture-conditions.csv"),
     ),
-    "over-time": (
+    "over-time": Caption(
         "each stimulus over time",
         "One column per stimulus, one row per recording, from top to bottom; the mark is the median. A histogram that "
         "moves left means that the culture responds less. Bursts are left out. Shares are of all responses; the title "
         "states how many lie beyond the axis, if any.",
+        (RESPONSES, "tables/culture-conditions.csv"),
     ),
-    "drift": (
+    "drift": Caption(
         "drift",
         "Above: percentiles of all non-burst responses. Middle: how often the response to each stimulus exceeds their "
         "median; curves that converge mean that control is lost. Below: the share of bursts. {recordings} recordings "
         "of about {responses} responses each.",
+        ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
     ),
 }
 
@@ -62,8 +81,8 @@ BURSTS = (
 NO_BURSTS = "Here no response is set apart as a burst, so there is no threshold."
 """Of `bursts`, for {cut}."""
 
-ROBOT: dict[str, tuple[str, str]] = {
-    "learning": (
+ROBOT = {
+    "learning": Caption(
         "learning curves",
         "Return against iterations of training; up is better. Thin: each of {policies} policies. Thick: their mean "
         "with its 95 % bootstrap interval. Each point is the mean over the episodes that ended within the {round} "
@@ -71,35 +90,40 @@ ROBOT: dict[str, tuple[str, str]] = {
         "episodes to end are not a representative sample. Actions are drawn. Lines: random actions and the optimal "
         "return with the simulator in use, which changes with it (from the second recording on: on a coarse grid). A "
         "control has no such return: whatever it chooses is as good as random.",
+        ("tables/{of}-learning.csv", "tables/learning-curves.csv"),
     ),
-    "comparisons": (
+    "comparisons": Caption(
         "comparisons",
         "One column per comparison, {policies} policies per side, each a point: its mean return over the episodes. "
         "Boxes: quartiles and median; whiskers reach to the furthest point within 1.5 times the box's height. Above: "
         "with random actions and the optimal return. Below: enlarged. Stars: * p < 0.05, ** p < 0.01, *** p < 0.001, "
         "n.s. otherwise; p is two-sided, Mann-Whitney, normal approximation, corrected by Holm: “p corrected” in the "
         "table. Score, under each arm: (mean − random) / (optimal − random).",
+        ("tables/comparisons.csv",),
     ),
-    "over-time": (
+    "over-time": Caption(
         "at every recording",
         "The same policies on the simulator of each recording: median and quartiles over {policies} policies of "
         "{episodes_over_time} episodes each, with the optimal return. A fall that the optimal return shares is due to "
         "the simulator: to the culture, and to what its bins keep of it. A steeper fall is due to the policy. The "
         "optimal return at every recording is on a coarse grid, which can lie slightly below the fine one, and is left "
         "out for mappings without steps, such as linear.",
+        ("tables/{of}-over-time.csv",),
     ),
-    "controls": (
+    "controls": Caption(
         "controls",
         "One row per agent; further right is better. If a control does as well as trained policies, what it lacks was "
         "not needed. Whiskers: standard errors over policies (for a control of one actor: over episodes), of "
         "{episodes} episodes each where no comparison says otherwise.",
+        ("tables/controls.csv",),
     ),
-    "paths": (
+    "paths": Caption(
         "episodes",
         "One episode of each policy at the last recording. Blue: it ended well (on cartpole it lasted to the limit, on "
         "navigation it arrived); orange: it did not. These are only examples; rely on the figures above.",
+        ("tables/{of}-paths.csv",),
     ),
-    "frames": (
+    "frames": Caption(
         "frames",
         "From the start of an episode to its end; the number under a frame is the iteration. One episode per arm, that "
         "of median length: an example.",

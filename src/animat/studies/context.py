@@ -5,25 +5,27 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
-import shutil
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+from animat.cultures.tissue.parameters import REVISION
 from animat.differences import with_fingerprint
-from animat.execution.jobs import Job, Jobs, expect_workers
-from animat.execution.task import UNFINISHED
-from animat.progress import Progress, Silent
+from animat.execution.jobs import Job, expect_workers
+from animat.progress import Progress
 from animat.report.results import ContextRow, LostRow
 from animat.robots.registry import robot_named
 from animat.studies.context_tasks import MEASURED, SIMULATED, ContextStudy, Judge, Measure, RecordCulture, TrainPolicies
 from animat.studies.folder import MANIFEST, claim_folder
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
+from animat.studies.run import run_jobs
 from animat.training.settings import LEARNER
 
 TABLE, WHOSE_WORK = "context.csv", "whose-work.csv"
+_PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba")
 
 
 @dataclass(frozen=True)
@@ -50,67 +52,49 @@ def run_context_study(
 ) -> ContextRun:
     """Run the study in a folder, or resume it there: finished jobs are not run again.
 
-    Args:
-        study: the specification.
-        folder: for all files; created if it is missing.
-        workers, executor, progress: as for `animat.studies.run.run_study`.
-
-    Raises:
-        Mismatch: if the folder belongs to another study, holds other files, or is in use by another run.
-        InvalidFile: if a file cannot be read or written.
-        InvalidArgument: for fewer than one worker, or workers together with an executor.
-        AnimatError: if a job failed; its message names the job.
+    Arguments and errors are those of `animat.studies.run.run_study`.
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
-    manifest = _describe(study)
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
+    manifest = with_fingerprint({"context study": asdict(study), "versions": versions})
     cultures = [f"culture-{culture}" for culture in study.cultures]
+    rows: list[ContextRow] = []
+    lost: list[LostRow] = []
     with claim_folder(folder, "study", manifest, MANIFEST, {}, (*cultures, RECEIPTS)):
-        left = Jobs(plan_context_study(study), folder, folder / RECEIPTS, manifest["fingerprint"])
-        took_s = {}
-        if left.waiting:
-            took_s = left.run(workers=workers, executor=executor, progress=progress or Silent())
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        pairs = [(culture, robot) for robot in study.robots for culture in study.cultures]
-        rows = tuple(_row(folder, *pair) for pair in pairs)
-        lost = tuple(row for pair in pairs for row in _lost(folder, *pair))
+        jobs = plan_context_study(study)
+        took_s = run_jobs(jobs, folder, manifest["fingerprint"], progress, workers=workers, executor=executor)
+        for robot, culture in product(study.robots, study.cultures):
+            files = (folder / f"culture-{culture}" / robot / name for name in (SIMULATED, MEASURED))
+            simulated, measured = (json.loads(file.read_text()) for file in files)
+            rows.append(_row(culture, robot, simulated, measured))
+            lost += _lost(culture, robot, simulated)
         write_records(folder / TABLE, ContextRow, rows)
         write_records(folder / WHOSE_WORK, LostRow, lost)
-    return ContextRun(folder, rows, lost, took_s)
-
-
-def _describe(study: ContextStudy) -> dict[str, Any]:
-    from animat.cultures.tissue.parameters import REVISION
-
-    packages = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba")
-    versions = {name: importlib.metadata.version(name) for name in packages}
-    versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
-    return with_fingerprint({"context study": asdict(study), "versions": versions})
+    return ContextRun(folder, tuple(rows), tuple(lost), took_s)
 
 
 def plan_context_study(study: ContextStudy) -> list[Job]:
     """All jobs of the study."""
     jobs = []
+    commands = {robot: robot_named(robot).n_commands for robot in study.robots}
     for culture in study.cultures:
-        commands = {robot: robot_named(robot).n_commands for robot in study.robots}
         records = {n: f"record/{culture}" + (f"/{n}-commands" if n > 1 else "") for n in sorted({*commands.values()})}
         jobs += [Job(name, RecordCulture(study, culture, n), (), 60) for n, name in records.items()]
-        for robot in study.robots:
-            recorded = records[commands[robot]]
+        for robot, n in commands.items():
             trained = f"train/{culture}/{robot}"
             jobs += [
-                Job(trained, TrainPolicies(study, culture, robot), (recorded,), 30),
+                Job(trained, TrainPolicies(study, culture, robot), (records[n],), 30),
                 Job(f"judge/{culture}/{robot}", Judge(study, culture, robot), (trained,), 100),
                 Job(f"measure/{culture}/{robot}", Measure(study, culture, robot), (trained,), 100),
             ]
     return jobs
 
 
-def _row(folder: Path, culture: int, robot: str) -> ContextRow:
-    evaluation = _read(folder, culture, robot, SIMULATED)
-    session_rows = _read(folder, culture, robot, MEASURED)["rows"]
+def _row(culture: int, robot: str, evaluation: dict[str, Any], session: dict[str, Any]) -> ContextRow:
     simulated = {row["name"]: row["mean_return"] for row in evaluation["rows"]}
-    measured = {row["name"]: row["measured"] for row in session_rows}
+    measured = {row["name"]: row["measured"] for row in session["rows"]}
     context = evaluation["context"] or {}
     gap, score = context.get("context_gap") or {}, evaluation["context_score"] or {}
     information = evaluation["whose_work"]["rows"][0]["goal_information"]
@@ -134,18 +118,14 @@ def _row(folder: Path, culture: int, robot: str) -> ContextRow:
         measured_heuristic=measured.get("heuristic"),
         measured_coupling=measured.get("coupling"),
         # The first row is that of all policies, or of the only one.
-        measured_policies=session_rows[0]["measured"],
-        predicted_policies=session_rows[0]["predicted"],
+        measured_policies=session["rows"][0]["measured"],
+        predicted_policies=session["rows"][0]["predicted"],
     )
 
 
-def _lost(folder: Path, culture: int, robot: str) -> list[LostRow]:
-    _, *interventions = _read(folder, culture, robot, SIMULATED)["whose_work"]["rows"]
+def _lost(culture: int, robot: str, evaluation: dict[str, Any]) -> list[LostRow]:
+    _, *interventions = evaluation["whose_work"]["rows"]
     return [
         LostRow(culture, robot, row["name"], row["mean_return"], *(row["lost"][of] for of in ("value", "low", "high")))
         for row in interventions
     ]
-
-
-def _read(folder: Path, culture: int, robot: str, name: str) -> Any:
-    return json.loads((folder / f"culture-{culture}" / robot / name).read_text())

@@ -8,31 +8,35 @@ from pathlib import Path
 import numpy as np
 
 from animat.report.context import draw_context, draw_whose_work
-from animat.report.html import Columns, Picture, Section, Table, cell, columns_of, table_of, write_page
+from animat.report.html import Columns, Section, Table, cell, columns_of, table_of, write_page
 from animat.report.results import ContextRow, LostRow
-from animat.report.style import FORMATS, save_figure
 from animat.studies.context import TABLE, WHOSE_WORK, ContextRun
 from animat.studies.context_tasks import ContextStudy
+from animat.studies.figures import picture_of, save_formats
 from animat.studies.places import REPORT
-
-_GAPS, _LOST = "context", "whose-work"
 
 
 def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
     """Write the page and its figures."""
     by_robot = {robot: [row for row in found.rows if row.robot == robot] for robot in study.robots}
-    lost = _shares_lost(found.rows, found.lost)
-    figures = {_GAPS: draw_context(by_robot)} | ({_LOST: draw_whose_work(lost)} if lost else {})
-    for name, figure in figures.items():
-        for ending in FORMATS:
-            save_figure(figure, found.folder / f"{name}.{ending}")
+    save_formats(draw_context(by_robot), found.folder, "context")
+    gaps = picture_of(
+        found.folder,
+        "context",
+        "Context gaps and context scores",
+        "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
+        f"random); from the dashed line on, a task counts as needing context. Right: how far the {study.policies} "
+        "policies get from that reflex to the optimum. Each point is a culture, with its 95 % interval on the "
+        "culture's simulator; an interval that reaches the frame extends beyond it. Triangles: lower bounds, as the "
+        "optimal return is not known.",
+        TABLE,
+    )
+    summaries = tuple((robot, summarise_robot(rows)) for robot, rows in by_robot.items())
     sections = [
-        Section("Results in short", (summarise_cultures(by_robot),),
-                points=tuple((robot, summarise_robot(rows)) for robot, rows in by_robot.items()),
-                pictures=(_context_picture(study, found.folder),)),
-        _whose_work(study, found, lost),
+        Section("Results in short", (summarise_cultures(by_robot),), summaries, pictures=(gaps,)),
+        _whose_work(study, found),
         Section("Every culture", tables=(_on_the_simulator(found.rows), _on_the_culture(found.rows))),
-    ]  # fmt: skip
+    ]
     cultures = f"Virtual culture{'' if len(study.cultures) == 1 else 's'} {', '.join(map(str, study.cultures))}"
     lead = f"{cultures}; {study.policies} policies of each robot on each, on the simulator and in closed loop."
     return write_page(
@@ -40,15 +44,30 @@ def write_context_page(study: ContextStudy, found: ContextRun) -> Path:
     )
 
 
-def _whose_work(study: ContextStudy, found: ContextRun, lost: dict[str, dict[str, list[float]]]) -> Section:
+def _whose_work(study: ContextStudy, found: ContextRun) -> Section:
     """What the policies lose, on cultures on which they are clearly better than random stimuli."""
     left_out = [f"{row.robot} on culture {row.culture}" for row in found.rows if not _beats_random(row)]
     note = (f"Left out, as the policies are hardly above random stimuli: {', '.join(left_out)}.",) if left_out else ()
+    lost = _shares_lost(found.rows, found.lost)
     if not lost:
         return Section("Whose work is it?", note)
-    return Section(
-        "Whose work is it?", note, pictures=(_lost_picture(study, found.folder),), tables=(_lost_table(lost),)
+    save_formats(draw_whose_work(lost), found.folder, "whose-work")
+    picture = picture_of(
+        found.folder,
+        "whose-work",
+        "Return lost by each intervention",
+        "The same policies with a change to the culture, to its stimuli, or to how its responses are used. 0: nothing "
+        "is lost; 1: the policies' whole advantage over random stimuli is lost; below 0: something is gained. Each "
+        f"point is a culture: the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator.",
+        WHOSE_WORK,
     )
+    names = dict.fromkeys(name for each in lost.values() for name in each)
+    rows = tuple(
+        (name, *(float(np.mean(each[name])) if name in each else None for each in lost.values())) for name in names
+    )
+    mean = "Mean over cultures of the return lost, as a fraction of the policies' advantage over random stimuli."
+    table = Table("Return lost", ("", *lost), rows, note=mean, beside=WHOSE_WORK)
+    return Section("Whose work is it?", note, pictures=(picture,), tables=(table,))
 
 
 def _beats_random(row: ContextRow) -> bool:
@@ -102,37 +121,6 @@ def _shares_lost(rows: Sequence[ContextRow], lost: Sequence[LostRow]) -> dict[st
         if span is not None:
             shares.setdefault(row.robot, {}).setdefault(row.intervention, []).append(row.lost / span)
     return shares
-
-
-def _context_picture(study: ContextStudy, folder: Path) -> Picture:
-    return Picture(
-        folder / f"{_GAPS}.png",
-        "Context gaps and context scores",
-        "Left: how much of a task the best reflex leaves undone, (optimal return − best coupling) / (optimal return − "
-        f"random); from the dashed line on, a task counts as needing context. Right: how far the {study.policies} "
-        "policies get from that reflex to the optimum. Each point is a culture, with its 95 % interval on the "
-        "culture's simulator; an interval that reaches the frame extends beyond it. Triangles: lower bounds, as the "
-        "optimal return is not known.",
-        (*(f"{_GAPS}.{ending}" for ending in FORMATS[1:]), TABLE),
-    )
-
-
-def _lost_picture(study: ContextStudy, folder: Path) -> Picture:
-    return Picture(
-        folder / f"{_LOST}.png",
-        "Return lost by each intervention",
-        "The same policies with a change to the culture, to its stimuli, or to how its responses are used. 0: nothing "
-        "is lost; 1: the policies' whole advantage over random stimuli is lost; below 0: something is gained. Each "
-        f"point is a culture: the mean of {study.policies} policies, {study.episodes} episodes each, on its simulator.",
-        (*(f"{_LOST}.{ending}" for ending in FORMATS[1:]), WHOSE_WORK),
-    )
-
-
-def _lost_table(lost: dict[str, dict[str, list[float]]]) -> Table:
-    names = list(dict.fromkeys(name for each in lost.values() for name in each))
-    rows = [(name, *(float(np.mean(each[name])) if name in each else None for each in lost.values())) for name in names]
-    note = "Mean over cultures of the return lost, as a fraction of the policies' advantage over random stimuli."
-    return Table("Return lost", ("", *lost), tuple(rows), note=note, beside=WHOSE_WORK)
 
 
 def _on_the_simulator(rows: Sequence[ContextRow]) -> Table:

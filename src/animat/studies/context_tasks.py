@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, final
+from typing import final
 
+from animat.coding.mapping import mapping_named
+from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, InvalidArgument
+from animat.evaluation.table import evaluate
 from animat.execution.task import UNFINISHED, Task
 from animat.execution.training_task import train_alone
+from animat.neurons.timeline import fit_timeline
 from animat.progress import EqualPhases, Progress
+from animat.reality_gap import Calibration, run_policies
+from animat.recordings.reading import read_sources
 from animat.records import Positive, Seed, Whole, record, write_json
 from animat.responses.readouts import DEFAULT_READOUTS
 from animat.responses.responses import Responses
+from animat.responses.series import extract_series
+from animat.robots.host import HostRobot
+from animat.robots.registry import robot_named
+from animat.stimulation import protocol
 from animat.studies.task import draw_seed
-
-if TYPE_CHECKING:
-    from animat.stimulation.protocol import Protocol
+from animat.studies.training import work_on
+from animat.training.policy import load_policies
+from animat.training.specification import Training
 
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
 SIMULATED, MEASURED = "simulated.json", "measured.json"
@@ -51,9 +63,6 @@ class ContextStudy:
     seed: Seed = 1
 
     def __post_init__(self) -> None:
-        from animat.robots.host import HostRobot
-        from animat.robots.registry import robot_named
-
         for name in ("cultures", "robots"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
@@ -64,17 +73,10 @@ class ContextStudy:
                 raise InvalidArgument(f"robots: expected JAX robots with one or two commands, got {name!r}")
 
 
-def quick_context_study(cultures: Sequence[int], seed: int = 1) -> ContextStudy:
-    """All steps at a small scale: a first look, not a result."""
-    return ContextStudy(
-        cultures=tuple(cultures),
-        policies=2,
-        iterations_share=0.1,
-        episodes=30,
-        episodes_measured=1,
-        optimum_resolution=0.25,
-        seed=seed,
-    )
+quick_context_study = partial(
+    ContextStudy, policies=2, iterations_share=0.1, episodes=30, episodes_measured=1, optimum_resolution=0.25
+)
+"""All steps at a small scale: a first look, not a result."""
 
 
 @dataclass(frozen=True)
@@ -88,13 +90,10 @@ class ContextTask(Task):
     def grows_with(self) -> Mapping[str, object]:
         return {"policies": self.study.policies, "episodes": self.study.episodes}
 
-    def culture_folder(self, folder: Path) -> Path:
-        return folder / f"culture-{self.culture}"
-
     def recordings(self, folder: Path, n_commands: int) -> Path:
         """The folder of the culture's recordings for robots with this number of commands."""
         name = RECORDINGS if n_commands == 1 else f"{RECORDINGS}-{n_commands}-commands"
-        return self.culture_folder(folder) / name
+        return folder / f"culture-{self.culture}" / name
 
 
 @final
@@ -105,18 +104,9 @@ class RecordCulture(ContextTask):
     n_commands: int = 1
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
-        from animat.cultures.virtual import VirtualCulture
-
-        out = self.recordings(folder, self.n_commands)
-        files = record_series(
-            lambda: VirtualCulture(self.culture),
-            protocol_for(self.n_commands),
-            out,
-            sessions=2,
-            progress=progress,
-        ).files
-        return [*files, out / STATE_FILE, out / SELECTION_FILE]
+        out, stimuli = self.recordings(folder, self.n_commands), protocol_for(self.n_commands)
+        series = record_series(lambda: VirtualCulture(self.culture), stimuli, out, sessions=2, progress=progress)
+        return [*series.files, out / STATE_FILE, out / SELECTION_FILE]
 
 
 @dataclass(frozen=True)
@@ -127,15 +117,10 @@ class RobotTask(ContextTask):
 
     @property
     def n_commands(self) -> int:
-        from animat.robots.registry import robot_named
-
         return robot_named(self.robot).n_commands
 
     def series(self, folder: Path) -> list[Responses]:
         """The responses of the culture's recordings on the robot's readouts."""
-        from animat.recordings.reading import read_sources
-        from animat.responses.series import extract_series
-
         recordings = read_sources([self.recordings(folder, self.n_commands)])
         return extract_series(recordings, readouts=DEFAULT_READOUTS[self.n_commands])
 
@@ -145,7 +130,7 @@ class RobotTask(ContextTask):
 
     def path(self, folder: Path, name: str) -> Path:
         """A file or folder of this robot on this culture."""
-        return self.culture_folder(folder) / self.robot / name
+        return folder / f"culture-{self.culture}" / self.robot / name
 
 
 @final
@@ -154,12 +139,6 @@ class TrainPolicies(RobotTask):
     """Train the policies as `animat train` does by default, resuming where a killed run stopped."""
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        from animat.coding.mapping import mapping_named
-        from animat.neurons.timeline import fit_timeline
-        from animat.robots.registry import robot_named
-        from animat.studies.training import work_on
-        from animat.training.specification import Training
-
         robot, timeline = robot_named(self.robot), fit_timeline(self.series(folder))
         training = Training(
             robot=robot,
@@ -180,10 +159,6 @@ class Judge(RobotTask):
     """Evaluate on the simulator: policies, controls, coupling, optimum, context gap and score, and whose work it is."""
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        from animat.evaluation.table import evaluate
-        from animat.neurons.timeline import fit_timeline
-        from animat.training.policy import load_policies
-
         evaluation = evaluate(
             load_policies(self.path(folder, POLICIES)),
             fit_timeline(self.series(folder)),
@@ -202,11 +177,6 @@ class Measure(RobotTask):
     """Run in closed loop on the culture from where its recordings ended, controls between the policies' episodes."""
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        from animat.cultures.series import STATE_FILE
-        from animat.cultures.virtual import VirtualCulture
-        from animat.reality_gap import Calibration, run_policies
-        from animat.training.policy import load_policies
-
         policies = load_policies(self.path(folder, POLICIES))
         calibration = Calibration.of_series(self.series(folder), next(iter(policies.values())))
         session = self.path(folder, SESSION)
@@ -214,7 +184,7 @@ class Measure(RobotTask):
         shutil.rmtree(session, ignore_errors=True)
         culture = VirtualCulture(self.culture)
         culture.restore_state(self.recordings(folder, self.n_commands) / STATE_FILE)
-        protocol = protocol_for(self.n_commands)
+        stimuli = protocol_for(self.n_commands)
         with culture:
             gap = run_policies(
                 policies,
@@ -224,8 +194,8 @@ class Measure(RobotTask):
                 episodes=self.study.episodes_measured,
                 with_coupling=True,
                 seed=self.seed_for("measure"),
-                pulse=protocol.pulse,
-                patterns=protocol.patterns,
+                pulse=stimuli.pulse,
+                patterns=stimuli.patterns,
                 # Best coupling, prediction, closed loop, optimal return.
                 progress=EqualPhases(progress, 4),
             )
@@ -237,8 +207,6 @@ class Measure(RobotTask):
         return [write_json(self.path(folder, MEASURED), kept)]
 
 
-def protocol_for(n_commands: int) -> Protocol:
+def protocol_for(n_commands: int) -> protocol.Protocol:
     """The protocol of recordings for robots with this number of commands, as in `animat record`."""
-    from animat.stimulation import protocol
-
     return protocol.CLOSED_LOOP if n_commands == 1 else protocol.TWO_COMMANDS

@@ -118,7 +118,6 @@ def run_over_cultures(
 
 
 def _write_manifest(folder: Path, names: Iterable[str], failed: Mapping[str, str]) -> None:
-    """Write the names of the cultures' folders, and the errors of those that failed."""
     write_whole(folder / MANIFEST, json.dumps({"cultures": list(names), "failed": failed}, indent=1) + "\n")
 
 
@@ -129,14 +128,12 @@ def _write_tables(folder: Path, finished: dict[str, StudyRun], failed: dict[str,
     results = {name: read_typed(results_file(each.folder), Results) for name, each in finished.items()}
     comparisons = {name: each.comparisons for name, each in results.items()}
     summary = over_cultures(list(comparisons.values()))
-    compared = [(name, row) for name, rows in comparisons.items() for row in rows]
-    scores = [(name, score) for name, each in results.items() for score in each.scores]
-    write_named_records(folder / COMPARISONS, compared, ComparedReturns, "culture")
+    scores = {name: each.scores for name, each in results.items()}
+    write_named_records(folder / COMPARISONS, comparisons, ComparedReturns, "culture")
     write_records(folder / SUMMARY, OverCultures, summary)
     write_named_records(folder / SCORES, scores, Score, "culture")
-    parquet = (folder / SCORES).with_suffix(".parquet")
-    is_written = write_parquet(parquet, scores, Score, "culture")
-    return CulturesRun(folder, finished, failed, comparisons, summary, parquet if is_written else None)
+    parquet = write_parquet((folder / SCORES).with_suffix(".parquet"), scores, Score, "culture")
+    return CulturesRun(folder, finished, failed, comparisons, summary, parquet)
 
 
 @contextmanager
@@ -157,94 +154,74 @@ def _run_side_by_side(
     runs: Mapping[str, Callable[..., StudyRun]], at_once: int, shared: Executor | None, progress: Progress
 ) -> tuple[dict[str, StudyRun], dict[str, str]]:
     """Run studies, `at_once` at a time; returns the finished ones and the errors of the others, in their order."""
-    finished: dict[str, StudyRun] = {}
-    failed: dict[str, str] = {}
-    total = _TotalProgress(progress, len(runs))
+    ended = set[str]()
+    reporting, stopped = threading.Lock(), threading.Event()
+
+    def report() -> None:
+        if stopped.is_set():
+            # This ends the study that reports.
+            raise AnimatError("stopped")
+        with reporting:
+            running = [(name, share.done) for name, share in shares.items() if share.done and name not in ended]
+            parts = [f"{len(ended)} of {len(runs)} cultures", *(f"{name} {100 * done:.0f} %" for name, done in running)]
+            progress.update(len(ended) + sum(done for _, done in running), len(runs), "; ".join(parts))
+
+    shares = {name: _Share(report) for name in runs}
     with ThreadPoolExecutor(min(at_once, len(runs)), "culture") as threads:
-        futures = {threads.submit(run, progress=_StudyProgress(total, name)): name for name, run in runs.items()}
+        futures = {threads.submit(run, progress=shares[name]): name for name, run in runs.items()}
         try:
             for future in as_completed(futures):
-                name = futures[future]
-                try:
-                    finished[name] = future.result()
-                except AnimatError as error:
-                    failed[name] = str(error)
-                total.end(name)
+                if not isinstance(future.exception(), AnimatError):
+                    future.result()
+                with reporting:
+                    ended.add(futures[future])
+                report()
         except BaseException:
-            total.is_stopped = True
+            stopped.set()
             threads.shutdown(wait=False, cancel_futures=True)
             if isinstance(shared, PinnedProcesses):
                 # Otherwise the studies would wait for their running jobs.
                 shared.kill_workers()
             raise
-    ordered = {name: finished[name] for name in runs if name in finished}
-    return ordered, {name: failed[name] for name in runs if name in failed}
+    errors = {name: future.exception() for future, name in futures.items()}
+    finished = {name: future.result() for future, name in futures.items() if errors[name] is None}
+    return finished, {name: str(error) for name, error in errors.items() if error is not None}
 
 
-class _TotalProgress:
-    """The progress of many studies together.
+class _Share:
+    """The progress of one of several studies, which reports them all together."""
 
-    Attributes:
-        is_stopped: once set, each study is stopped at its next report.
-    """
-
-    def __init__(self, progress: Progress, studies: int) -> None:
-        self.is_stopped = False
-        self._progress, self._studies = progress, studies
-        self._shares: dict[str, float] = {}
-        self._ended = 0
-        self._lock = threading.Lock()
-
-    def end(self, name: str) -> None:
-        """Count a study that has finished or failed."""
-        with self._lock:
-            self._shares.pop(name, None)
-            self._ended += 1
-            self._report()
-
-    def update(self, name: str, share: float) -> None:
-        """Set the share of a study that is done."""
-        if self.is_stopped:
-            raise AnimatError("stopped")
-        with self._lock:
-            self._shares[name] = share
-            self._report()
-
-    def _report(self) -> None:
-        running = "; ".join(f"{name} {100 * share:.0f} %" for name, share in self._shares.items())
-        note = f"{self._ended} of {self._studies} cultures" + (f"; {running}" if running else "")
-        self._progress.update(self._ended + sum(self._shares.values()), self._studies, note)
-
-
-class _StudyProgress:
-    def __init__(self, total: _TotalProgress, name: str) -> None:
-        self._total, self._name = total, name
+    def __init__(self, report: Callable[[], None]) -> None:
+        self.done = 0.0
+        self._report = report
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        self._total.update(self._name, done / total)
+        self.done = done / total
+        self._report()
 
 
 def over_cultures(comparisons: Sequence[Sequence[ComparedReturns]]) -> tuple[OverCultures, ...]:
     """Each comparison over cultures, all of which have the same comparisons in the same order."""
-    return tuple(_over(rows) for rows in zip(*comparisons, strict=True))
-
-
-def _over(rows: tuple[ComparedReturns, ...]) -> OverCultures:
-    first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
-    low, high = bootstrap_interval(second - first) if len(rows) > 1 else (None, None)
-    return OverCultures(
-        comparison=rows[0].comparison,
-        robot=rows[0].robot,
-        cultures=len(rows),
-        mean_first=float(first.mean()),
-        mean_second=float(second.mean()),
-        difference=float((second - first).mean()),
-        low_95=low,
-        high_95=high,
-        larger_in=int((second > first).sum()),
-        holds_in=sum(row.outcome == SECOND for row in rows),
-        tested=sum(row.outcome != TOO_FEW for row in rows),
-    )
+    found = []
+    for rows in zip(*comparisons, strict=True):
+        first, second = np.array([row.mean_first for row in rows]), np.array([row.mean_second for row in rows])
+        low, high = bootstrap_interval(second - first) if len(rows) > 1 else (None, None)
+        found.append(
+            OverCultures(
+                comparison=rows[0].comparison,
+                robot=rows[0].robot,
+                cultures=len(rows),
+                mean_first=float(first.mean()),
+                mean_second=float(second.mean()),
+                difference=float((second - first).mean()),
+                low_95=low,
+                high_95=high,
+                larger_in=int((second > first).sum()),
+                holds_in=sum(row.outcome == SECOND for row in rows),
+                tested=sum(row.outcome != TOO_FEW for row in rows),
+            )
+        )
+    return tuple(found)
 
 
 def bootstrap_interval(values: Float64[np.ndarray, " cultures"]) -> tuple[float, float]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from animat.report.html import Picture, Section, cell, columns_of, table_of, write_page
+from animat.report.html import Section, cell, columns_of, table_of, write_page
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import OverCultures
-from animat.report.style import FORMATS, save_figure
 from animat.studies.arms import arm_differences, arms_table, summarise_arms
 from animat.studies.cultures import COMPARISONS, SUMMARY, CulturesRun
+from animat.studies.figures import picture_of, save_formats
 from animat.studies.places import REPORT
 from animat.studies.specification import Compared, Study
 from animat.studies.tabulating import LEVEL
@@ -23,13 +23,12 @@ def write_cultures_page(study: Study, found: CulturesRun) -> Path:
         of_each = zip(*found.comparisons.values(), strict=True)
         differences = ([row.mean_second - row.mean_first for row in rows] for rows in of_each)
         figure = draw_over_cultures([*zip(found.summary, differences, strict=True)])
-        for ending in FORMATS:
-            save_figure(figure, found.folder / f"over-cultures.{ending}")
+        save_formats(figure, found.folder, "over-cultures")
         sections.append(_summary(study, found))
-    pages = tuple(f"{name}/{REPORT}" for name in found.finished)
-    points = [(name, f"finished: {page}") for name, page in zip(found.finished, pages, strict=True)]
+    pages = {name: f"{name}/{REPORT}" for name in found.finished}
+    points = [(name, f"finished: {page}") for name, page in pages.items()]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
-    sections.append(Section("Each culture", points=tuple(points), links=pages))
+    sections.append(Section("Each culture", points=tuple(points), links=tuple(pages.values())))
     cultures = f"{len(found.finished)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
     lead = f"{cultures}. {summarise_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
@@ -58,13 +57,14 @@ def _summary(study: Study, found: CulturesRun) -> Section:
         f"Significantly better in: those in which it is better at p < {LEVEL:g}, as in their own reports.",
         beside=SUMMARY,
     )
-    picture = Picture(
-        found.folder / "over-cultures.png",
+    picture = picture_of(
+        found.folder,
+        "over-cultures",
         "Differences on each culture",
         "Each point is a culture: the mean return of the second arm's policies minus that of the first's; to the right "
         "of 0 the second arm is better. Above each row of points: their mean with its 95 % interval, of "
         f"{len(found.comparisons)} cultures.",
-        ("over-cultures.svg", "over-cultures.pdf", COMPARISONS),
+        COMPARISONS,
     )
     return Section("Results in short", (), tuple(points), (arms_table(study), table), (picture,))
 

@@ -34,7 +34,6 @@ def decisions(study: Study, series: Sequence[Responses] = ()) -> tuple[tuple[str
     return (
         *_size_decisions(study),
         *_culture_decisions(study),
-        *_command_decisions(study),
         *_simulator_decisions(study, series),
         *_learning_decisions(study),
     )
@@ -73,9 +72,6 @@ def _culture_decisions(study: Study) -> Iterator[tuple[str, str]]:
             "As published, the pulse's phases do not balance (100 against 80 mV ms). The virtual culture accepts it "
             "unchanged; hardware would not.",
         )
-
-
-def _command_decisions(study: Study) -> Iterator[tuple[str, str]]:
     if any(arm.mapping == "9-thresholds" for arm in study.arms):
         yield (
             "Ten levels without zero",

@@ -4,33 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float64
+from pandas import DataFrame as DataFrame
 
 from animat.evaluation.rollouts import Episodes
 from animat.studies.results import read_arrays, write_arrays
 
-if TYPE_CHECKING:
-    from pandas import DataFrame as DataFrame
-    from pandas import Series
-else:
-    # For annotations alone: pandas is loaded only where tables are used.
-    DataFrame = Any
-
 COLUMNS = ("robot", "arm", "agent", "actor", "at_min", "over_time", "episode", "return", "iterations", "ended")
-"""Columns of the table:
-
-- robot: its name in the study.
-- arm: the arm's name; for controls the mapping they act through (`mapping_label`).
-- agent: `POLICY`, or the control's name.
-- actor: which of several, from 0; for policies p0, p1, ...
-- at_min: the recording whose simulator responds.
-- over_time: whether it is one of the few episodes at every recording.
-- episode: from 0.
-- return, iterations: of the episode.
-- ended: `terminated` by itself, or `truncated` at the episode limit.
+"""Columns of the table, described in docs/studies.md; for controls `arm` is the `mapping_label` they act through.
 
 For robots with a goal (`animat.goals.tally.Outcome`) also: `SUCCEEDED`, 1 or 0; `MARGIN`; and the `SATISFACTION` of
 each objective, from 0, in %.
@@ -45,8 +29,6 @@ def episode_rows(
     ran: Episodes, *, robot: str, arm: str, at_min: float, agent: str = POLICY, over_time: bool = False
 ) -> DataFrame:
     """Episodes that were run together, as rows of the table."""
-    from pandas import DataFrame
-
     actor, episode = (index.ravel() for index in np.indices(ran.returns.shape))
     columns = {
         "robot": robot,
@@ -71,8 +53,6 @@ def episode_rows(
 
 def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
     """Write parts of the table to one file, each column as an array; atomic, and always the same bytes."""
-    import pandas as pd
-
     table = pd.concat(parts)
     columns = {
         name: column.to_numpy(str if pd.api.types.is_string_dtype(column) else None) for name, column in table.items()
@@ -82,19 +62,18 @@ def write_episodes(path: Path, parts: Iterable[DataFrame]) -> Path:
 
 def read_episodes(paths: Iterable[Path]) -> DataFrame:
     """The table, read from its files; raises InvalidFile if one cannot be read."""
-    import pandas as pd
-
     files = [read_arrays(path) for path in paths]
     goal_columns = [name for arrays in files for name in arrays if name.startswith((SUCCEEDED, MARGIN, SATISFACTION))]
     parts = [pd.DataFrame(arrays, columns=list(dict.fromkeys((*COLUMNS, *goal_columns)))) for arrays in files]
     return pd.concat(parts, ignore_index=True)
 
 
+def rows_where(table: DataFrame, **values: object) -> DataFrame:
+    """The rows of the table that have these values in their columns."""
+    return table[np.logical_and.reduce([table[name] == value for name, value in values.items()])]
+
+
 def mean_returns(rows: DataFrame, episodes: int | None = None) -> Float64[np.ndarray, " actors"]:
     """Each actor's mean return over its first episodes, or all: what the paper calls a policy's performance."""
-
-    def mean(of_actor: Series) -> float:
-        return float(of_actor.to_numpy()[:episodes].mean())
-
-    means: Float64[np.ndarray, " actors"] = rows.groupby("actor")["return"].apply(mean).to_numpy(np.float64)
-    return means
+    by_actor = rows.groupby("actor")["return"]
+    return np.array([returns.to_numpy()[:episodes].mean() for _, returns in by_actor], np.float64)

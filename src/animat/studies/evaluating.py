@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from animat.environment import Environment
 from animat.evaluation.controls import controls_of
@@ -17,6 +17,7 @@ from animat.robots.host import HostRobot
 from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
+from animat.studies.results import write_arrays
 from animat.studies.simulating import load_timeline
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask, draw_seed
@@ -38,11 +39,10 @@ class Evaluate(StudyTask):
     arm: Arm
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        study, timeline = as_recorded(self.study, folder)
+        study, timeline, first, last = as_recorded(self.study, folder)
         setting = setting_of(study, self.spec, self.arm, timeline)
         networks = _networks(study, folder, self.spec, self.arm)
         robot, slug, n = self.spec.name, self.arm.slug, study.policies
-        first, last = span_min(timeline)
         parts = []
         for at_min, episodes in study.minutes_of(self.arm, first, last).items():
             ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
@@ -57,7 +57,7 @@ class Evaluate(StudyTask):
         paths = record_paths(setting.environment, setting.simulator(last), networks, n, seed)
         return [
             write_episodes(episodes_file(folder, self.spec, self.arm), parts),
-            paths.save(paths_file(folder, self.spec, self.arm)),
+            write_arrays(paths_file(folder, self.spec, self.arm), vars(paths)),
         ]
 
 
@@ -78,14 +78,13 @@ class Control(StudyTask):
     plain: Arm
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        study, timeline = as_recorded(self.study, folder)
+        study, timeline, first, last = as_recorded(self.study, folder)
         arm, robot = replace(self.plain, delivery="chosen"), self.spec.name
         setting = setting_of(study, self.spec, arm, timeline)
         name = f"controls-{arm.thresholds}"
         through = mapping_label(*arm.kind)
         networks = _networks(study, folder, self.spec, self.plain) if is_usual(self.plain) else None
         parts = []
-        first, last = span_min(timeline)
         minutes = study.optimum_minutes(first, last) if arm.through_neurons else [last]
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
@@ -109,8 +108,7 @@ class Control(StudyTask):
         return [write_episodes(controls_file(folder, self.spec, arm), parts)]
 
 
-@dataclass(frozen=True, eq=False)
-class Setting:
+class Setting(NamedTuple):
     """What policies run in: an environment, the simulators of every minute (None without neurons), action labels."""
 
     environment: Environment[Any]
@@ -139,10 +137,16 @@ def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimel
     return Setting(training.environment(len(timeline.conditions)), timeline, labels)
 
 
-def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | None]:
-    """The study with comparisons at the minutes of its recordings, and their simulators; None without neurons."""
-    timeline = load_timeline(folder / TIMELINE) if study.needs_neurons else None
-    return study.at_recordings([] if timeline is None else timeline.start_min.tolist()), timeline
+def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | None, float, float]:
+    """The study with comparisons at the minutes of its recordings, their simulators, and their first and last minute.
+
+    Without neurons there are no simulators, and both minutes are 0.
+    """
+    if not study.needs_neurons:
+        return study.at_recordings([]), None, 0.0, 0.0
+    timeline = load_timeline(folder / TIMELINE)
+    start_min = timeline.start_min.tolist()
+    return study.at_recordings(start_min), timeline, start_min[0], start_min[-1]
 
 
 def is_usual(arm: Arm) -> bool:
@@ -150,12 +154,11 @@ def is_usual(arm: Arm) -> bool:
     return arm.trained and arm.delivery == "chosen" and arm.through_neurons
 
 
-def span_min(timeline: SimulatorTimeline | None) -> tuple[float, float]:
-    """The minutes of the first and the last recording; 0 without recordings."""
-    return (0.0, 0.0) if timeline is None else (float(timeline.start_min[0]), float(timeline.start_min[-1]))
+def policies_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> list[Policy]:
+    """The policies of an arm on a robot."""
+    out = policies_folder(folder, spec, arm)
+    return [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
 
 
 def _networks(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Networks:
-    out = policies_folder(folder, spec, arm)
-    policies = [Policy.load(out / f"p{i}.safetensors") for i in range(study.policies)]
-    return networks_of(policies, greedy=study.actions == "most probable")
+    return networks_of(policies_of(study, folder, spec, arm), greedy=study.actions == "most probable")

@@ -58,10 +58,8 @@ def write_conditions(folder: Path, series: Sequence[Responses]) -> Path:
     for responses in series:
         for i, share in enumerate(responses.shares_above_median().tolist()):
             condition, x = responses.conditions[i], responses.rates_of(i)
-            median_hz = float(np.median(x)) if len(x) else None
-            rows.append(
-                (responses.start_min, condition.label, condition.value, condition.unit, len(x), median_hz, share)
-            )
+            of_condition = condition.label, condition.value, condition.unit
+            rows.append((responses.start_min, *of_condition, len(x), float(np.median(x)) if len(x) else None, share))
     return _write(folder, "culture-conditions", head, rows)
 
 
@@ -108,10 +106,8 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
         for course in panel.courses:
             for i, at_min in enumerate(course.minutes.tolist()):
                 levels = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
-                quartiles = course.quartiles[:, i].tolist()
-                rows.append(
-                    (panel.title, course.name, at_min, len(course.returns), *quartiles, *levels, fine.get(at_min))
-                )
+                known = panel.title, course.name, at_min, len(course.returns), *course.quartiles[:, i].tolist()
+                rows.append((*known, *levels, fine.get(at_min)))
     return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
 
 

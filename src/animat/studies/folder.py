@@ -15,31 +15,26 @@ from animat.differences import first_difference, folder_mismatch, read_descripti
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
-from animat.plain_file import expect_no_file
+from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
+from animat.recordings.reading import list_recordings
 from animat.robots.host import HostRobot
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
-from animat.studies.toml import study_to_toml
 from animat.training.settings import LEARNER
 from animat.writing import clear_away, exclusive_lock, is_unfinished, write_whole
 
 MANIFEST = "study.json"
-SPECIFICATION = "study.toml"
 _PACKAGES = (
     "animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba", "h5py", "pynwb", "pandas", "pillow", "matplotlib",
     "jinja2",
 )  # fmt: skip
-_ABOUT_FILES = "# files: relative to the original specification. To run it from here: files = ['recordings']\n"
 
 
 def describe_study(study: Study, sources: dict[str, str], device: str | None = None) -> dict[str, Any]:
-    """Everything that decides a study's results, with a fingerprint of it.
+    """Everything that decides a study's results, with a fingerprint; `sources` are the files' SHA-256 by their paths.
 
-    Args:
-        study: the specification.
-        sources: SHA-256 of each recording's file, by its path.
-        device: the kind of GPU that trains, as GPUs round differently; None for CPU cores, which are not recorded.
+    `device` is the kind of GPU that trains, as GPUs round differently; None for CPU cores, which are not recorded.
     """
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     if study.culture.kind == "virtual":
@@ -64,28 +59,16 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
 
 
 def source_files(study: Study, base: Path) -> list[Path]:
-    """The files of a study's recordings; their names are relative to `base`.
-
-    Raises:
-        InvalidFile: if one is missing.
-        InvalidArgument: for a study of many cultures.
-    """
+    """The files of a study's recordings; their names are relative to `base`."""
     if study.culture.seeds or study.culture.folders:
         raise InvalidArgument("culture: expected one culture, got many; animat study runs such a study")
     if study.culture.kind != "files":
         return []
-    from animat.recordings.reading import list_recordings
-
     return list_recordings([base / name for name in study.culture.files])
 
 
 def hash_files(files: list[Path], base: Path) -> dict[str, str]:
-    """SHA-256 of each file, by its path relative to `base`; CSV spikes include the file of their stimuli.
-
-    Raises:
-        InvalidFile: if one is missing or cannot be read.
-        InvalidArgument: if one is named twice.
-    """
+    """SHA-256 of each file, by its path relative to `base`; CSV spikes include the file of their stimuli."""
     hashes: dict[str, str] = {}
     for file in files:
         if _relative(file, base) in hashes:
@@ -93,9 +76,7 @@ def hash_files(files: list[Path], base: Path) -> dict[str, str]:
         stimuli = stimuli_beside(file)
         for each in [file] if stimuli is None else [file, stimuli]:
             try:
-                hashes[_relative(each, base)] = sha256(each)
-            except FileNotFoundError as error:
-                raise InvalidFile(f"{each}: no such file") from error
+                hashes[_relative(each, base)] = sha256(expect_plain_file(each))
             except OSError as error:
                 raise InvalidFile(f"{each}: cannot be read: {error.strerror or error}") from error
     return dict(sorted(hashes.items()))
@@ -120,10 +101,8 @@ def claim_folder(
     Nothing in the folder is touched before it is known to be free or to belong to this work.
 
     Args:
-        folder: of the work.
         what: kind of work for messages, such as `study`.
-        manifest: description of the work, with a fingerprint.
-        file: name of the file for the manifest.
+        manifest: description of the work, with a fingerprint, and the name of the `file` for it.
         beside: text of further files, by their names.
         own_folders: every folder that the work makes in its folder.
 
@@ -144,18 +123,8 @@ def claim_folder(
         yield
 
 
-def specification_files(study: Study) -> dict[str, str]:
-    """A study's specification as a file to edit and run, by its name."""
-    return {SPECIFICATION: _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)}
-
-
 def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[str]) -> bool:
-    """True if the folder already belongs to this work, False if it is free.
-
-    Raises:
-        Mismatch: if it belongs to other work, or holds other files.
-        InvalidFile: if its description, the first of its files, cannot be read.
-    """
+    """Whether the folder already belongs to this work, whose description is the first of its files, or is free."""
     found = read_description(folder / files[0], what)
     if found is None:
         if folder.is_dir() and not all(map(_is_hidden, folder.iterdir())):

@@ -8,7 +8,7 @@ from dataclasses import fields
 from animat.goals.robot import RobotWithGoal
 from animat.report.html import Table, table_of
 from animat.report.results import ObjectiveMet
-from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame
+from animat.studies.episodes import MARGIN, SATISFACTION, SUCCEEDED, DataFrame, rows_where
 from animat.studies.specification import Study
 
 
@@ -18,7 +18,7 @@ def goals_met(study: Study, table: DataFrame) -> Iterator[ObjectiveMet]:
         robot = spec.robot()
         if not isinstance(robot, RobotWithGoal):
             continue
-        at = table[(table["robot"] == spec.name) & ~table["over_time"]]
+        at = rows_where(table, robot=spec.name, over_time=False)
         for (arm, agent, at_min), rows in at.groupby(["arm", "agent", "at_min"], sort=False):
             met = len(rows), float(rows[SUCCEEDED].mean()), float(rows[MARGIN].mean())
             for i, objective in enumerate(robot.goal.objectives):

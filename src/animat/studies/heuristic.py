@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from animat.evaluation.verdict import compare_episodes, is_worse
 from animat.report.results import HeuristicComparison, Results
-from animat.studies.episodes import POLICY, DataFrame, mean_returns
+from animat.studies.episodes import POLICY, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual
 from animat.studies.specification import RobotSpec, Study, mapping_label
 
@@ -16,13 +16,11 @@ OUTPERFORM, NOT, TOO_FEW = "outperform it", "do not outperform it", "too few epi
 
 def compare_with_heuristic(study: Study, table: DataFrame, spec: RobotSpec) -> Iterator[HeuristicComparison]:
     """Compare each arm that `is_usual` at each minute at which the heuristic was run too; `table` is of episodes."""
-    at = table[(table["robot"] == spec.name) & ~table["over_time"]]
+    at = rows_where(table, robot=spec.name, over_time=False)
     for arm in filter(is_usual, study.arms):
-        through = mapping_label(*arm.kind)
-        heuristic = at[(at["arm"] == through) & (at["agent"] == HEURISTIC)].groupby("at_min")["return"]
-        policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY)].groupby("at_min")
+        heuristic = rows_where(at, arm=mapping_label(*arm.kind), agent=HEURISTIC).groupby("at_min")["return"]
         heuristic_returns = {at_min: returns.to_numpy() for at_min, returns in heuristic}
-        for at_min, episodes in policies:
+        for at_min, episodes in rows_where(at, arm=arm.name, agent=POLICY).groupby("at_min"):
             if at_min in heuristic_returns:
                 found = compare_episodes(episodes["return"].to_numpy(), heuristic_returns[at_min])
                 outcome = (OUTPERFORM if found.is_outperformed else NOT) if found.has_enough_episodes else TOO_FEW

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -14,7 +15,7 @@ from animat.progress import Part, Progress
 from animat.report.results import StudyOptimum
 from animat.robots.base import lacking
 from animat.robots.grid import why_no_grid
-from animat.studies.evaluating import as_recorded, setting_of, span_min
+from animat.studies.evaluating import as_recorded, setting_of
 from animat.studies.places import optima_file
 from animat.studies.results import read_typed, write_typed
 from animat.studies.simulating import read_series
@@ -25,6 +26,9 @@ ROUGH = 0.5
 """Grid steps along each axis for the optima of every recording, as a fraction of those elsewhere."""
 COARSER = 0.8
 """Grid steps along each axis for bootstrapped responses, at most, as a fraction of the optimum's."""
+
+_COPIED = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
+"""Columns of the table that an `Optimum` has under the same name."""
 
 
 def kinds_of(study: Study) -> list[Arm]:
@@ -38,14 +42,19 @@ def rough_kinds(study: Study) -> list[Arm]:
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
 
-def read_complete_optima(folder: Path, robot: str, what: str = "optima") -> list[StudyOptimum]:
-    """The optima over all conditions, leaving out those over fewer, which do not apply to the policies."""
-    return [optimum for optimum in read_optima(folder, robot, what) if optimum.left_out is None]
-
-
 def read_optima(folder: Path, robot: str, what: str = "optima") -> tuple[StudyOptimum, ...]:
     """All optima that the job wrote."""
     return read_typed(optima_file(folder, robot, what), tuple[StudyOptimum, ...])
+
+
+def complete_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, float], StudyOptimum]:
+    """The optima of one robot over all conditions, by `key_of`; those over fewer do not apply to the policies."""
+    return {key_of(optimum, optimum.at_min): optimum for optimum in optima if optimum.left_out is None}
+
+
+def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
+    """What identifies an optimum on a robot: without neurons every minute is the same."""
+    return (of.mapping, of.percentiles, at_min) if of.mapping != "none" else ("none", "", 0.0)
 
 
 def missing_capabilities(study: Study) -> list[str]:
@@ -80,16 +89,14 @@ class FindOptima(StudyTask):
         file = optima_file(folder, self.spec.name, "over-time" if self.over_time else "optima")
         if why_no_grid(self.spec.robot()) is not None:
             return [write_typed(file, [])]
-        study, timeline = as_recorded(self.study, folder)
-        first, last = span_min(timeline)
+        study, timeline, first, last = as_recorded(self.study, folder)
         kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
         resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:
             kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
             resolution, episodes = min(ROUGH, resolution), 0
         if timeline is not None:
-            series = sorted(read_series(study, folder), key=lambda responses: responses.start_min)
-            timeline = replace(timeline, responses=tuple(series))
+            timeline = replace(timeline, responses=tuple(read_series(study, folder)))
         requests = [
             self._request(kind, at, timeline) for kind in kinds for at in (minutes if kind.through_neurons else [last])
         ]
@@ -99,8 +106,10 @@ class FindOptima(StudyTask):
         for each in requests:
             if each.case is not None:
                 batches.setdefault(each.kind if self.over_time else each.case[0].n_actions is None, []).append(each)
-        compared = [] if self.over_time else _compared(study, first, last)
-        bootstrapped = [each for each in requests if each.counted is not None and (each.kind, each.at_min) in compared]
+        # Threshold mappings have an interval at the minutes at which their arms are evaluated.
+        arms = [] if self.over_time else [arm for arm in study.arms if arm.has_steps]
+        evaluated = {(arm.kind, at) for arm in arms for at in study.minutes_of(arm, first, last)}
+        bootstrapped = [each for each in requests if each.counted and (each.kind.kind, each.at_min) in evaluated]
         done, steps = 0, sum(map(len, batches.values())) + len(bootstrapped)
         for batch in batches.values():
             part = Part(progress, done, len(batch), steps)
@@ -146,29 +155,8 @@ class _Request:
     optimum: Optimum | None = None
 
     def to_row(self, robot: str) -> StudyOptimum:
-        """A row of the table."""
-        kind, few = self.kind, "; ".join(self.left_out) or None
-        return StudyOptimum(robot, kind.mapping, kind.percentiles, self.at_min, **_fields(self.optimum), left_out=few)
-
-
-def _compared(study: Study, first: float, last: float) -> list[tuple[Arm, float]]:
-    """Threshold mappings at the minutes at which their arms are evaluated: these optima have an interval."""
-    return [
-        (kind, at)
-        for kind in rough_kinds(study)
-        for arm in study.arms_of(kind)
-        for at in study.minutes_of(arm, first, last)
-    ]
-
-
-def _fields(optimum: Optimum | None) -> dict[str, Any]:
-    """An optimum's columns of the table, from the best return to the nodes; all None if there is no optimum."""
-    fields = {} if optimum is None else optimum.to_dict()
-    interval = None if optimum is None else optimum.interval
-    names = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
-    return {
-        "best_return": fields.get("value"),
-        "low_95": None if interval is None else interval.low,
-        "high_95": None if interval is None else interval.high,
-        **{name: fields.get(name) for name in names},
-    }
+        known: dict[str, Any] = {} if self.optimum is None else self.optimum.to_dict()
+        interval, few = known.get("interval") or {}, "; ".join(self.left_out) or None
+        bracket = known.get("value"), interval.get("low"), interval.get("high")
+        copied: dict[str, Any] = {name: known.get(name) for name in _COPIED}
+        return StudyOptimum(robot, *self.kind.kind, self.at_min, *bracket, **copied, left_out=few)

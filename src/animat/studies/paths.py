@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,7 +15,6 @@ from animat.evaluation.rollouts import Actor
 from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import HostRobot
-from animat.studies.results import read_arrays, write_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +30,6 @@ class Paths:
     observations: Float[np.ndarray, "actors iterations+1 observations"]
     commands: Float[np.ndarray, "actors iterations *commands"]
     lengths: Int64[np.ndarray, " actors"]
-
-    def save(self, path: Path) -> Path:
-        """Write it atomically."""
-        return write_arrays(path, vars(self))
-
-    @staticmethod
-    def load(path: Path) -> Paths:
-        """Read what `save` wrote; raises InvalidFile if it cannot be read."""
-        return Paths(**read_arrays(path))
 
     def episodes(self) -> list[tuple[np.ndarray, list[float]]]:
         """Observations and commands of each actor, up to the end of its episode."""

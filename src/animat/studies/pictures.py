@@ -27,16 +27,17 @@ from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
 from animat.report.results import ComparedReturns, ControlReturns, Results
-from animat.report.style import FORMATS, Figure, save_figure
+from animat.report.style import Figure
 from animat.responses.psth import post_stimulus_histogram, spontaneous_rate
 from animat.robots.base import lacking
 from animat.studies import figure_tables
-from animat.studies.episodes import POLICY, DataFrame, mean_returns
-from animat.studies.evaluating import as_recorded, span_min
+from animat.studies.episodes import POLICY, mean_returns, rows_where
+from animat.studies.evaluating import as_recorded
+from animat.studies.figures import save_formats
 from animat.studies.optima import kinds_of
 from animat.studies.paths import Paths
 from animat.studies.places import RECORDINGS, paths_file, results_file
-from animat.studies.results import read_typed
+from animat.studies.results import read_arrays, read_typed
 from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
@@ -91,7 +92,7 @@ class RobotPictures(StudyTask):
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
         robot, name = self.spec.robot(), self.spec.name
-        study, timeline = as_recorded(self.study, folder)
+        study, timeline, *_ = as_recorded(self.study, folder)
         table = all_episodes(study, folder, [self.spec])
         known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
@@ -99,15 +100,15 @@ class RobotPictures(StudyTask):
         rough = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
-        curves = _curves(study, folder, self.spec, known, rough, timeline)
+        curves = _curves(known, rough, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(figure_tables.write_learning(folder, name, curves))
         if study.comparisons:
-            pairs = [_pair(study, row, table, known) for row in results.comparisons if row.robot == name]
+            pairs = [_pair(row, known) for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
         if timeline is not None and len(timeline) > 1:
-            courses = _courses(study, table, known, rough, timeline)
+            courses = _courses(known, rough, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
             drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
             figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
@@ -115,7 +116,7 @@ class RobotPictures(StudyTask):
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)
         figures["controls"] = draw_controls(controls, f"{name}: controls")
-        recorded = {each.name: Paths.load(paths_file(folder, self.spec, each)) for each in study.arms}
+        recorded = {each.name: Paths(**read_arrays(paths_file(folder, self.spec, each))) for each in study.arms}
         tables.append(
             figure_tables.write_paths(folder, name, [quantity.name for quantity in robot.observation_spec], recorded)
         )
@@ -134,31 +135,22 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     files = []
     for i, (name, figure) in enumerate(figures.items()):
         progress.update(0.3 + 0.7 * i / len(figures), 1, name)
-        files += [save_figure(figure, folder / "figures" / f"{of}-{name}.{ending}") for ending in FORMATS]
+        files += save_formats(figure, folder, f"figures/{of}-{name}")
     return files
 
 
-def _curves(
-    study: Study,
-    folder: Path,
-    spec: RobotSpec,
-    known: References,
-    rough: References,
-    timeline: SimulatorTimeline | None,
-) -> list[LearningCurve]:
-    curves = []
-    for arm in study.arms:
-        if not arm.trained:
-            continue
-        learning = learning_of(study, folder, spec, arm)
+def _curves(known: References, rough: References, timeline: SimulatorTimeline | None) -> list[LearningCurve]:
+    curves, study = [], known.study
+    for arm in (arm for arm in study.arms if arm.trained):
+        learning = learning_of(study, known.folder, known.spec, arm)
         random, optimum = [], []
         for at_min in _minutes_in_training(study, arm, timeline, learning.shape[1]):
             random.append((rough if arm.through_neurons else known).random(arm, at_min))
-            best = known.optimum(arm, at_min) or rough.optimum(arm, at_min)
-            optimum.append(None if best is None else best.best_return)
+            best = known.best_return(arm, at_min)
+            optimum.append(rough.best_return(arm, at_min) if best is None else best)
         levels = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = learning[0, :, 0]
-        returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, spec))
+        returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, known.spec))
         curves.append(LearningCurve(arm.name, iterations, returns, *levels))
     return curves
 
@@ -171,45 +163,39 @@ def round_of(study: Study, spec: RobotSpec) -> int:
 def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, chunks: int) -> list[float]:
     """The minute of the recording in use in each chunk of training."""
     if timeline is None or not arm.through_neurons:
-        return [span_min(timeline)[1]] * chunks
-    start, _ = span_min(timeline)
+        # Without neurons every minute is the same.
+        return [0.0] * chunks
+    every_min = timeline.start_min.tolist()
     share = 1 / chunks if arm.shadowing else 0.0
-    rows = [timeline.row_at(start + study.training_min * share * chunk) for chunk in range(chunks)]
-    return [float(timeline.start_min[row]) for row in rows]
+    rows = [timeline.row_at(every_min[0] + study.training_min * share * chunk) for chunk in range(chunks)]
+    return [every_min[row] for row in rows]
 
 
-def _pair(study: Study, row: ComparedReturns, table: DataFrame, known: References) -> Pair:
-    first, second = study.arm(row.first), study.arm(row.second)
-    a, b = (performances(table, row.robot, arm, row.at_min, row.episodes) for arm in (first, second))
+def _pair(row: ComparedReturns, known: References) -> Pair:
+    first, second = known.study.arm(row.first), known.study.arm(row.second)
+    a, b = (performances(known.table, row.robot, arm, row.at_min, row.episodes) for arm in (first, second))
     return Pair(row, a, b, known.random(first, row.at_min))
 
 
-def _courses(
-    study: Study, table: DataFrame, known: References, rough: References, timeline: SimulatorTimeline
-) -> list[Courses]:
+def _courses(known: References, rough: References, timeline: SimulatorTimeline) -> list[Courses]:
     every_min: list[float] = timeline.start_min.tolist()
-    over_time = table[(table["agent"] == POLICY) & table["over_time"]]
+    over_time = rows_where(known.table, agent=POLICY, over_time=True)
     panels = []
-    for kind in (kind for kind in kinds_of(study) if kind.through_neurons):
+    for kind in (kind for kind in kinds_of(known.study) if kind.through_neurons):
         courses = []
-        for arm in study.arms_of(kind):
-            of_minute = over_time[over_time["arm"] == arm.name].groupby("at_min")
+        for arm in known.study.arms_of(kind):
+            of_minute = rows_where(over_time, arm=arm.name).groupby("at_min")
             returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
             courses.append(Course(arm.name, np.array(every_min), returns))
-        roughly = [rough.optimum(kind, at_min) for at_min in every_min]
-        levels = [None if each is None else each.best_return for each in roughly]
-        optima = ((at_min, known.optimum(kind, at_min)) for at_min in every_min)
+        optimum = [rough.best_return(kind, at_min) for at_min in every_min]
+        fine = ((at_min, known.best_return(kind, at_min)) for at_min in every_min)
         panels.append(
             Courses(
                 mapping_label(*kind.kind),
                 tuple(courses),
                 np.array([rough.random(kind, at_min) for at_min in every_min]),
-                None if levels[0] is None else np.array(levels, np.float64),
-                tuple(
-                    (at_min, optimum.best_return)
-                    for at_min, optimum in optima
-                    if optimum and optimum.best_return is not None
-                ),
+                None if optimum[0] is None else np.array(optimum, np.float64),
+                tuple((at_min, best) for at_min, best in fine if best is not None),
             )
         )
     return panels

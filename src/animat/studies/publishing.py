@@ -18,31 +18,23 @@ from animat.progress import Progress
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
 from animat.report.results import ComparedReturns, ControlReturns, Results, Score
-from animat.report.style import FORMATS, save_figure
+from animat.report.style import save_figure
 from animat.responses.responses import Responses
+from animat.studies import report_tables
 from animat.studies.arms import arm_differences, arms_table, describe_mapping, summarise_arms
-from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT
+from animat.studies.captions import BURSTS, CULTURE, HEADLINE, NO_BURSTS, ROBOT, Caption
 from animat.studies.differences import decisions, differing_comparisons
 from animat.studies.episodes import DataFrame
+from animat.studies.figures import picture_of, save_formats
 from animat.studies.folder import MANIFEST
 from animat.studies.goals import goals_table
 from animat.studies.heuristic import not_outperforming
 from animat.studies.pictures import round_of
-from animat.studies.places import REPORT, RESPONSES, TIMELINE, results_file
+from animat.studies.places import REPORT, TIMELINE, results_file
 from animat.studies.reflex import describe_reflexes
-from animat.studies.report_tables import (
-    comparisons_table,
-    controllability_table,
-    controls_table,
-    heuristic_table,
-    optima_table,
-    reflexes_table,
-    returns_table,
-    scores_table,
-)
 from animat.studies.results import read_typed
 from animat.studies.simulating import controllability, load_timeline, read_series
-from animat.studies.specification import Arm, RobotSpec, Study
+from animat.studies.specification import Arm, Study
 from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask
 from animat.studies.toml import study_to_toml
@@ -62,16 +54,18 @@ class Publish(StudyTask):
             kept = controllability(load_timeline(folder / TIMELINE))
             series = read_series(study, folder, as_one=True)
         headline = _headline(study, results, all_episodes(study, folder, study.robots))
-        figure = draw_headline(headline)
-        drawn = [save_figure(figure, folder / "figures" / f"headline.{ending}") for ending in FORMATS]
+        drawn = save_formats(draw_headline(headline), folder, "figures/headline")
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
-        sections = [_summary(study, results, [row for row, _ in headline], drawn, narrow)]
+        title, caption = "Every arm on every robot", HEADLINE.format(policies=study.policies)
+        picture = picture_of(folder, "figures/headline", title, caption, "tables/scores.csv", narrow=narrow)
+        sections = [_summary(study, results, [row for row, _ in headline], picture)]
+        facts = {name: getattr(study, name) for name in ("policies", "episodes", "episodes_over_time")}
         for spec in study.robots:
-            pictures = _pictures(folder, spec.name, ROBOT, _NUMBERS_OF_ROBOT, _facts_of_robot(study, spec))
+            pictures = _pictures(folder, spec.name, ROBOT, {**facts, "round": f"{round_of(study, spec):,}"})
             sections.append(Section(spec.name.capitalize(), pictures=pictures))
         if kept:
-            table = controllability_table(study, folder, kept)
-            pictures = _pictures(folder, "culture", CULTURE, _NUMBERS_OF_CULTURE, _facts_of_culture(series))
+            table = report_tables.controllability_table(study, folder, kept)
+            pictures = _pictures(folder, "culture", CULTURE, _facts_of_culture(series))
             sections.append(Section("The culture", tables=(table,), pictures=pictures))
         sections += [_controls(study, results), _compared(study, results), _scores(results)]
         if study.paper:
@@ -103,15 +97,14 @@ def _and(parts: Sequence[str]) -> str:
 
 def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Score, Float64[np.ndarray, " policies"]]]:
     """Each arm on each robot at the last recording that it was evaluated on, with the mean return of each policy."""
-    last = {(row.robot, row.arm): row for row in sorted(results.scores, key=lambda row: row.at_min)}
+    # Scores of an arm are in the order of its minutes.
+    last = {(row.robot, row.arm): row for row in results.scores}
     return [
-        (row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes))
-        for row in results.scores
-        if row is last[row.robot, row.arm]
+        (row, performances(table, row.robot, study.arm(row.arm), row.at_min, row.episodes)) for row in last.values()
     ]
 
 
-def _summary(study: Study, results: Results, headline: Sequence[Score], drawn: Sequence[Path], narrow: Path) -> Section:
+def _summary(study: Study, results: Results, headline: Sequence[Score], picture: Picture) -> Section:
     """The best arm on each robot, the same with random stimuli, and how many comparisons agree with the paper."""
     chosen = {arm.name for arm in study.arms if arm.trained and arm.through_neurons and arm.delivery == "chosen"}
     sentences, explained = [], []
@@ -142,13 +135,6 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], drawn: S
             f"With {study.policies} policies per side p cannot fall below {smallest:.2g}: this is a first look, not a "
             "result."
         )
-    picture = Picture(
-        drawn[0],
-        "Every arm on every robot",
-        HEADLINE.format(policies=study.policies),
-        (*(f"figures/{file.name}" for file in drawn[1:]), "tables/scores.csv"),
-        narrow,
-    )
     return Section("Results in short", tuple(sentences), pictures=(picture,), tables=(arms_table(study),))
 
 
@@ -190,7 +176,9 @@ def _compared(study: Study, results: Results) -> Section:
         "not mean that there is none. The effect is the rank-biserial correlation, +1 where every policy of the second "
         "arm is better, with Newcombe's 95 % interval."
     )
-    return Section("Comparisons", (method,), tables=(comparisons_table(rows), returns_table(rows)))
+    return Section(
+        "Comparisons", (method,), tables=(report_tables.comparisons_table(rows), report_tables.returns_table(rows))
+    )
 
 
 def _as_in_paper(rows: Sequence[ComparedReturns]) -> str:
@@ -222,41 +210,12 @@ def _describe_differing(rows: Sequence[ComparedReturns]) -> Iterator[str]:
 
 
 def _scores(results: Results) -> Section:
-    tables = [scores_table(results.scores), optima_table(results.optima)]
-    if results.goals:
-        tables.append(goals_table(results.goals))
     note = (
         "Means over policies; the interquartile mean is that of the middle half, with its 95 % interval by Student's t."
     )
-    return Section("Scores", (note,), tables=tuple(tables))
-
-
-_NUMBERS_OF_CULTURE = {
-    "array": ("tables/culture-array.csv",),
-    "psth": ("tables/culture-psth.csv",),
-    "bursts": ("tables/culture-bursts.csv", RESPONSES),
-    "responses": (RESPONSES, "tables/culture-conditions.csv"),
-    "over-time": (RESPONSES, "tables/culture-conditions.csv"),
-    "drift": ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
-}
-_NUMBERS_OF_ROBOT = {
-    "learning": ("tables/{of}-learning.csv", "tables/learning-curves.csv"),
-    "comparisons": ("tables/comparisons.csv",),
-    "over-time": ("tables/{of}-over-time.csv",),
-    "paths": ("tables/{of}-paths.csv",),
-    "controls": ("tables/controls.csv",),
-}
-"""Files with the numbers behind each figure."""
-
-
-def _facts_of_robot(study: Study, spec: RobotSpec) -> dict[str, str]:
-    """The placeholders in captions of a robot's figures."""
-    return {
-        "policies": f"{study.policies}",
-        "episodes": f"{study.episodes}",
-        "episodes_over_time": f"{study.episodes_over_time}",
-        "round": f"{round_of(study, spec):,}",
-    }
+    goals = (goals_table(results.goals),) if results.goals else ()
+    optima = report_tables.optima_table(results.optima)
+    return Section("Scores", (note,), tables=(report_tables.scores_table(results.scores), optima, *goals))
 
 
 def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
@@ -270,18 +229,14 @@ def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
 
 
 def _pictures(
-    folder: Path,
-    of: str,
-    captions: Mapping[str, tuple[str, str]],
-    numbers: Mapping[str, tuple[str, ...]],
-    facts: Mapping[str, str],
+    folder: Path, of: str, captions: Mapping[str, Caption], facts: Mapping[str, object]
 ) -> tuple[Picture, ...]:
+    """The figures that were drawn; `facts` fill the placeholders in captions."""
     pictures = []
-    for name, (title, caption) in captions.items():
-        files = [Path("figures") / f"{of}-{name}.{ending}" for ending in FORMATS]
-        if (folder / files[0]).exists():
-            beside = (*(file.as_posix() for file in files[1:]), *(n.format(of=of) for n in numbers.get(name, ())))
-            pictures.append(Picture(folder / files[0], f"{of.capitalize()}: {title}", caption.format(**facts), beside))
+    for name, (title, caption, numbers) in captions.items():
+        file, files = f"figures/{of}-{name}", (each.format(of=of) for each in numbers)
+        if (folder / f"{file}.png").exists():
+            pictures.append(picture_of(folder, file, f"{of.capitalize()}: {title}", caption.format(**facts), *files))
     return tuple(pictures)
 
 
@@ -301,13 +256,13 @@ def _controls(study: Study, results: Results) -> Section:
             "The best reflex: a fixed rule from sensed values to a stimulus, without memory and without a goal.",
         ),
     )
-    comparisons = heuristic_table(results.heuristic), reflexes_table(results.reflexes)
+    comparisons = report_tables.heuristic_table(results.heuristic), report_tables.reflexes_table(results.reflexes)
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
         ("Each control removes something.", *(each[:1].upper() + each[1:] for each in sentences)),
         points,
-        (*(table for table in comparisons if table.rows), controls_table(study, results.controls)),
+        (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results.controls)),
     )
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import final
 
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
+from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidFile
 from animat.execution.receipts import Receipt
 from animat.progress import Progress
 from animat.recordings.formats.nwb import recording_name, write_nwb
+from animat.recordings.reading import read_recordings
 from animat.studies.folder import source_files
 from animat.studies.places import RECEIPTS, RECORDINGS
 from animat.studies.task import StudyTask
@@ -36,13 +38,20 @@ class Record(StudyTask):
         # Changed recordings are deleted here, as they may be valid and nothing later would notice the change.
         for name in () if receipt is None else receipt.changed(folder):
             (folder / name).unlink(missing_ok=True)
-        if self.study.culture.kind == "files":
+        culture = self.study.culture
+        if culture.kind == "files":
             return self._copies(out, progress)
-        return [*self._virtual(out, progress), out / SELECTION_FILE, out / STATE_FILE]
+        series = record_series(
+            lambda: VirtualCulture(culture.seed),
+            culture.protocol(),
+            out,
+            sessions=culture.sessions,
+            interval_min=culture.interval_min,
+            progress=progress,
+        )
+        return [*series.files, out / SELECTION_FILE, out / STATE_FILE]
 
     def _copies(self, out: Path, progress: Progress) -> list[Path]:
-        from animat.recordings.reading import read_recordings
-
         copies: list[Path] = []
         recordings = read_recordings(source_files(self.study, self.base))
         for i, recording in enumerate(recordings):
@@ -55,16 +64,3 @@ class Record(StudyTask):
             write_nwb(recording, copy)
             progress.update(i + 1, len(recordings))
         return copies
-
-    def _virtual(self, out: Path, progress: Progress) -> list[Path]:
-        from animat.cultures.virtual import VirtualCulture
-
-        culture = self.study.culture
-        return record_series(
-            lambda: VirtualCulture(culture.seed),
-            culture.protocol(),
-            out,
-            sessions=culture.sessions,
-            interval_min=culture.interval_min,
-            progress=progress,
-        ).files

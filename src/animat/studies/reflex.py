@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from math import nan
 
 from animat.evaluation.coupling import REFLEX_GAP, context_gap
 from animat.evaluation.optimum import Optimum
 from animat.evaluation.statistics import Interval
 from animat.report.results import ReflexComparison, StudyOptimum
-from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns
+from animat.studies.episodes import COUPLING, POLICY, RANDOM, DataFrame, mean_returns, rows_where
 from animat.studies.evaluating import is_usual
+from animat.studies.optima import complete_optima, key_of
 from animat.studies.specification import RobotSpec, Study, mapping_label
 
 
@@ -20,24 +22,19 @@ def compare_with_reflex(
 
     Without an optimal return over all conditions there is no context gap, and hence no row.
     """
-    at = table[(table["robot"] == spec.name) & ~table["over_time"]]
-    known = {
-        (each.mapping, each.percentiles, each.at_min): each
-        for each in optima
-        if each.robot == spec.name and each.left_out is None and each.best_return is not None
-    }
+    at = rows_where(table, robot=spec.name, over_time=False)
+    known = complete_optima(each for each in optima if each.robot == spec.name)
     for arm in filter(is_usual, study.arms):
-        of = at[at["arm"] == mapping_label(*arm.kind)]
-        for at_min, coupled in of[of["agent"] == COUPLING].groupby("at_min")["return"]:
-            best = known.get((*arm.kind, at_min))
-            policies = at[(at["arm"] == arm.name) & (at["agent"] == POLICY) & (at["at_min"] == at_min)]
-            if best is None or not len(policies):
+        controls = rows_where(at, arm=mapping_label(*arm.kind))
+        for at_min, coupled in rows_where(controls, agent=COUPLING).groupby("at_min")["return"]:
+            best = known.get(key_of(arm, at_min))
+            policies = rows_where(at, arm=arm.name, agent=POLICY, at_min=at_min)
+            if best is None or best.best_return is None or not len(policies):
                 continue
-            random = of[(of["agent"] == RANDOM) & (of["at_min"] == at_min)]["return"].to_numpy()
-            nan = float("nan")
-            optimum = Optimum(best.best_return or 0.0, best.grid_error or 0.0, nan, nan, nan, nan, 0, 0)
+            random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
+            # The context gap takes only the value and its error.
+            optimum = Optimum(best.best_return, best.grid_error or 0.0, nan, nan, nan, nan, 0, 0)
             context = context_gap(coupled.to_numpy(), random, optimum)
-            gap, score = context.gap, context.score(mean_returns(policies), optimum)
             yield ReflexComparison(
                 spec.name,
                 arm.name,
@@ -45,9 +42,9 @@ def compare_with_reflex(
                 context.coupling,
                 context.standard_error if len(coupled) > 1 else None,
                 optimum.value,
-                *_ends(gap),
+                *_ends(context.gap),
                 context.needs_context,
-                *_ends(score),
+                *_ends(context.score(mean_returns(policies), optimum)),
             )
 
 
@@ -57,14 +54,15 @@ def describe_reflexes(rows: Iterable[ReflexComparison]) -> list[str]:
     for row in rows:
         if row.gap is None:
             continue
-        where = f"{row.robot}, {row.arm}, at {row.at_min:g} min: the best reflex returns {row.coupling:.1f}"
-        if not row.needs_context:
-            is_known = row.gap_high_95 is not None and row.gap_high_95 <= REFLEX_GAP
-            more = "the task needs no more than that" if is_known else "whether the task needs more is not known"
-            sentences.append(f"{where}; {more}.")
-        else:
+        if row.needs_context:
             score = "" if row.score is None else f"; the policies' context score is {row.score:.2f}"
-            sentences.append(f"{where}; the task needs more{score}.")
+            needs = f"the task needs more{score}"
+        elif row.gap_high_95 is not None and row.gap_high_95 <= REFLEX_GAP:
+            needs = "the task needs no more than that"
+        else:
+            needs = "whether the task needs more is not known"
+        where = f"{row.robot}, {row.arm}, at {row.at_min:g} min"
+        sentences.append(f"{where}: the best reflex returns {row.coupling:.1f}; {needs}.")
     return sentences
 
 

@@ -18,7 +18,7 @@ from animat.report.results import (
 )
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
-from animat.studies.optima import read_complete_optima, rough_kinds
+from animat.studies.optima import complete_optima, key_of, read_optima, rough_kinds
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
@@ -35,7 +35,6 @@ _SCORE_NOTE = (
 
 def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
     """Tests and outcomes, with the paper's p where it printed one."""
-    printed = any(row.paper_p is not None for row in rows)
     columns: Columns = [
         *columns_of("comparison", "robot"),
         ("at (min)", "at_min"),
@@ -47,18 +46,12 @@ def comparisons_table(rows: Sequence[ComparedReturns]) -> Table:
         ("effect", _interval("effect", "effect_low_95", "effect_high_95")),
         ("outcome", _outcome),
     ]
-    if printed:
+    note = ""
+    if any(row.paper_p is not None for row in rows):
         columns += [("the paper's p (U it implies)", _printed), ("as in the paper", "as_in_paper")]
-    return table_of(
-        "Comparisons",
-        rows,
-        columns,
-        note="The paper prints p but not U; U is the value that gives this p. Highlighted: not as in the paper."
-        if printed
-        else "",
-        beside="tables/comparisons.csv",
-        marked=tuple(i for i, row in enumerate(rows) if row.as_in_paper == "no"),
-    )
+        note = "The paper prints p but not U; U is the value that gives this p. Highlighted: not as in the paper."
+    marked = tuple(i for i, row in enumerate(rows) if row.as_in_paper == "no")
+    return table_of("Comparisons", rows, columns, note=note, beside="tables/comparisons.csv", marked=marked)
 
 
 def returns_table(rows: Sequence[ComparedReturns]) -> Table:
@@ -136,16 +129,9 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
 
 def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
     """How often each condition exceeds the median in every recording, in the data and in the simulator."""
-    kinds = rough_kinds(study)[:1]
-    optima = {
-        spec.name: {
-            optimum.at_min: optimum.best_return
-            for optimum in read_complete_optima(folder, spec.name, "over-time")
-            if (optimum.mapping, optimum.percentiles) == kinds[0].kind
-        }
-        for spec in study.robots
-        if kinds
-    }
+    kind = next(iter(rough_kinds(study)), None)
+    names = [spec.name for spec in study.robots] if kind else []
+    optima = {name: complete_optima(read_optima(folder, name, "over-time")) for name in names}
     labels = next(iter(kept.values())).labels
     rows, marked = [], []
     for i, (at_min, of) in enumerate(kept.items()):
@@ -155,8 +141,9 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
             for a, b in zip(in_data, in_simulator, strict=True)
         ]
         ranges = (max(each) - min(each) for each in (in_data, in_simulator))
-        optimum_of_each = (by_minute.get(at_min) for by_minute in optima.values())
-        rows.append((at_min, *shares[:_MOST_LABELS], *ranges, *optimum_of_each))
+        found = [of_robot.get(key_of(kind, at_min)) for of_robot in optima.values()] if kind else []
+        best = (None if optimum is None else optimum.best_return for optimum in found)
+        rows.append((at_min, *shares[:_MOST_LABELS], *ranges, *best))
         if of.largest_loss > LARGEST_LOSS:
             marked.append(i)
     note = (
@@ -165,29 +152,25 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
         f"moves a share by more than {LARGEST_LOSS:g}, so the simulator, the optima and the policies differ from what "
         "the culture would allow."
     )
-    if kinds:
-        mapping = mapping_label(*kinds[0].kind)
-        note += f" Optimum: the optimal return with {mapping} on a coarse grid."
+    if kind:
+        note += f" Optimum: the optimal return with {mapping_label(*kind.kind)} on a coarse grid."
     if len(labels) > _MOST_LABELS:
         note += f" {len(labels) - _MOST_LABELS} more conditions are in the file; the differences are over all of them."
-    return Table(
-        "Controllability of every recording",
-        (
-            "at (min)",
-            *labels[:_MOST_LABELS],
-            "difference, data",
-            "difference, simulator",
-            *(f"optimum, {robot}" for robot in optima),
-        ),
-        tuple(rows),
-        note=note,
-        beside="tables/controllability.csv",
-        marked=tuple(marked),
-    )
+    differences = "difference, data", "difference, simulator"
+    head = ("at (min)", *labels[:_MOST_LABELS], *differences, *(f"optimum, {robot}" for robot in optima))
+    title, file = "Controllability of every recording", "tables/controllability.csv"
+    return Table(title, head, tuple(rows), note=note, beside=file, marked=tuple(marked))
 
 
 def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
     """Trained policies and the controls of their mapping, at every recording at which anything is evaluated."""
+    note = (
+        "Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; "
+        "for one actor, over its episodes. Optima are those with the culture, also in the rows of silent and shuffled."
+    )
+    any_command = any(spec.robot().baseline_commands is None for spec in study.robots)
+    if any_command and any(row.mapping == "none" for row in rows):
+        note += " Without neurons, where any command can be chosen, there is no constant control."
     return table_of(
         "Controls",
         rows,
@@ -200,14 +183,7 @@ def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
             *columns_of("random", "optimum"),
             ("score", "normalised_score"),
         ],
-        note="Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; "
-        "for one actor, over its episodes. Optima are those with the culture, also in the rows of silent and shuffled."
-        + (
-            " Without neurons, where any command can be chosen, there is no constant control."
-            if any(row.mapping == "none" for row in rows)
-            and any(spec.robot().baseline_commands is None for spec in study.robots)
-            else ""
-        ),
+        note=note,
         beside="tables/controls.csv",
         folded=len(rows) > _MOST_ROWS,
     )

@@ -65,31 +65,30 @@ def write_records(path: Path, kind: type, rows: Iterable[Any]) -> Path:
     return write_table(path, [field.name for field in fields(kind)], (astuple(row) for row in rows))
 
 
-def write_named_records(path: Path, named: Iterable[tuple[str, Any]], kind: type, name: str) -> Path:
-    """Write records as a CSV file with an extra first column `name`, whose value comes with each record."""
+def write_named_records(path: Path, named: Mapping[str, Iterable[Any]], kind: type, name: str) -> Path:
+    """Write records as a CSV file with an extra first column `name`, whose value is the key of each record."""
     head = [name, *(field.name for field in fields(kind))]
-    return write_table(path, head, ((first, *astuple(row)) for first, row in named))
+    return write_table(path, head, ((first, *astuple(row)) for first, rows in named.items() for row in rows))
 
 
 MISSING = f"fastparquet is not installed: {install_command('parquet')}"
 
 
-def write_parquet(path: Path, named: Sequence[tuple[str, Any]], kind: type, name: str) -> bool:
-    """Write records as `write_named_records` does, with None as NaN; returns False if fastparquet is missing."""
+def write_parquet(path: Path, named: Mapping[str, Sequence[Any]], kind: type, name: str) -> Path | None:
+    """Write records as `write_named_records` does, with None as NaN; returns None if fastparquet is missing."""
     try:
         import fastparquet
     except ImportError:
-        return False
+        return None
     import pandas as pd
 
     hints = get_type_hints(kind)
     dtypes = {int: "int64", str: object, str | None: object}
-    columns = {name: pd.Series([first for first, _ in named], dtype=object)}
+    columns = {name: pd.Series([first for first, rows in named.items() for _ in rows], dtype=object)}
     for each in fields(kind):
-        values = [getattr(row, each.name) for _, row in named]
+        values = [getattr(row, each.name) for rows in named.values() for row in rows]
         columns[each.name] = pd.Series(values, dtype=dtypes.get(hints[each.name], "float64"))
-    strings = [column for column, values in columns.items() if values.dtype == object]
-    encodings = {column: "utf8" if column in strings else "infer" for column in columns}
+    encodings = {column: "utf8" if values.dtype == object else "infer" for column, values in columns.items()}
     with atomic_write(path) as beside:
         fastparquet.write(str(beside), pd.DataFrame(columns), object_encoding=encodings, write_index=False)
-    return True
+    return path

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidFile
 from animat.execution.gpu import find_gpu
-from animat.execution.jobs import Jobs, expect_workers
+from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress, Silent
 from animat.robots.checking import check_robot
-from animat.studies.folder import MANIFEST, claim_folder, describe_study, hash_files, source_files, specification_files
+from animat.studies.folder import MANIFEST, claim_folder, describe_study, hash_files, source_files
 from animat.studies.places import RECEIPTS, REPORT
 from animat.studies.plan import plan_study
 from animat.studies.specification import RobotSpec, Study
+from animat.studies.toml import study_to_toml
+
+SPECIFICATION = "study.toml"
+_ABOUT_FILES = "# files: relative to the original specification. To run it from here: files = ['recordings']\n"
 
 
 @dataclass(frozen=True)
@@ -73,20 +78,28 @@ def run_study(
     gpu = find_gpu() if executor is None else None
     check_custom(study.robots, [arm.mapping for arm in study.arms])
     manifest = describe_study(study, hash_files(source_files(study, base), base), gpu)
-    with claim_folder(folder, "study", manifest, MANIFEST, specification_files(study)):
+    specification = _ABOUT_FILES * (study.culture.kind == "files") + study_to_toml(study)
+    with claim_folder(folder, "study", manifest, MANIFEST, {SPECIFICATION: specification}):
         jobs = plan_study(study, base)
-        left = Jobs(jobs, folder, folder / RECEIPTS, manifest["fingerprint"])
-        took_s: dict[str, float] = {}
-        if left.waiting:
-            if not os.access(folder, os.W_OK):
-                raise InvalidFile(
-                    f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
-                )
-            took_s = left.run(
-                workers=workers, executor=executor, progress=progress or Silent(), has_gpu=gpu is not None
-            )
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        how = {"workers": workers, "executor": executor, "has_gpu": gpu is not None}
+        took_s = run_jobs(jobs, folder, manifest["fingerprint"], progress, **how)
     return StudyRun(folder, folder / REPORT, len(jobs), took_s)
+
+
+def run_jobs(
+    jobs: Sequence[Job], folder: Path, fingerprint: str, progress: Progress | None, **how: Any
+) -> dict[str, float]:
+    """Run the jobs of a folder that are not done, with options of `Jobs.run`; returns the CPU seconds of each."""
+    left = Jobs(jobs, folder, folder / RECEIPTS, fingerprint)
+    took_s: dict[str, float] = {}
+    if left.waiting:
+        if not os.access(folder, os.W_OK):
+            raise InvalidFile(
+                f"{folder}: {len(left.waiting)} of {len(jobs)} jobs are left, but it cannot be written to"
+            )
+        took_s = left.run(progress=progress or Silent(), **how)
+    shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+    return took_s
 
 
 def check_custom(robots: Iterable[RobotSpec], mappings: Iterable[str]) -> None:

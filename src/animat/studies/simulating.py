@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from animat.errors import AnimatError, InvalidFile, UnusableData
 from animat.neurons.fidelity import Fidelity
@@ -51,8 +53,7 @@ class Fit(StudyTask):
                 '(to allow it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))
-        save_timeline(timeline, folder / TIMELINE)
-        return [folder / TIMELINE, _write_responses(folder / RESPONSES, series)]
+        return [save_timeline(timeline, folder / TIMELINE), _write_responses(folder / RESPONSES, series)]
 
 
 def fit_simulators(study: Study, series: list[Responses]) -> SimulatorTimeline:
@@ -89,16 +90,12 @@ def _write_responses(path: Path, series: list[Responses]) -> Path:
 def _moved(study: Study, start_min: list[float]) -> list[Finding]:
     """A finding for each comparison at a minute at which no recording starts."""
     settled = study.at_recordings(start_min).comparisons
-    return [
-        Finding(
-            "comparison-minute",
-            "note",
-            f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min",
-            new.at_min,
-        )
-        for old, new in zip(study.comparisons, settled, strict=True)
-        if old.at_min is not None and old.at_min != new.at_min
-    ]
+    moved = []
+    for old, new in zip(study.comparisons, settled, strict=True):
+        if old.at_min is not None and old.at_min != new.at_min:
+            text = f"{old.name} was requested at {old.at_min:g} min and is made on the recording at {new.at_min:g} min"
+            moved.append(Finding("comparison-minute", "note", text, new.at_min))
+    return moved
 
 
 def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Responses]:
@@ -125,15 +122,11 @@ def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
     return fidelities
 
 
-def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
+def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
     """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
-    from safetensors.numpy import save
-
-    simulators = timeline.simulators
-    names = [field.name for field in fields(simulators)]  # type: ignore[arg-type]
-    arrays = {name: np.ascontiguousarray(getattr(simulators, name)) for name in names}
+    arrays = {name: np.ascontiguousarray(array) for name, array in vars(timeline.simulators).items()}
     metadata = {
-        "kind": type(simulators).__name__,
+        "kind": type(timeline.simulators).__name__,
         "start_min": timeline.start_min.tolist(),
         "conditions": [asdict(condition) for condition in timeline.conditions],
         "window_ms": timeline.window_ms,
@@ -145,13 +138,11 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> None:
         "fitted": timeline.fitted,
         **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
-    write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
+    return write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
 
 
 def load_timeline(path: Path) -> SimulatorTimeline:
     """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(path, framework="numpy") as file:
             metadata: dict[str, Any] = json.loads(file.metadata()["animat"])

@@ -125,8 +125,6 @@ class RobotSpec:
             raise InvalidArgument(f"parameters: {error}") from error
         if self.name == "culture":
             raise InvalidArgument("name: expected a name other than that of the culture's figures, got 'culture'")
-        if self.goal is not None:
-            with_goal(robot, self.goal)
         expect_lessons(self.lessons, self.robot(), draws_recordings=True)
         if not is_ours(robot):
             # Workers import it from there.
@@ -199,11 +197,6 @@ class Arm:
     def has_steps(self) -> bool:
         """Whether its mapping gives only a few commands, so that optimal returns are quick to compute."""
         return self.through_neurons and isinstance(mapping_named(self.mapping), Thresholds)
-
-    @property
-    def learns_one_recording(self) -> bool:
-        """Whether its policies learn, with their chosen stimuli, from the first recording only."""
-        return self.trained and self.through_neurons and not self.shadowing and self.delivery == "chosen"
 
 
 def mapping_label(mapping: str, percentiles: str) -> str:
@@ -280,17 +273,17 @@ class Study:
                 raise InvalidArgument(f"{name}: expected at least one, got none")
         n_readouts = count_readouts(readouts_named(self.simulators.readouts))
         for spec in self.robots:
-            if self.needs_neurons and (n := spec.robot().n_commands) != n_readouts:
+            robot = spec.robot()
+            if self.needs_neurons and robot.n_commands != n_readouts:
                 raise InvalidArgument(
-                    f"simulators.readouts: expected as many as {spec.name} has commands ({n}), got "
+                    f"simulators.readouts: expected as many as {spec.name} has commands ({robot.n_commands}), got "
                     f"{self.simulators.readouts!r}, which are {n_readouts}; robots with more or fewer commands need "
                     "another study"
                 )
-        for spec in self.robots:
             for arm in self.arms:
                 drawn = arm.shadowing == "drawn" and arm.through_neurons
                 try:
-                    expect_lessons(spec.lessons, spec.robot(), draws_recordings=drawn)
+                    expect_lessons(spec.lessons, robot, draws_recordings=drawn)
                 except InvalidArgument as error:
                     raise InvalidArgument(f"robots.lessons: {error} ({spec.name}, {arm.name})") from error
         _expect_unique("robots", [spec.name for spec in self.robots])
@@ -307,16 +300,14 @@ class Study:
                     f"{name}: expected at most {MOST_AT_ONCE:,} of all policies together, got {episodes:,} for each of "
                     f"{self.policies}"
                 )
-        trained = len(self.robots) * len(self.arms) * self.policies
-        if trained > MOST_TRAINED:
+        if (trained := len(self.robots) * len(self.arms) * self.policies) > MOST_TRAINED:
             raise InvalidArgument(
                 f"policies: expected at most {MOST_TRAINED:,} in a study, got {trained:,} (robots x arms x policies)"
             )
         known = [arm.name for arm in self.arms]
         for compared in self.comparisons:
             for side in ("first", "second"):
-                name = getattr(compared, side)
-                if name not in known:
+                if (name := getattr(compared, side)) not in known:
                     raise InvalidArgument(
                         f"comparisons.{side}: expected one of the arms {', '.join(known)}, got {name!r} in "
                         f"{compared.name!r}"
@@ -337,7 +328,8 @@ class Study:
     def minutes_of(self, arm: Arm, first_min: float, last_min: float) -> dict[float, int]:
         """The minutes at which an arm is evaluated, with numbers of episodes: those of its comparisons, and the last.
 
-        An arm that is trained on the first recording only is evaluated on it too, to show how well it learned it.
+        An arm that is trained, with its chosen stimuli, on the first recording only is evaluated on it too, to show how
+        well it learned it.
         """
         minutes: dict[float, int] = {}
         for compared in self.comparisons:
@@ -345,7 +337,7 @@ class Study:
                 at = last_min if compared.at_min is None else compared.at_min
                 minutes[at] = max(minutes.get(at, 0), compared.episodes)
         minutes.setdefault(last_min, self.episodes)
-        if arm.learns_one_recording:
+        if arm.trained and arm.through_neurons and not arm.shadowing and arm.delivery == "chosen":
             minutes[first_min] = max(minutes.get(first_min, 0), self.episodes)
         return minutes
 

@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar, final, get_args, get_type_hints
+from typing import Any, final, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import InvalidArgument
 from animat.evaluation.statistics import Comparison, compare, holm, interquartile_mean, normalised_score, p_of_u
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.report.results import TRAINED, ComparedReturns, ControlReturns, Results, Score, StudyOptimum
-from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes
-from animat.studies.evaluating import as_recorded, span_min
+from animat.studies.episodes import POLICY, RANDOM, DataFrame, mean_returns, read_episodes, rows_where
+from animat.studies.evaluating import as_recorded, policies_of
 from animat.studies.goals import goals_met
 from animat.studies.heuristic import compare_with_heuristic
-from animat.studies.optima import kinds_of, missing_capabilities, read_complete_optima, read_optima
+from animat.studies.optima import complete_optima, key_of, kinds_of, missing_capabilities, read_optima
 from animat.studies.paper import PRINTED
-from animat.studies.places import controls_file, episodes_file, policies_folder, results_file, table_file
+from animat.studies.places import controls_file, episodes_file, results_file, table_file
 from animat.studies.reflex import compare_with_reflex
 from animat.studies.results import write_records, write_table, write_typed
 from animat.studies.simulating import controllability
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask
-from animat.training.policy import Policy
 from animat.writing import atomic_write
-
-T = TypeVar("T")
 
 LEVEL = 0.01
 """The p below which an arm counts as better: by the normal approximation and uncorrected, as in the paper."""
@@ -49,15 +46,14 @@ class Tabulate(StudyTask):
     """Summarise the table of episodes and write `tables/`: typed results for later tasks, and everything as CSV."""
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
-        study, timeline = as_recorded(self.study, folder)
-        first, last = span_min(timeline)
-        table = all_episodes(study, folder)
-        known = {spec.name: References(study, folder, spec, table) for spec in study.robots}
+        study, timeline, first, last = as_recorded(self.study, folder)
+        table = all_episodes(study, folder, study.robots)
+        known = [References(study, folder, spec, table) for spec in study.robots]
         optima = tuple(optimum for spec in study.robots for optimum in read_optima(folder, spec.name))
         results = Results(
-            scores=tuple(_scores(study, table, first, last, known)),
-            comparisons=tuple(_comparisons(study, table, last, known)),
-            controls=tuple(row for spec in study.robots for row in _controls(study, table, spec, known[spec.name])),
+            scores=tuple(row for of_robot in known for row in _scores(of_robot, first, last)),
+            comparisons=tuple(_comparisons(study, last, known)),
+            controls=tuple(row for of_robot in known for row in _controls(of_robot)),
             heuristic=tuple(row for spec in study.robots for row in compare_with_heuristic(study, table, spec)),
             optima=optima,
             findings=tuple(_findings(study, timeline, optima)),
@@ -86,10 +82,10 @@ class Tabulate(StudyTask):
         return [*files, table_file(folder, "episodes")]
 
 
-def all_episodes(study: Study, folder: Path, robots: Iterable[RobotSpec] | None = None) -> DataFrame:
-    """The table of episodes of all robots, or of some."""
+def all_episodes(study: Study, folder: Path, robots: Iterable[RobotSpec]) -> DataFrame:
+    """The table of episodes of some robots."""
     files = []
-    for spec in study.robots if robots is None else robots:
+    for spec in robots:
         files += [episodes_file(folder, spec, arm) for arm in study.arms]
         files += [controls_file(folder, spec, kind) for kind in kinds_of(study)]
     return read_episodes(files)
@@ -115,49 +111,39 @@ class References:
     def __init__(
         self, study: Study, folder: Path, spec: RobotSpec, table: DataFrame, *, over_time: bool = False
     ) -> None:
-        self._optima = {
-            (optimum.mapping, optimum.percentiles, optimum.at_min): optimum
-            for optimum in read_complete_optima(folder, spec.name, "over-time" if over_time else "optima")
-        }
-        random = table[(table["robot"] == spec.name) & (table["agent"] == RANDOM) & (table["over_time"] == over_time)]
+        self.study, self.folder, self.spec, self.table = study, folder, spec, table
+        self._optima = complete_optima(read_optima(folder, spec.name, "over-time" if over_time else "optima"))
+        random = rows_where(table, robot=spec.name, agent=RANDOM, over_time=over_time)
         self._random: dict[tuple[str, str, float], float] = {}
         for kind in kinds_of(study):
-            of_kind = random[random["arm"] == mapping_label(*kind.kind)]
-            for at_min, returns in of_kind.groupby("at_min")["return"]:
-                self._random[*kind.kind, at_min] = float(returns.to_numpy().mean())
+            for at_min, returns in rows_where(random, arm=mapping_label(*kind.kind)).groupby("at_min")["return"]:
+                self._random[key_of(kind, at_min)] = float(returns.to_numpy().mean())
 
     def random(self, arm: Arm, at_min: float) -> float | None:
         """The mean return of random actions, delivered as chosen."""
-        return self._find(self._random, arm, at_min)
+        return self._random.get(key_of(arm, at_min))
 
     def optimum(self, arm: Arm, at_min: float) -> StudyOptimum | None:
-        """The optimal return; None for the control, which has none, and where it leaves out conditions."""
-        return None if arm.delivery == "shuffled" else self._find(self._optima, arm, at_min)
+        """The optimum; None for the control, which has none, and where it leaves out conditions."""
+        return None if arm.delivery == "shuffled" else self._optima.get(key_of(arm, at_min))
+
+    def best_return(self, arm: Arm, at_min: float) -> float | None:
+        """The optimal return, where there is an `optimum`."""
+        optimum = self.optimum(arm, at_min)
+        return None if optimum is None else optimum.best_return
 
     def score(self, arm: Arm, at_min: float, mean: float) -> float | None:
         """The normalised score; None if it is not known, or nothing can be learned."""
-        random, optimum = self.random(arm, at_min), self.optimum(arm, at_min)
-        if random is None or optimum is None or optimum.best_return is None:
-            return None
-        try:
-            return normalised_score(mean, random, optimum.best_return)
-        except InvalidArgument:
-            return None
-
-    @staticmethod
-    def _find(known: Mapping[tuple[str, str, float], T], arm: Arm, at_min: float) -> T | None:
-        if arm.through_neurons:
-            return known.get((*arm.kind, at_min))
-        # Without neurons every minute is the same.
-        return next((value for (mapping, _, _), value in known.items() if mapping == arm.mapping), None)
+        random, best = self.random(arm, at_min), self.best_return(arm, at_min)
+        return None if random is None or best is None or not best > random else normalised_score(mean, random, best)
 
 
 def performances(
     table: DataFrame, robot: str, arm: Arm, at_min: float, episodes: int | None = None
 ) -> Float64[np.ndarray, " policies"]:
     """Each policy's mean return over its first `episodes`, or all, at a minute: the paper's measure of a policy."""
-    of_robot = table[(table["robot"] == robot) & (table["arm"] == arm.name) & (table["agent"] == POLICY)]
-    return mean_returns(of_robot[(of_robot["at_min"] == at_min) & ~of_robot["over_time"]], episodes)
+    rows = rows_where(table, robot=robot, arm=arm.name, agent=POLICY, at_min=at_min, over_time=False)
+    return mean_returns(rows, episodes)
 
 
 def _finite(end: float) -> float | None:
@@ -165,41 +151,33 @@ def _finite(end: float) -> float | None:
     return end if math.isfinite(end) else None
 
 
-def _scores(
-    study: Study, table: DataFrame, first: float, last: float, references: Mapping[str, References]
-) -> Iterator[Score]:
-    for spec in study.robots:
-        known = references[spec.name]
-        for arm in study.arms:
-            for at_min, episodes in sorted(study.minutes_of(arm, first, last).items()):
-                means = performances(table, spec.name, arm, at_min)
-                mean = float(means.mean())
-                middle = interquartile_mean(means, within=spec.robot().return_range)
-                optimum = known.optimum(arm, at_min)
-                yield Score(
-                    robot=spec.name,
-                    arm=arm.name,
-                    mapping=arm.mapping,
-                    at_min=at_min,
-                    policies=len(means),
-                    episodes=episodes,
-                    mean_return=mean,
-                    standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
-                    interquartile_mean=middle.value,
-                    low_95=_finite(middle.low),
-                    high_95=_finite(middle.high),
-                    random=known.random(arm, at_min),
-                    optimum=None if optimum is None else optimum.best_return,
-                    normalised_score=known.score(arm, at_min, mean),
-                )
+def _scores(known: References, first: float, last: float) -> Iterator[Score]:
+    spec = known.spec
+    for arm in known.study.arms:
+        for at_min, episodes in sorted(known.study.minutes_of(arm, first, last).items()):
+            means = performances(known.table, spec.name, arm, at_min)
+            mean = float(means.mean())
+            middle = interquartile_mean(means, within=spec.robot().return_range)
+            yield Score(
+                robot=spec.name,
+                arm=arm.name,
+                mapping=arm.mapping,
+                at_min=at_min,
+                policies=len(means),
+                episodes=episodes,
+                mean_return=mean,
+                standard_deviation=float(means.std(ddof=1)) if len(means) > 1 else None,
+                interquartile_mean=middle.value,
+                low_95=_finite(middle.low),
+                high_95=_finite(middle.high),
+                random=known.random(arm, at_min),
+                optimum=known.best_return(arm, at_min),
+                normalised_score=known.score(arm, at_min, mean),
+            )
 
 
-FIRST, SECOND, NONE, TOO_FEW = (
-    "first better",
-    "second better",
-    f"none found (p ≥ {LEVEL:g})",
-    "too few policies to tell",
-)
+FIRST, SECOND, NONE = "first better", "second better", f"none found (p ≥ {LEVEL:g})"
+TOO_FEW = "too few policies to tell"
 
 AS_IN_PAPER = {FIRST: "no", SECOND: "yes", NONE: "no", TOO_FEW: "cannot tell"}
 """Whether each outcome agrees with the paper, in which the second arm was always better."""
@@ -220,23 +198,16 @@ def _optimum_error(optimum: StudyOptimum | None) -> float | None:
     return max(optimum.grid_error, *(abs(each.value or 0.0) for each in optimum.findings()), 0.0)
 
 
-def _comparisons(
-    study: Study, table: DataFrame, last: float, references: Mapping[str, References]
-) -> Iterator[ComparedReturns]:
-    made = []
-    for compared in study.comparisons:
-        at_min = last if compared.at_min is None else compared.at_min
-        sides = study.arm(compared.first), study.arm(compared.second)
-        for spec in study.robots:
-            a, b = (performances(table, spec.name, side, at_min, compared.episodes) for side in sides)
-            made.append((compared, spec.name, sides, at_min, a, b, compare(a, b)))
-    corrected = holm({f"{compared.name}/{robot}": test.p_normal for compared, robot, *_, test in made})
-    for compared, robot, (first, second), at_min, a, b, test in made:
-        known = references[robot]
-        printed = PRINTED.get((compared.name, robot)) if study.paper else None
+def _comparisons(study: Study, last: float, references: Iterable[References]) -> Iterator[ComparedReturns]:
+    rows = []
+    for compared, known in product(study.comparisons, references):
+        robot, at_min = known.spec.name, last if compared.at_min is None else compared.at_min
+        first, second = study.arm(compared.first), study.arm(compared.second)
+        a, b = (performances(known.table, robot, arm, at_min, compared.episodes) for arm in (first, second))
+        test = compare(a, b)
         outcome = outcome_of(test)
-        optima = [known.optimum(arm, at_min) for arm in (first, second)]
-        yield ComparedReturns(
+        printed = PRINTED.get((compared.name, robot)) if study.paper else None
+        row = ComparedReturns(
             comparison=compared.name,
             robot=robot,
             first=first.name,
@@ -249,14 +220,14 @@ def _comparisons(
             score_first=known.score(first, at_min, float(a.mean())),
             score_second=known.score(second, at_min, float(b.mean())),
             random_second=known.random(second, at_min),
-            optimum_first=None if optima[0] is None else optima[0].best_return,
-            optimum_second=None if optima[1] is None else optima[1].best_return,
-            optimum_error_first=_optimum_error(optima[0]),
-            optimum_error_second=_optimum_error(optima[1]),
+            optimum_first=known.best_return(first, at_min),
+            optimum_second=known.best_return(second, at_min),
+            optimum_error_first=_optimum_error(known.optimum(first, at_min)),
+            optimum_error_second=_optimum_error(known.optimum(second, at_min)),
             u=test.u,
             p_normal=test.p_normal,
             p_exact=test.p_exact,
-            p_holm=corrected[f"{compared.name}/{robot}"],
+            p_holm=math.nan,
             effect=test.effect.value,
             effect_low_95=test.effect.low,
             effect_high_95=test.effect.high,
@@ -265,13 +236,16 @@ def _comparisons(
             paper_p=None if printed is None else printed.p,
             as_in_paper=None if printed is None else AS_IN_PAPER[outcome],
         )
+        rows.append(row)
+    corrected = holm({f"{row.comparison}/{row.robot}": row.p_normal for row in rows})
+    return (replace(row, p_holm=corrected[f"{row.comparison}/{row.robot}"]) for row in rows)
 
 
-def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References) -> Iterator[ControlReturns]:
+def _controls(known: References) -> Iterator[ControlReturns]:
+    study, table, spec = known.study, known.table, known.spec
     for kind in kinds_of(study):
-        through = mapping_label(*kind.kind)
-        of_kind = table[(table["robot"] == spec.name) & (table["arm"] == through) & (table["agent"] != POLICY)]
-        for at_min, of_minute in of_kind[~of_kind["over_time"]].groupby("at_min"):
+        of_kind = rows_where(table, robot=spec.name, arm=mapping_label(*kind.kind), over_time=False)
+        for at_min, of_minute in of_kind[of_kind["agent"] != POLICY].groupby("at_min"):
             rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
             for arm in study.arms_of(kind):
                 means = performances(table, spec.name, arm, at_min)
@@ -281,7 +255,6 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
                 means = mean_returns(of_agent)
                 # Each actor is one sample; for a single actor, each of its episodes is.
                 rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
-            optimum = known.optimum(kind, at_min)
             for name, actors, samples in rows:
                 mean = float(samples.mean())
                 yield ControlReturns(
@@ -294,15 +267,14 @@ def _controls(study: Study, table: DataFrame, spec: RobotSpec, known: References
                     mean_return=mean,
                     standard_error=float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None,
                     random=known.random(kind, at_min),
-                    optimum=None if optimum is None else optimum.best_return,
+                    optimum=known.best_return(kind, at_min),
                     normalised_score=known.score(kind, at_min, mean),
                 )
 
 
 def learning_of(study: Study, folder: Path, spec: RobotSpec, arm: Arm) -> Float64[np.ndarray, "policies parts 3"]:
     """The learning curves of an arm's policies: iterations, episodes and mean return, as in `Policy.learning_curve`."""
-    out = policies_folder(folder, spec, arm)
-    curves = [Policy.load(out / f"p{i}.safetensors").learning_curve[:, :3] for i in range(study.policies)]
+    curves = [policy.learning_curve[:, :3] for policy in policies_of(study, folder, spec, arm)]
     return np.stack(curves).astype(np.float64)
 
 

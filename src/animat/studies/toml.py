@@ -12,7 +12,7 @@ from typing import Any
 
 from animat import plain_file
 from animat.errors import InvalidArgument, InvalidFile
-from animat.records import read_record
+from animat.records import in_file, read_record
 from animat.studies.source import MOST_ENTRIES
 from animat.studies.specification import Study
 from animat.training.settings import FORMER as FORMER_SETTINGS
@@ -36,8 +36,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study's specification.
 
     Keys are the attributes of `animat.studies.specification.Study` and of the tables in it. A key that is left out has
-    its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations
-    (`expand_lists`).
+    its default; an unknown key is refused. Lists in robots, arms and comparisons stand for all combinations.
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.
@@ -61,28 +60,26 @@ def study_from(data: dict[str, Any], path: str | os.PathLike[str]) -> Study:
         if isinstance(table := data.get(name), dict):
             wrote = next((f"[{name}.{key}]" for key, value in table.items() if isinstance(value, dict)), f"[{name}]")
             raise InvalidFile(f"{path}: {name}: expected [[{name}]] for each, and its name in it, got {wrote}")
-    try:
+    with in_file(path):
         return read_record(Study, expand_lists(_with_current_keys(data)))
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error
 
 
 def _with_current_keys(data: dict[str, Any]) -> dict[str, Any]:
-    """The data with former keys renamed; other mistakes are left to later checks."""
+    """The data with former keys renamed."""
     data = _rename_keys(data, FORMER[""])
-    for name, names in FORMER.items():
-        table = data.get(name)
-        if isinstance(table, dict):
-            data[name] = _rename_keys(table, names)
-        elif isinstance(table, list):
-            data[name] = [_rename_keys(each, names) if isinstance(each, dict) else each for each in table]
+    data |= {name: _rename_keys(data[name], names) for name, names in FORMER.items() if name in data}
     culture = data.get("culture")
     if isinstance(culture, dict) and culture.get("channels") == FORMER_CHANNELS:
         data["culture"] = {key: value for key, value in culture.items() if key != "channels"}
     return data
 
 
-def _rename_keys(table: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
+def _rename_keys(table: Any, names: dict[str, str]) -> Any:
+    """The same for a table, or each in a list; anything else is refused later."""
+    if isinstance(table, list):
+        return [_rename_keys(each, names) for each in table]
+    if not isinstance(table, dict):
+        return table
     # If both names are present, the former one stays and is refused as an unknown key.
     return {key if names.get(key, key) in table else names[key]: value for key, value in table.items()}
 
@@ -94,24 +91,18 @@ def study_to_toml(study: Study) -> str:
 
 def _lines(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
     """A table's lines: first its plain values, as TOML requires, then the tables in it."""
-    inner = {key: value for key, value in table.items() if _is_table(value) or _is_tables(value)}
-    lines = [f"{key} = {_format_value(v)}" for key, v in table.items() if key not in inner and v is not None]
-    for key, value in inner.items():
+    plain: list[str] = []
+    inner: list[str] = []
+    for key, value in table.items():
         name = ".".join((*path, key))
-        if _is_table(value):
-            lines += ["", f"[{name}]", *_lines(value, (*path, key))]
-        else:
+        if isinstance(value, dict) and value:
+            inner += ["", f"[{name}]", *_lines(value, (*path, key))]
+        elif isinstance(value, tuple | list) and value and isinstance(value[0], dict):
             for each in value:
-                lines += ["", f"[[{name}]]", *_lines(each, (*path, key))]
-    return lines
-
-
-def _is_table(value: Any) -> bool:
-    return isinstance(value, dict) and bool(value)
-
-
-def _is_tables(value: Any) -> bool:
-    return isinstance(value, tuple | list) and bool(value) and isinstance(value[0], dict)
+                inner += ["", f"[[{name}]]", *_lines(each, (*path, key))]
+        elif value is not None:
+            plain.append(f"{key} = {_format_value(value)}")
+    return plain + inner
 
 
 def _format_value(value: Any) -> str:
@@ -122,11 +113,7 @@ def _format_value(value: Any) -> str:
 
 
 def expand_lists(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A specification's plain data with each combination of listed values as a separate entry.
-
-    `{key}` in an entry's name is replaced by each value. Tables of the wrong type are left to later checks. Raises
-    InvalidArgument for a name that does not distinguish the combinations, or for too many of them.
-    """
+    """Plain data with each combination of listed values as a separate entry; in its name `{key}` becomes the value."""
     expanded = dict(data)
     for table in TABLES:
         if isinstance(entries := data.get(table), list):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -57,8 +56,6 @@ def read_journal(folder: Path) -> list[TrialResult]:
         trials = [read_record(TrialResult, json.loads(line)) for line in path.read_text().splitlines()]
         if [trial.trial for trial in trials] != list(range(len(trials))):
             raise ValueError("trials are missing")
-        if not all(math.isfinite(number) for trial in trials for returns in trial.returns for number in returns):
-            raise ValueError("a return is not a finite number")
     except (OSError, ValueError, RecursionError, TypeError) as error:
         raise InvalidFile(
             f"{path}: expected the journal of a tuning, got a file that cannot be read ({error}); remove it to run its "

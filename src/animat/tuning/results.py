@@ -15,6 +15,7 @@ from animat.report.tuning import draw_history, draw_importance
 from animat.studies.places import RECORDINGS
 from animat.studies.toml import study_to_toml
 from animat.tuning.journal import TrialResult
+from animat.tuning.search import importance_of
 from animat.tuning.space import SEARCHABLE, THROUGH_NEURONS, Settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.writing import write_whole
@@ -81,14 +82,9 @@ class TuningResult:
         return {"best": best, "finals": rows, "trials": counts, "importance": dict(self.importance)}
 
 
-def write_results(
-    folder: Path,
-    tuning: Tuning,
-    trials: Sequence[TrialResult],
-    finals: Sequence[Final],
-    importance: Mapping[str, float],
-) -> TuningResult:
+def write_results(folder: Path, tuning: Tuning, trials: Sequence[TrialResult], finals: Sequence[Final]) -> TuningResult:
     """Write the results of a tuning into its folder, reproducibly."""
+    importance = importance_of(tuning.space, trials)
     # Among equals the study's own, or else the one that was found first.
     best = max(finals, key=lambda final: (final.mean, -final.trial))
     tuned = TuningResult(folder, best, tuple(finals), tuple(trials), importance)

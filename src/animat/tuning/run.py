@@ -9,9 +9,9 @@ import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from animat.differences import with_fingerprint
 from animat.errors import InvalidFile, UnusableData
@@ -29,19 +29,13 @@ from animat.training.group import split_groups
 from animat.training.specification import CHUNKS
 from animat.tuning.journal import TrialResult, read_journal, write_journal
 from animat.tuning.results import Final, TuningResult, write_results
-from animat.tuning.search import Search, expect_optuna, importance_of
-from animat.tuning.space import first_settings, own_settings, with_settings
+from animat.tuning.search import Search, expect_optuna
+from animat.tuning.space import choices_of, first_settings, with_settings
 from animat.tuning.specification import Tuning
 from animat.tuning.tasks import Fit, TrainTrials, Trial, group_by_shape, returns_file, timeline_file
 
 MANIFEST = "tune.json"
 FINALS = "finals"
-
-
-def describe_tuning(tuning: Tuning, sources: dict[str, str]) -> dict[str, Any]:
-    """Everything that determines a tuning's results, like `describe_study`, with a fingerprint over all of it."""
-    versions = {**describe_study(tuning.study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
-    return with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
 
 
 def tune(
@@ -75,8 +69,10 @@ def tune(
     folder, base, progress = Path(folder).absolute(), Path(base).absolute(), progress or Silent()
     study = tuning.study
     # Checked before the folder is created.
-    check_custom(study.robots, [study.arms[0].mapping, *_choices(tuning.space.get("mapping"))])
-    manifest = describe_tuning(tuning, hash_files(source_files(study, base), base))
+    check_custom(study.robots, choices_of("mapping", tuning.space, study))
+    sources = hash_files(source_files(study, base), base)
+    versions = {**describe_study(study, sources)["versions"], "optuna": importlib.metadata.version("optuna")}
+    manifest = with_fingerprint({**tuning.to_dict(), "sources": sources, "versions": versions})
     # Our own processes are reused from one part of the work to the next.
     context: AbstractContextManager[Executor] = (
         PinnedProcesses(own_cores(workers)) if executor is None else nullcontext(executor)
@@ -87,7 +83,7 @@ def tune(
         trials = run.search()
         finals = run.finals(trials)
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        return write_results(folder, tuning, trials, finals, importance_of(tuning.space, trials))
+        return write_results(folder, tuning, trials, finals)
 
 
 class _Run:
@@ -106,9 +102,8 @@ class _Run:
         study, space = self._tuning.study, self._tuning.space
         if not study.needs_neurons:
             return
-        own = own_settings(study)
         names = ("simulator", "conditions", "readouts")
-        choices = [dict.fromkeys((own[name], *_choices(space.get(name)))) for name in names]
+        choices = [choices_of(name, space, study) for name in names]
         variants = [with_settings(study, dict(zip(names, chosen, strict=True))) for chosen in product(*choices)]
         fits = [Job(f"fit/{timeline_file(each).stem}", Fit(each), (JOB,), 3) for each in variants]
         self._run_jobs([Job(JOB, Record(study, base), (), 5), *fits], RECEIPTS, 20, "recordings and simulators")
@@ -142,45 +137,34 @@ class _Run:
         tune = self._tuning.tune
         seeds = draw_seed("tuning", tune.seed, "training"), draw_seed("tuning", tune.seed, "episodes")
         members, rungs = tuple(range(tune.policies)), tune.chunks
-        chunks: dict[int, list[int]] = {trial.number: [] for trial in trials}
-        returns: dict[int, list[tuple[float, ...]]] = {trial.number: [] for trial in trials}
-        diverged, racing = set(), list(trials)
+        results = {trial.number: TrialResult(trial.number, trial.settings, "complete", (), ()) for trial in trials}
         for rung, (first, last) in enumerate(zip([0, *rungs], rungs, strict=False)):
+            racing = [trial for trial in trials if results[trial.number].state == "complete"]
             jobs = [
                 self._job(
                     f"rung-{rung + 1}/trials-{','.join(str(trial.number) for trial in group)}",
-                    TrainTrials(
-                        self._tuning.study, group, members, seeds, tune.episodes, (first, last), place, last < CHUNKS
-                    ),
+                    TrainTrials(self._tuning.study, group, members, seeds, tune.episodes, (first, last), place),
                 )
                 for group in group_by_shape(racing, tune.policies)
             ]
             note = f"trials {trials[0].number} to {trials[-1].number} of {tune.trials}, rung {rung + 1} of {len(rungs)}"
             self._run_jobs(jobs, f"{place}/jobs", sum(job.cost_s for job in jobs), note)
             for trial in racing:
-                trial_returns = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
-                if trial_returns is None:
-                    diverged.add(trial.number)
+                returns = json.loads(returns_file(self._folder / place, trial, last, 0).read_text())
+                result = results[trial.number]
+                if returns is None:
+                    results[trial.number] = replace(result, state="diverged")
                 else:
-                    chunks[trial.number].append(last)
-                    returns[trial.number].append(tuple(trial_returns))
-            racing = [trial for trial in racing if trial.number not in diverged]
+                    chunks, every = (*result.chunks, last), (*result.returns, tuple(returns))
+                    results[trial.number] = replace(result, chunks=chunks, returns=every)
             if last < CHUNKS:
-                ranked = sorted(racing, key=lambda trial: (-sum(returns[trial.number][-1]), trial.number))
-                best = {trial.number for trial in ranked[: -(-len(trials) // tune.keep ** (rung + 1))]}
-                # The settings from before the search are always trained to the end, for comparison.
-                racing = [trial for trial in racing if trial.number in best or trial.number < self._first]
-        complete = {trial.number for trial in racing}
-        return [
-            TrialResult(
-                trial.number,
-                trial.settings,
-                "diverged" if trial.number in diverged else "complete" if trial.number in complete else "stopped",
-                tuple(chunks[trial.number]),
-                tuple(returns[trial.number]),
-            )
-            for trial in trials
-        ]
+                complete = [result for result in results.values() if result.state == "complete"]
+                complete.sort(key=lambda result: (-sum(result.returns[-1]), result.trial))
+                for result in complete[-(-len(trials) // tune.keep ** (rung + 1)) :]:
+                    # The settings from before the search are always trained to the end, for comparison.
+                    if result.trial >= self._first:
+                        results[result.trial] = replace(result, state="stopped")
+        return list(results.values())
 
     def finals(self, results: Sequence[TrialResult]) -> list[Final]:
         """Retrain the first settings and the best of the others with the study's policies, in fresh episodes."""
@@ -195,18 +179,19 @@ class _Run:
         others = [result for result in ranked if result.trial >= self._first][: tune.finalists]
         finalists = [Trial(result.trial, result.settings) for result in (*results[: self._first], *others)]
         seeds = draw_seed("tuning", tune.seed, "final training"), draw_seed("tuning", tune.seed, "final episodes")
+        split = split_groups(study.policies)
         jobs = [
             self._job(
                 f"final/trial-{trial.number}/p{members[0]}",
-                TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS, False),
+                TrainTrials(study, (trial,), members, seeds, study.episodes, (0, CHUNKS), FINALS),
             )
             for trial in finalists
-            for members in split_groups(study.policies)
+            for members in split
         ]
         self._run_jobs(jobs, RECEIPTS, sum(job.cost_s for job in jobs), "retraining the first and the best settings")
-        finals, firsts = [], [members[0] for members in split_groups(study.policies)]
+        finals = []
         for trial in finalists:
-            files = [returns_file(self._folder / FINALS, trial, CHUNKS, first) for first in firsts]
+            files = (returns_file(self._folder / FINALS, trial, CHUNKS, members[0]) for members in split)
             groups = [json.loads(file.read_text()) for file in files]
             returns = None if None in groups else tuple(number for group in groups for number in group)
             finals.append(Final(trial.number, trial.settings, returns))
@@ -227,7 +212,3 @@ class _Run:
 
     def _cost_s(self, policies: int, chunks: int) -> float:
         return policies * self._tuning.study.robots[0].trained_for * chunks / CHUNKS / ITERATIONS_PER_S
-
-
-def _choices(among: Any) -> tuple[Any, ...]:
-    return among if isinstance(among, tuple) else ()

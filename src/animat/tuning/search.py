@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from animat.extras import expect_extra
@@ -81,7 +80,18 @@ def importance_of(space: Space, results: Sequence[TrialResult]) -> dict[str, flo
 
 def distributions(space: Space) -> dict[str, BaseDistribution]:
     """The search as Optuna's distributions, in which a discount may be replaced by its distance from 1."""
-    return {name: _distribution(name, among) for name, among in space.items()}
+    d: Any = expect_optuna().distributions
+    found: dict[str, BaseDistribution] = {}
+    for name, among in space.items():
+        if not isinstance(among, Range):
+            found[name] = d.CategoricalDistribution(among)
+        elif isinstance(getattr(SAC(), name), int):
+            found[name] = d.IntDistribution(int(among.low), int(among.high), log=among.log)
+        elif _is_mirrored(name, among):
+            found[name] = d.FloatDistribution(1 - among.high, 1 - among.low, log=True)
+        else:
+            found[name] = d.FloatDistribution(among.low, among.high, log=among.log)
+    return found
 
 
 def _mirrored(space: Space, settings: Settings) -> Settings:
@@ -91,19 +101,6 @@ def _mirrored(space: Space, settings: Settings) -> Settings:
 
 def _is_mirrored(name: str, among: Range | tuple[Value, ...]) -> bool:
     return name == "discount" and isinstance(among, Range) and among.log
-
-
-def _distribution(name: str, among: Range | tuple[Value, ...]) -> BaseDistribution:
-    d: Any = expect_optuna().distributions
-    if not isinstance(among, Range):
-        distribution: BaseDistribution = d.CategoricalDistribution(among)
-    elif isinstance(asdict(SAC())[name], int):
-        distribution = d.IntDistribution(int(among.low), int(among.high), log=among.log)
-    elif _is_mirrored(name, among):
-        distribution = d.FloatDistribution(1 - among.high, 1 - among.low, log=True)
-    else:
-        distribution = d.FloatDistribution(among.low, among.high, log=among.log)
-    return distribution
 
 
 def expect_optuna() -> Any:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
@@ -24,22 +24,12 @@ from animat.training.specification import Training
 from animat.tuning.space import NUMBERS
 from animat.wrappers import EpisodeLimit
 
-
-class Numbers(NamedTuple):
-    """The settings of one policy that need no compilation; `NUMBERS` are their names."""
-
-    learning_rate: Float[Array, ""]
-    discount: Float[Array, ""]
-    tau: Float[Array, ""]
-    reward_scale: Float[Array, ""]
-    initial_alpha: Float[Array, ""]
-    target_entropy_ratio: Float[Array, ""]
-    entropy_nats: Float[Array, ""]
+Numbers = dict[str, Array]
 
 
 @lru_cache(maxsize=8)
 def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """`begin` and `train_chunk` for several policies, each with its own `Numbers`.
+    """`begin` and `train_chunk` for several policies, each with its own values of `NUMBERS` as the first argument.
 
     The programs of ordinary training (`animat.training.group.programs`) have these settings compiled in.
     """
@@ -47,22 +37,18 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
 
     def beginning(numbers: Numbers, key: Array) -> Learner:
         learner = begin(limited, algorithm, key)
-        return learner._replace(trained=learner.trained._replace(log_alpha=jnp.log(numbers.initial_alpha)))
+        return learner._replace(trained=learner.trained._replace(log_alpha=jnp.log(numbers["initial_alpha"])))
 
     def chunk(numbers: Numbers, learner: Learner, simulator: NeuronSimulator | None, first: Array, last: Array) -> Any:
-        return train_chunk(limited, _traced(algorithm, numbers), learner, simulator, first, last)
+        # Traced numbers bypass the record's checks.
+        settings = object.__new__(SAC)
+        vars(settings).update({**vars(algorithm), **numbers})
+        return train_chunk(limited, settings, learner, simulator, first, last)
 
     return (
         jax.jit(jax.vmap(beginning), compiler_options=COMPILER_OPTIONS),
         jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=1, compiler_options=COMPILER_OPTIONS),
     )
-
-
-def _traced(algorithm: SAC, numbers: Numbers) -> SAC:
-    """The settings with traced numbers, which bypass the record's checks."""
-    settings = object.__new__(SAC)
-    vars(settings).update({**vars(algorithm), **numbers._asdict()})
-    return settings
 
 
 class Trials(SideBySide):
@@ -81,12 +67,10 @@ class Trials(SideBySide):
         # The default numbers stand in, so that trials with other numbers reuse the compiled program.
         defaults = {name: getattr(SAC(), name) for name in NUMBERS}
         training = replace(training, algorithm=replace(algorithms[0], **defaults))
-        numbers = Numbers(
-            *(
-                jnp.repeat(jnp.array([getattr(settings, name) for settings in algorithms], jnp.float32), len(members))
-                for name in Numbers._fields
-            )
-        )
+        numbers = {
+            name: jnp.repeat(jnp.array([getattr(settings, name) for settings in algorithms], jnp.float32), len(members))
+            for name in NUMBERS
+        }
         compiled = programs(training.environment_on(timeline), training.algorithm)
         groups = [Group(training, tuple(members), timeline, "", {})] * len(algorithms)
         # Nobody reads their curves, and a diverging trial must not stop the others.

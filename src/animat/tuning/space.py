@@ -65,23 +65,20 @@ DEFAULT: Space = {
 
 def default_space(study: Study) -> Space:
     """The default search for a study with one robot and one arm."""
-    space: Space = {}
-    has_neurons = study.arms[0].through_neurons
-    defaults: Space = dict(DEFAULT)
-    if not has_neurons and study.robots[0].robot().baseline_commands is None:
-        del defaults["target_entropy_ratio"]
-        defaults["entropy_nats"] = Range(-3.0, 0.5)
-    for name, among in defaults.items():
-        if name in THROUGH_NEURONS and not has_neurons:
-            continue
-        own: Any = own_settings(study)[name]
+    space, own = dict(DEFAULT), own_settings(study)
+    if not study.arms[0].through_neurons:
+        space = {name: among for name, among in space.items() if name not in THROUGH_NEURONS}
+        if study.robots[0].robot().baseline_commands is None:
+            del space["target_entropy_ratio"]
+            space["entropy_nats"] = Range(-3.0, 0.5)
+    for name, among in space.items():
+        value: Any = own[name]
         if isinstance(among, Range):
             # A range that reaches 0 has no logarithm, and is searched uniformly.
-            low, high = min(among.low, own), max(among.high, own)
-            log = among.log and low > 0 and not (name == "discount" and high == 1)
-            space[name] = Range(low, high, log)
-        else:
-            space[name] = among if own in among else (own, *among)
+            low, high = min(among.low, value), max(among.high, value)
+            space[name] = Range(low, high, among.log and low > 0 and not (name == "discount" and high == 1))
+        elif value not in among:
+            space[name] = (value, *among)
     return space
 
 
@@ -95,6 +92,7 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
     if not table:
         raise InvalidArgument("tune.search: expected at least one setting to search for, got none")
     space: Space = {}
+    own = own_settings(study)
     for name, among in table.items():
         where = f"tune.search.{name}"
         if name not in SEARCHABLE:
@@ -109,7 +107,7 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
             if name == "discount" and among.get("log") and among["high"] == 1:
                 raise InvalidArgument(f"{where}: expected high below 1 with log = true, got 1")
         elif isinstance(among, list) and len(among) > 1 and all(each not in among[:i] for i, each in enumerate(among)):
-            space[name] = tuple(_whole(each, own_settings(study)[name]) for each in among)
+            space[name] = tuple(_whole(each, own[name]) for each in among)
         else:
             raise InvalidArgument(
                 f"{where}: expected a range {{ low = ..., high = ... }} or a list of two or more different choices, "
@@ -117,35 +115,26 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
             )
         if name not in FITTING:
             _expect_possible(study, name, space[name], where)
-        own = own_settings(study)[name]
-        if own not in space[name]:
+        if own[name] not in space[name]:
             raise InvalidArgument(
-                f"{where}: expected it to include the study's own setting, {own!r}, which is tried first; got "
-                f"{shown(table[name])}"
+                f"{where}: expected it to include the study's own setting, {own[name]!r}, which is tried first; got "
+                f"{shown(among)}"
             )
-    _expect_fitting(study, space)
-    return space
-
-
-def _expect_fitting(study: Study, space: Space) -> None:
-    """Refuse choices of settings that depend on each other if any combination does not fit."""
-    own = own_settings(study)
-    choices = [value if isinstance(value := space.get(name), tuple) else (own[name],) for name in FITTING]
-    for chosen in itertools.product(*choices):
+    for chosen in itertools.product(*(choices_of(name, space, study) for name in FITTING)):
         try:
             with_settings(study, dict(zip(FITTING, chosen, strict=True)))
         except InvalidArgument as error:
             raise InvalidArgument(f"tune.search: {error}") from error
+    return space
 
 
 def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], where: str) -> None:
     """Refuse a search with settings that the study could not run with; of a range its ends are checked."""
     for value in (among.low, among.high) if isinstance(among, Range) else among:
         try:
-            value = _whole(value, own_settings(study)[name])
             if name == "mapping" and value == "none":
                 raise InvalidArgument("expected mappings, got 'none': tune policies without neurons separately")
-            changed = with_settings(study, {name: value})
+            changed = with_settings(study, {name: _whole(value, own_settings(study)[name])})
             if name == "mapping":
                 mapping_named(changed.arms[0].mapping)
         except InvalidArgument as error:
@@ -164,6 +153,12 @@ def own_settings(study: Study) -> dict[str, Any]:
         "mapping": study.arms[0].mapping,
         **{name: getattr(study.simulators, field) for name, field in _OF_SIMULATORS.items()},
     }
+
+
+def choices_of(name: str, space: Space, study: Study) -> tuple[Any, ...]:
+    """The choices of a setting; only the study's own if it is not searched."""
+    among = space.get(name)
+    return among if isinstance(among, tuple) else (own_settings(study)[name],)
 
 
 def first_settings(study: Study, space: Space) -> list[Settings]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from animat.errors import InvalidArgument, InvalidFile
-from animat.records import Seed, Whole, read_record, record
+from animat.records import Seed, Whole, in_file, read_record, record
 from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
 from animat.studies.toml import read_toml, study_from
@@ -71,21 +71,12 @@ class Tuning:
 
     def to_dict(self) -> dict[str, Any]:
         """The specification as plain data."""
-        space = {
-            name: {"low": among.low, "high": among.high, "log": among.log} if isinstance(among, Range) else list(among)
-            for name, among in self.space.items()
-        }
-        tune = {name: getattr(self.tune, name) for name in self.tune.__dataclass_fields__}
-        return {"study": asdict(self.study), "tune": {**tune, "search": space}}
+        space = {name: asdict(of) if isinstance(of, Range) else list(of) for name, of in self.space.items()}
+        return {"study": asdict(self.study), "tune": {**asdict(self.tune), "search": space}}
 
 
 def tuning_of(study: Study, tune: Tune) -> Tuning:
-    """A tuning of a study, with the two checked against each other.
-
-    Raises:
-        InvalidArgument: for more than one robot or arm, an arm that is not trained, a robot that is stepped outside
-            JAX, lessons or drawn recordings, or as in `read_space`.
-    """
+    """A tuning of a study; raises InvalidArgument for a study that cannot be tuned, and as `read_space` does."""
     for name in ("robots", "arms"):
         if (n := len(getattr(study, name))) != 1:
             raise InvalidArgument(f"{name}: expected one [[{name}]] to tune for, got {n}")
@@ -110,7 +101,5 @@ def read_tuning(path: str | os.PathLike[str]) -> Tuning:
     if not data:
         raise InvalidFile(f"{path}: expected a study's settings in addition to [tune], such as [[robots]], got none")
     study = study_from(data, path)
-    try:
+    with in_file(path):
         return tuning_of(study, read_record(Tune, tune, "tune"))
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error

@@ -47,8 +47,7 @@ class Fit(StudyTask):
         timeline = fit_simulators(self.study, read_series(self.study, folder))
         if len(timeline.conditions) < 2:
             raise UnusableData(one_condition(timeline))
-        save_timeline(timeline, folder / timeline_file(self.study))
-        return [folder / timeline_file(self.study)]
+        return [save_timeline(timeline, folder / timeline_file(self.study))]
 
 
 @dataclass(frozen=True)
@@ -68,13 +67,11 @@ class TrainTrials(StudyTask):
     that is easiest to control would win. All trials use the same random numbers.
 
     Attributes:
-        trials: the trials.
-        members: numbers of their policies.
-        seeds: seeds of training and of the episodes.
-        episodes: episodes per policy.
+        members: numbers of the trials' policies.
+        seeds: of training and of the episodes.
+        episodes: per policy.
         chunks: the chunks of training, from the first up to but excluding the last.
-        place: folder of the learners and the returns, relative to the tuning's.
-        is_continued: whether the learners are stored for the next rung.
+        place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.
     """
 
     sizes = ("algorithm",)
@@ -85,17 +82,14 @@ class TrainTrials(StudyTask):
     episodes: int
     chunks: tuple[int, int]
     place: str
-    is_continued: bool
 
     @property
     def reads(self) -> tuple[str, ...]:
         """Places of the files that it reads, which other jobs wrote."""
         study, first = with_settings(self.study, self.trials[0].settings), self.chunks[0]
-        places = (
-            [learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials] if first else []
-        )
+        places = [_learner_file(Path(self.place), trial, first, self.members[0]) for trial in self.trials if first]
         if study.arms[0].through_neurons:
-            places += {timeline_file(each) for each in (study, replace(study, simulators=_judge(self.study, study)))}
+            places += {timeline_file(each) for each in (study, _judge(self.study, study))}
         return tuple(place.as_posix() for place in places)
 
     def make(self, folder: Path, progress: Progress) -> list[Path]:
@@ -105,12 +99,12 @@ class TrainTrials(StudyTask):
         training = training_of(studies[0], self.study.robots[0], studies[0].arms[0])
         training = replace(training, seed=self.seeds[0], policies=len(self.members))
         timeline = _timeline(folder, studies[0])
-        judging = _timeline(folder, replace(studies[0], simulators=_judge(self.study, studies[0])))
+        judging = _timeline(folder, _judge(self.study, studies[0]))
         together = Trials(training, timeline, algorithms, self.members)
 
         numbers = ",".join(str(trial.number) for trial in self.trials)
         checkpoint = place / f"t{numbers}-p{self.members[0]}-to-{last}-of-{CHUNKS}.npz"
-        learners = [learner_file(place, trial, first, self.members[0]) for trial in self.trials if first]
+        learners = [_learner_file(place, trial, first, self.members[0]) for trial in self.trials if first]
         files = [checkpoint] if checkpoint.exists() else learners
         done = together.resume(*files) if files else 0
         written = time.monotonic()
@@ -133,8 +127,8 @@ class TrainTrials(StudyTask):
                 returns = means.tolist() if np.isfinite(means).all() else None
             file = returns_file(place, trial, last, self.members[0])
             files.append(write_whole(file, json.dumps(returns) + "\n"))
-            if self.is_continued:
-                files.append(learner_file(place, trial, last, self.members[0]))
+            if last < CHUNKS:
+                files.append(_learner_file(place, trial, last, self.members[0]))
                 together.save_checkpoint(files[-1], i)
         checkpoint.unlink(missing_ok=True)
         return files
@@ -142,17 +136,16 @@ class TrainTrials(StudyTask):
 
 def returns_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
     """The JSON file with the mean return of each of a trial's policies after so many chunks; null if not finite."""
-    return place / f"t{trial.number}-p{member}-{chunks}.json"
+    return _learner_file(place, trial, chunks, member).with_suffix(".json")
 
 
-def learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
-    """The file of a trial's learners after so many chunks."""
+def _learner_file(place: Path, trial: Trial, chunks: int, member: int) -> Path:
     return place / f"t{trial.number}-p{member}-{chunks}.npz"
 
 
-def _judge(own: Study, trial: Study) -> Any:
-    """The simulators that judge a trial: of the study's own kind, with the trial's conditions."""
-    return replace(trial.simulators, kind=own.simulators.kind)
+def _judge(own: Study, trial: Study) -> Study:
+    """The study that judges a trial: with simulators of the study's own kind, for the trial's conditions."""
+    return replace(trial, simulators=replace(trial.simulators, kind=own.simulators.kind))
 
 
 def _timeline(folder: Path, study: Study) -> SimulatorTimeline | None:
