@@ -1,6 +1,6 @@
 // Views made of tables, lists and charts.
 
-import { Frame, colour, list, make, series, shown, spanOf, table, unpacked } from "./draw.js";
+import { Frame, colour, list, listColours, make, series, shown, spanOf, table, unpacked } from "./draw.js";
 
 // Typographic minus, at-least and plus-minus signs, in texts as in numbers.
 const signs = (text) => text.replace(/(^|[\s(,])-(?=\d)/g, "$1\u2212").replaceAll(">=", "\u2265").replaceAll("+- ", "\u00b1\u00a0");
@@ -67,11 +67,7 @@ export class BlocksPage {
       frame.text(what, from, 10, colour("faint"));
       free = from + wide + 6;
     }
-    legend.replaceChildren(...named.map((each) => {
-      const mark = make("i", { className: each.style === "dashed" ? "dashed" : "" });
-      mark.style.color = paint(each);
-      return make("span", {}, mark, each.name);
-    }));
+    listColours(legend, named.map((each) => [each.name, paint(each), each.style === "dashed" ? "dashed" : ""]));
   }
 
   raster({ body, words, legend }, block) {
