@@ -15,6 +15,7 @@ from animat.report.style import (
     WINDOW,
     Axes,
     Figure,
+    add_colour_bar,
     add_common_legend,
     condition_colours,
     new_figure,
@@ -134,6 +135,4 @@ def _draw_rates(
         origin="lower",
         interpolation="nearest",
     )
-    bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02, shrink=0.6, anchor=(0.0, 0.0))
-    bar.set_label("firing rate (Hz per channel)", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+    add_colour_bar(axes, drawn, "firing rate (Hz per channel)", pad=0.02, shrink=0.6, anchor=(0.0, 0.0))
