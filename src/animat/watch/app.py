@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -132,13 +133,9 @@ def _response(answer: Callable[[_Query], Any], query: _Query) -> Response:
 
 
 def _number(query: _Query, name: str) -> float | None:
-    raw = query.get(name)
-    if raw is None:
+    if name not in query:
         return None
-    try:
-        value = float(raw)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) < 1e15:
-        raise InvalidArgument(f"{name}: expected a number, got {text(raw, 40)}")
-    return value
+    with suppress(ValueError):
+        if abs(value := float(query[name])) < 1e15:
+            return value
+    raise InvalidArgument(f"{name}: expected a number, got {text(query[name], 40)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from animat.closed_loop.session_data import LOG_FILE
@@ -53,24 +54,14 @@ def place_within(folder: Path, place: str) -> Path:
 
 def _folders(folder: Path) -> Iterator[Path]:
     """The folder and its subfolders, level by level."""
-    level, seen = [folder], 0
-    for _ in range(_DEPTH):
-        below: list[Path] = []
-        for parent in level:
-            seen += 1
-            if seen > _MOST_FOLDERS:
-                return
-            yield parent
-            try:
-                with os.scandir(parent) as entries:
-                    below += [
-                        parent / entry.name
-                        for entry in entries
-                        if entry.is_dir(follow_symlinks=False) and entry.name[0] != "." and entry.name not in _SKIPPED
-                    ]
-            except OSError:
-                continue
-        level = sorted(below)
+    folders = [(folder, 1)]
+    # The list grows while it is read.
+    for parent, depth in islice(folders, _MOST_FOLDERS):
+        yield parent
+        if depth < _DEPTH:
+            _, names, _ = next(os.walk(parent), ("", [], []))
+            below = [parent / name for name in sorted(names) if name[0] != "." and name not in _SKIPPED]
+            folders += [(each, depth + 1) for each in below if not each.is_symlink()]
 
 
 def _in_folder(root: Path, folder: Path) -> Iterator[Item]:

@@ -22,6 +22,8 @@ from animat.watch.view import View, in_blocks, titled
 
 _LARGEST = 2**31
 """Most bytes of a file that is read."""
+_Content = tuple[Recording | None, Inspection | None, str]
+"""A recording and its inspection, or why there is none."""
 _Shares = tuple[float, dict[str, float]]
 """A recording's start, and the share of each condition's responses above the median."""
 
@@ -34,9 +36,7 @@ class RecordingView(View):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self._key: tuple[Path, float] | None = None
-        self._recording: Recording | None = None
-        self._inspection: Inspection | None = None
-        self._error = ""
+        self._content: _Content = None, None, ""
         self._shares: dict[Path, _Shares] = {}
 
     def _about(self) -> dict[str, Any]:
@@ -49,15 +49,15 @@ class RecordingView(View):
         if not times_s:
             raise InvalidFile(f"{self.folder}: expected recordings, but they are gone")
         newest = max(times_s, key=lambda file: (times_s[file], file.name))
-        self._look(times_s, newest)
-        recording, in_progress = self._recording, self.folder / UNDER_WAY in times_s
+        recording, inspection, error = self._look(times_s, newest)
+        in_progress = self.folder / UNDER_WAY in times_s
         n_whole = len(times_s) - in_progress
-        blocks = [facts("Recordings", self._facts(n_whole, newest))]
+        blocks = [facts("Recordings", _facts(inspection, n_whole, newest))]
         span: dict[str, Any] = {"from_s": 0.0, "to_s": 0.0, "end_s": 0.0}
         if recording is not None:
             raster, span = _raster(recording, to_s, span_s)
             blocks += [raster, _rates(recording)]
-        blocks += [_shares_table(self._shares, len(times_s)), *_inspected(self._inspection)]
+        blocks += [_shares_table(self._shares, len(times_s)), *_inspected(inspection)]
         state, message = "ended", "1 recording" if n_whole == 1 else f"{n_whole} recordings"
         if running is False and in_progress:
             state = "silent"
@@ -71,37 +71,36 @@ class RecordingView(View):
                 )
             elif recording is not None:
                 message = f"{recording.duration_s:.0f} s of the one in progress are shown"
-        return in_blocks({"state": state, "message": message, **span}, blocks, self._error)
+        return in_blocks({"state": state, "message": message, **span}, blocks, error)
 
-    def _facts(self, n_whole: int, newest: Path) -> list[tuple[str, Any]]:
-        shown = "the one in progress, as far as it has come" if newest.name == UNDER_WAY else newest.name
-        rows: list[tuple[str, Any]] = [("complete", n_whole), ("shown", shown)]
-        inspection = self._inspection
-        if inspection is not None:
-            rows += [
-                ("verdict", inspection.verdict),
-                ("stimuli", inspection.n_stimuli),
-                ("spikes", inspection.n_spikes),
-                ("channels", inspection.n_channels),
-                ("seconds", inspection.duration_s),
-                ("bursts", inspection.n_bursts),
-                ("presented", inspection.presentation or "not known"),
-            ]
-        return rows
-
-    def _look(self, times_s: dict[Path, float], newest: Path) -> None:
+    def _look(self, times_s: dict[Path, float], newest: Path) -> _Content:
         """Read the newest if it changed, or one other that has not been inspected yet: each takes a second or two."""
         self._shares = {file: row for file, row in self._shares.items() if file in times_s}
         if self._key != (newest, times_s[newest]):
-            self._key = newest, times_s[newest]
-            self._recording, self._inspection, self._error = _read(newest)
-            self._shares[newest] = _shares_of(self._inspection)
+            self._key, self._content = (newest, times_s[newest]), _read(newest)
+            self._shares[newest] = _shares_of(self._content[1])
         elif (other := next((file for file in times_s if file not in self._shares), None)) is not None:
             self._shares[other] = _shares_of(_read(other)[1])
+        return self._content
 
 
-def _read(file: Path) -> tuple[Recording | None, Inspection | None, str]:
-    """A recording and its inspection, or why there is none."""
+def _facts(inspection: Inspection | None, n_whole: int, newest: Path) -> list[tuple[str, Any]]:
+    shown = "the one in progress, as far as it has come" if newest.name == UNDER_WAY else newest.name
+    rows: list[tuple[str, Any]] = [("complete", n_whole), ("shown", shown)]
+    if inspection is not None:
+        rows += [
+            ("verdict", inspection.verdict),
+            ("stimuli", inspection.n_stimuli),
+            ("spikes", inspection.n_spikes),
+            ("channels", inspection.n_channels),
+            ("seconds", inspection.duration_s),
+            ("bursts", inspection.n_bursts),
+            ("presented", inspection.presentation or "not known"),
+        ]
+    return rows
+
+
+def _read(file: Path) -> _Content:
     from animat.recordings.reading import read_recording
 
     try:

@@ -6,7 +6,6 @@ import os
 import time
 import zlib
 from array import array
-from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -80,16 +79,14 @@ class Tail:
 
     def record(self, number: int) -> Record | None:
         """A record; None if it is not whole, in which case the log ends before it."""
-        if number in self._kept:
-            self._kept.move_to_end(number)
-            return self._kept[number]
-        data = self._data(number)
-        if data is None:
-            return None
-        self._kept[number] = record = parse_record(self.path, data)
-        if len(self._kept) > _KEPT:
-            self._kept.popitem(last=False)
-        return record
+        if number not in self._kept:
+            data = self._data(number)
+            if data is None:
+                return None
+            if len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[number] = parse_record(self.path, data)
+        return self._kept[number]
 
     def peek(self, number: int) -> dict[str, Any] | None:
         """The fields of a record, without keeping it; None if it is not whole."""
@@ -109,8 +106,7 @@ class Tail:
         self._damaged_at = place
         self.damage = f"{self._places[-1] - place:,} bytes after the last whole record are damaged"
         del self._places[number + 1 :]
-        for later in [kept for kept in self._kept if kept >= number]:
-            del self._kept[later]
+        self._kept.clear()
         return None
 
     def _open(self) -> int:
@@ -136,5 +132,5 @@ class Tail:
 
     def _begin(self) -> None:
         self._places = array("Q", [len(MAGIC)])
-        self._kept: OrderedDict[int, Record] = OrderedDict()
+        self._kept: dict[int, Record] = {}
         self._damaged_at = -1

@@ -37,7 +37,6 @@ class Moment:
     total: float = 0.0
     delivered: str = ""
     rate_hz: float = math.nan
-    ended: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,6 +132,5 @@ class _Reading:
                 total=before.total + (tick.reward or 0.0),
                 delivered=self._conditions[tick.delivered] if tick.pulse_time_s else "",
                 rate_hz=tick.rate_hz,
-                ended=tick.terminated or tick.truncated,
             )
         )

@@ -86,14 +86,10 @@ def scene_of_policies(
                 pulses = 1 if first.presentation is None else first.presentation.pulses
                 label, period_s = condition.label, pulses / (condition.frequencies_hz or (1 / _WITHOUT_NEURONS_S,))[0]
             time_s += period_s
-            ended = moved.terminated or moved.truncated or iteration + 1 >= robot.episode_limit
-            rate_hz = float(np.mean(response.rate_hz))
+            at, rate_hz = tuple(observation.tolist()), float(np.mean(response.rate_hz))
             commands = tuple(u.tolist()) if u.ndim else float(u)
-            at = tuple(observation.tolist())
-            moments.append(
-                Moment(time_s, name, episode, iteration, episode, at, commands, total, label, rate_hz, ended)
-            )
-            if ended or time_s >= to_s:
+            moments.append(Moment(time_s, name, episode, iteration, episode, at, commands, total, label, rate_hz))
+            if moved.terminated or moved.truncated or time_s >= to_s:
                 break
         time_s += _PAUSE_S
     if from_s >= time_s:

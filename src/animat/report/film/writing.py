@@ -48,14 +48,12 @@ def check_film(path: str | os.PathLike[str]) -> None:
 
 
 def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-    """Film a scene in real time, as .mp4 or .gif; the file is written atomically.
+    """Film a scene in real time, as .mp4 or .gif (`check_film`); the file is written atomically.
 
     Raises:
-        InvalidArgument: as `check_film`.
         InvalidFile: if it cannot be written.
     """
     path = Path(path)
-    check_film(path)
     kind, frames = path.suffix.lower(), Frames(scene, pictures_of(scene))
     pictures = _pictures(scene, frames, FRAMES_PER_S[kind], progress or Silent())
     with atomic_write(path) as beside:
