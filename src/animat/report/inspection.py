@@ -92,9 +92,6 @@ def draw_inspection(
 
     Files are named after the inspection; `file_format` is one of `FORMATS`. For a recording without stimuli only a
     raster with its bursts is drawn, for a response table neither raster nor post-stimulus histogram.
-
-    Raises:
-        InvalidFile: if a file cannot be written.
     """
     responses, figures = inspection.responses, {}
     if isinstance(recording, Recording):

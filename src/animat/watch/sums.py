@@ -28,12 +28,10 @@ class Sums:
 
     Attributes:
         counted: number of records counted.
-        outline: their outline.
         totals: for each record the return of its episode so far; NaN without a tick.
         wall_s: of the last tick, on the program's clock; None before the first.
         on_electrode: number of pulses on each electrode.
         faults: the last ones: when, on the session's clock, and what happened.
-        n_faults: number of all faults.
         percentiles: the thresholds since each change.
         strange: number of records that are not understood.
     """
