@@ -40,11 +40,9 @@ def chart(
     }  # fmt: skip
 
 
-def curve(
-    name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str = "", most: int = 2000
-) -> dict[str, Any]:
+def curve(name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str) -> dict[str, Any]:
     """A curve of a chart: its name in the legend (empty: none), and its points, thinned if there are many."""
-    step = max(1, math.ceil(len(x) / most))
+    step = max(1, math.ceil(len(x) / 2000))
     xs, ys = ([number(float(value)) for value in values[::step]] for values in (x, y))
     return {"name": text(name), "x": xs, "y": ys, "style": style, "colour": colour}
 

@@ -6,8 +6,6 @@ import json
 import math
 from typing import Any
 
-_MOST_LETTERS = 300
-
 
 def number(value: Any) -> float | None:
     """A finite number; None for anything else."""
@@ -22,7 +20,7 @@ def numbers(values: Any) -> list[float | None]:
     return [] if number(values) is None else [number(values)]
 
 
-def text(value: Any, most: int = _MOST_LETTERS) -> str:
+def text(value: Any, most: int = 300) -> str:
     """A value as text that a page can show, truncated if it is long."""
     string = value if isinstance(value, str) else json.dumps(value, default=str)
     # Halves of surrogate pairs cannot be sent.

@@ -20,8 +20,6 @@ from animat.watch.spikes import packed
 from animat.watch.state import is_locked
 from animat.watch.view import View, in_blocks, titled
 
-_LARGEST = 2**31
-"""Most bytes of a file that is read."""
 _Content = tuple[Recording | None, Inspection | None, str]
 """A recording and its inspection, or why there is none."""
 _Shares = tuple[float, dict[str, float]]
@@ -104,7 +102,7 @@ def _read(file: Path) -> _Content:
     from animat.recordings.reading import read_recording
 
     try:
-        recording = read_recording(expect_plain_file(file, _LARGEST))
+        recording = read_recording(expect_plain_file(file, most_bytes=2**31))
         return recording, inspect_recording(recording, name=file.name), ""
     except AnimatError as error:
         return None, None, text(" ".join(str(error).split()))

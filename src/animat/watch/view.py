@@ -13,10 +13,8 @@ from animat.folder_kinds import MARKERS, Kind
 from animat.progress import Speed
 from animat.watch.files import json_of
 
-MOST_SPAN_S = 60.0
-"""Longest span shown at once."""
-_SPEED_S = 60.0
-"""Over which the speed of work is measured."""
+_MOST_SPAN_S = 60.0
+"""Longest span shown at once, and over which the speed of work is measured."""
 
 
 class View(abc.ABC):
@@ -31,7 +29,7 @@ class View(abc.ABC):
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.file = folder, folder / MARKERS[self.kind][0]
-        self._speed = Speed(_SPEED_S)
+        self._speed = Speed(_MOST_SPAN_S)
 
     def about(self) -> dict[str, Any]:
         """What does not change while work goes on; errors are those of `view`."""
@@ -45,8 +43,8 @@ class View(abc.ABC):
             InvalidFile: if the folder's files cannot be read, or hold something else.
             InvalidArgument: for an invalid span.
         """
-        if not 0 < span_s <= MOST_SPAN_S:
-            raise InvalidArgument(f"span: expected above 0 and at most {MOST_SPAN_S:g} s, got {span_s:g}")
+        if not 0 < span_s <= _MOST_SPAN_S:
+            raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
         with self._reading():
             return self._view(to_s, span_s)
 
