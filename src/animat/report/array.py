@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.recordings.recording import Recording
-from animat.report.style import GREY, RED, Axes, Figure, add_colour_bar, add_legend, new_figure, style_axes
+from animat.report.style import GREY, RED, Axes, Figure, add_legend, new_figure, style_axes
 from animat.stimulation.selection import Selection
 from animat.tables import UNKNOWN
 
@@ -35,7 +35,9 @@ def draw_array(recording: Recording) -> Figure:
     colours: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
     drawn = axes.scatter(*places_um, s=9, linewidths=0, **colours)
     included = ", stimulated time included" if len(stimuli) else ""
-    add_colour_bar(axes, drawn, f"firing rate{included} (Hz)", shrink=0.7)
+    bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
+    bar.set_label(f"firing rate{included} (Hz)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
     stimulated = np.unique(stimuli.electrodes[stimuli.electrodes != UNKNOWN])
     place = {int(e): i for i, e in enumerate(channels.electrode.tolist()) if e != UNKNOWN and known[i]}
     rows = [place[e] for e in stimulated.tolist() if e in place]

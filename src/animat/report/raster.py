@@ -15,7 +15,6 @@ from animat.report.style import (
     WINDOW,
     Axes,
     Figure,
-    add_colour_bar,
     add_common_legend,
     add_legend,
     condition_colours,
@@ -166,4 +165,6 @@ def _draw_rates(
         origin="lower",
         interpolation="nearest",
     )
-    add_colour_bar(axes, drawn, "firing rate (Hz per channel)", pad=0.02, shrink=0.6, anchor=(0.0, 0.0))
+    bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02, shrink=0.6, anchor=(0.0, 0.0))
+    bar.set_label("firing rate (Hz per channel)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)

@@ -85,13 +85,6 @@ def condition_colours(units: Sequence[str]) -> list[str]:
     return list(PALETTE[:n])
 
 
-def add_colour_bar(axes: Axes, drawn: Any, label: str, **place: Any) -> None:
-    """Add a bar for the colours of what was drawn; `place` as for `Figure.colorbar`."""
-    bar = axes.figure.colorbar(drawn, ax=axes, extend="max", **place)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=8)
-
-
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure atomically as PNG, SVG or PDF, by the path's suffix.
 
