@@ -15,7 +15,7 @@ from animat.watch.files import json_of
 from animat.watch.plain import text
 from animat.watch.state import is_locked, state_of
 from animat.watch.study import share_of
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.view import View, in_blocks
 
 _DONE, _COMPARISONS = "jobs/report.json", "tables/comparisons.csv"
 _MOST_CULTURES, _MOST_BYTES = 10_000, 2**20
@@ -33,8 +33,8 @@ class CulturesView(View):
         super().__init__(folder)
         self._compared: dict[str, _Means] = {}
 
-    def _about(self) -> dict[str, Any]:
-        return titled(f"study over {len(self._names()):,} cultures")
+    def _title(self) -> str:
+        return f"study over {len(self._names()):,} cultures"
 
     def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         names, failed = self._names(), self._failed()

@@ -18,7 +18,7 @@ from animat.watch.discovery import recordings_in
 from animat.watch.plain import text
 from animat.watch.spikes import packed
 from animat.watch.state import is_locked
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.view import View, in_blocks
 
 _Content = tuple[Recording | None, Inspection | None, str]
 """A recording and its inspection, or why there is none."""
@@ -37,8 +37,8 @@ class RecordingView(View):
         self._content: _Content = None, None, ""
         self._shares: dict[Path, _Shares] = {}
 
-    def _about(self) -> dict[str, Any]:
-        return titled("recordings")
+    def _title(self) -> str:
+        return "recordings"
 
     def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         # Before the files are listed: a program removes the recording in progress before it unlocks the folder.

@@ -15,6 +15,7 @@ import numpy as np
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, STOP_FILE
+from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import format_duration
 from animat.stimulation.stimulus import NOTHING
@@ -77,6 +78,10 @@ class SessionView(View):
                     earlier.append(past["observation"])
             return picture_of(self._robot, tick, earlier[::-1])
 
+    def _title(self) -> str:
+        fields = self._fields
+        return f"{text(fields['loop']['robot']['name'])} on the {text(fields.get('culture', ''))} culture"
+
     def _about(self) -> dict[str, Any]:
         self._look()
         header, fields = self._header, self._fields
@@ -85,7 +90,7 @@ class SessionView(View):
         mapping = mapped(loop.get("mapping")).get("name", loop.get("mapping"))
         return {
             "generation": self.tail.generation,
-            "title": f"{text(loop['robot']['name'])} on the {text(fields.get('culture', ''))} culture",
+            "title": self._title(),
             "conditions": list(map(text, header.conditions)),
             "observed": list(map(text, header.observed)),
             "readouts": list(map(text, header.readouts)),
@@ -258,8 +263,6 @@ def _span(fields: dict[str, Any]) -> tuple[float, float] | None:
 
 def _thresholds(mapping: Any) -> list[int]:
     """Which of the eleven percentiles a mapping compares responses with; both ends if not known."""
-    from animat.coding.mapping import Thresholds
-
     known = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
     return known.get(mapping, [0, 10])
 

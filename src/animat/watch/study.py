@@ -10,7 +10,7 @@ from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes
 from animat.watch.plain import text
 from animat.watch.state import changed_s, state_of
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.view import View, in_blocks
 
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
 _CONTEXT = "context study"
@@ -22,12 +22,12 @@ class StudyView(View):
 
     kind = "study"
 
-    def _about(self) -> dict[str, Any]:
+    def _title(self) -> str:
         manifest = self._manifest()
         names = [spec["name"] for spec in manifest.get("study", {}).get("robots", ())]
         names += manifest.get(_CONTEXT, {}).get("robots", ())
         robots, kind = ", ".join(map(text, names)), _CONTEXT if _CONTEXT in manifest else "study"
-        return titled(f"{kind} {f'of {robots}' if robots else ''}".strip())
+        return f"{kind} {f'of {robots}' if robots else ''}".strip()
 
     def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         self._manifest()

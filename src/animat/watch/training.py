@@ -14,7 +14,7 @@ from animat.watch.files import JobProgress, curve_of_policy, curves_of_checkpoin
 from animat.watch.learning import Curves, learning_charts, levels_of
 from animat.watch.plain import settings, text
 from animat.watch.state import changed_s, state_of
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.view import View, in_blocks
 
 _MOST_POLICIES = 1000
 _CHUNKS = 60
@@ -30,8 +30,8 @@ class TrainingView(View):
         super().__init__(folder)
         self._read: dict[Path, tuple[float, Any]] = {}
 
-    def _about(self) -> dict[str, Any]:
-        return titled(f"training of {text(self._manifest()['training']['robot']['name'])} policies")
+    def _title(self) -> str:
+        return f"training of {text(self._manifest()['training']['robot']['name'])} policies"
 
     def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         manifest = self._manifest()

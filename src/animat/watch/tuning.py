@@ -13,7 +13,7 @@ from animat.watch.files import json_of
 from animat.watch.plain import settings, short, text
 from animat.watch.state import state_of
 from animat.watch.study import running_jobs, running_table
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.view import View, in_blocks
 
 _MOST_SHOWN = 300
 _STATES = {"complete": "complete", "stopped": "stopped early", "diverged": "diverged"}
@@ -24,9 +24,9 @@ class TuningView(View):
 
     kind = "tuning"
 
-    def _about(self) -> dict[str, Any]:
+    def _title(self) -> str:
         robots = ", ".join(text(spec["name"]) for spec in self._manifest()["study"]["robots"])
-        return titled(f"tuning {f'on {robots}' if robots else ''}".strip())
+        return f"tuning {f'on {robots}' if robots else ''}".strip()
 
     def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         planned = self._manifest()["tune"]["trials"]

@@ -51,8 +51,11 @@ class View(abc.ABC):
     def close(self) -> None:  # noqa: B027 - most keep nothing open
         """Close files."""
 
+    def _about(self) -> dict[str, Any]:
+        return {"generation": 0, "title": self._title()}
+
     @abc.abstractmethod
-    def _about(self) -> dict[str, Any]: ...
+    def _title(self) -> str: ...
 
     @abc.abstractmethod
     def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]: ...
@@ -73,11 +76,6 @@ class View(abc.ABC):
         if not content:
             raise InvalidFile(f"{self.file}: expected the description of a {self.kind}, got none")
         return content
-
-
-def titled(title: str) -> dict[str, Any]:
-    """The description of an item with only a title."""
-    return {"generation": 0, "title": title}
 
 
 def in_blocks(state: dict[str, Any], blocks: Sequence[dict[str, Any]], damage: str = "") -> dict[str, Any]:
