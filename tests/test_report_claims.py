@@ -444,9 +444,9 @@ def test_files_that_a_page_names_are_links() -> None:
 
 def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> None:
     minutes = np.array([0.0, 10.0])
-    courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(6))
+    courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(8))
     panels = [
-        Courses("1-threshold", courses, np.zeros(2), np.ones(2), ((0.0, 1.1),), 2),
+        Courses("1-threshold", courses, np.zeros(2), np.ones(2), ((0.0, 1.1),)),
         Courses("linear", (Course("linear", minutes, np.zeros((2, 2))),), np.zeros(2)),
     ]
     figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
@@ -458,6 +458,7 @@ def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> N
         "linear",
         "c5",
     } <= said
+    assert not {"c6", "c7"} & said
     assert "2 more arms" in figure.axes[0].get_title(loc="left")
     colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
     (dashed,) = [line for line in figure.axes[0].lines if "coarse" in str(line.get_label())]

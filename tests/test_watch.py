@@ -20,8 +20,7 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.session import read_session
 from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
-from animat.watch.app import stop_session
-from animat.watch.session import SessionView, _in_force
+from animat.watch.session import SessionView, _in_force, stop_session
 from animat.watch.tail import Tail
 from watching import session_in
 

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from animat.closed_loop.log import read_log
 from animat.closed_loop.session_data import LOG_FILE
 from animat.errors import AnimatError
-from animat.watch.picture import picture_of
 from animat.watch.session import SessionView
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
@@ -101,9 +100,8 @@ def looked_at(folder: Path) -> None:
         contents = [view.about(), *(view.view(to_s, 30.0) for to_s in (None, 0.5, -1.0))]
         json.dumps(contents, allow_nan=False).encode()
         picture = contents[1]["picture"]
-        if picture is not None and (tick := view.tick_at(picture)) is not None:
-            drawn = picture_of(view.robot_data, *tick)
-            assert drawn is None or drawn.startswith(b"\x89PNG")
+        drawn = None if picture is None else view.picture(picture)
+        assert drawn is None or drawn.startswith(b"\x89PNG")
     except AnimatError as error:
         assert LOG_FILE in str(error)
     finally:

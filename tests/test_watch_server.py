@@ -146,7 +146,7 @@ def test_stop_is_posted_from_the_page_alone(folder: Path, tmp_path: Path) -> Non
     header = read_log(folder / "outside" / LOG_FILE).header
     LogWriter(tmp_path / LOG_FILE, header).close()
     app = app_for(tmp_path, TOKEN, PORT)
-    assert asked(app, "stop").status == 405
+    assert asked(app, "stop").status == 404
     assert asked(app, "stop", method="POST").status == 403
     assert not (tmp_path / STOP_FILE).exists()
     assert asked(app, "stop", method="POST", origin=OWN, **{"in": ""}).json == {"stopped": True}

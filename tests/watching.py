@@ -70,9 +70,11 @@ def asked(
         "headers": headers, "client": ("127.0.0.1", 50000), "server": ("127.0.0.1", PORT),
     }  # fmt: skip
     sent: list[Any] = []
+    received = iter([{"type": "http.request", "body": b"", "more_body": False}])
 
     async def receive() -> Any:
-        return {"type": "http.request", "body": b"", "more_body": False}
+        # Nothing follows the request while the client waits for the answer.
+        return next(received, None) or await asyncio.Event().wait()
 
     async def send(message: Any) -> None:
         sent.append(message)

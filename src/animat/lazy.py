@@ -1,11 +1,11 @@
-"""JAX for modules that must be importable without it, imported on first use; `Array` and `Axes` are annotations."""
+"""JAX for modules that must be importable without it, imported on first use; the other names are annotations."""
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["Array", "Axes", "jax", "jnp"]
+__all__ = ["Array", "Axes", "Figure", "jax", "jnp"]
 
 
 class _LazyModule:
@@ -23,5 +23,7 @@ if TYPE_CHECKING:
     import jax.numpy as jnp
     from jax import Array
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 else:
-    jax, jnp, Array, Axes = _LazyModule("jax"), _LazyModule("jax.numpy"), Any, Any
+    jax, jnp = _LazyModule("jax"), _LazyModule("jax.numpy")
+    Array = Axes = Figure = Any

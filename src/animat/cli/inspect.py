@@ -74,8 +74,7 @@ class Inspect(ResponseOptions):
         from animat.progress import Part
         from animat.recordings.reading import read_source
         from animat.recordings.recording import Recording
-        from animat.report.inspection import draw_inspection, inspection_text
-        from animat.report.series import draw_series
+        from animat.report.inspection import draw_inspection, draw_series, inspection_text
         from animat.responses.inspection import inspect_recording
 
         inspected, series, unreadable = [], [], []

@@ -32,21 +32,20 @@ def draw_array(recording: Recording) -> Figure:
     axes = figure.subplots()
     # A few channels with a very high rate must not leave all others dark.
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
-    of_rates: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
-    drawn = axes.scatter(*places_um, s=9, linewidths=0, **of_rates)
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
+    colours: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
+    drawn = axes.scatter(*places_um, s=9, linewidths=0, **colours)
     included = ", stimulated time included" if len(stimuli) else ""
+    bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
     bar.set_label(f"firing rate{included} (Hz)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     stimulated = np.unique(stimuli.electrodes[stimuli.electrodes != UNKNOWN])
     place = {int(e): i for i, e in enumerate(channels.electrode.tolist()) if e != UNKNOWN and known[i]}
     rows = [place[e] for e in stimulated.tolist() if e in place]
     _ring(axes, channels.x_um[rows], channels.y_um[rows], f"{len(rows)} stimulated electrodes")
-    unplaced = len(stimulated) - len(rows)
     title = f"{np.count_nonzero(known):,} recording sites at {recording.start_min:g} min"
     if np.any(~known):
         title += f"\n{np.count_nonzero(~known):,} channels at unknown positions are not drawn"
-    if unplaced:
+    if unplaced := len(stimulated) - len(rows):
         title += f"\n{unplaced} stimulated electrodes that no channel reads are not drawn"
     _finish(axes, title)
     return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool
 
 from animat.report.response_histograms import even_edges, rate_edges
 from animat.report.style import BLACK, BLUE, BURST, NON_BURST, Axes, Figure, add_legend, new_figure, style_axes
@@ -24,7 +23,7 @@ def draw_burst_separation(responses: Responses) -> Figure:
     all_x, plain, ratios, *more = figure.subplots(2, 2).flat if n_bursts else figure.subplots(1, 3)
     all_x.hist(responses.rate_hz, bins=rate_edges(responses, responses.rate_hz, 40).tolist(), color=BLUE)
     style_axes(all_x, f"{len(responses):,} responses", _RATE, "responses (count)")
-    _scatter(plain, responses, np.ones(len(responses), dtype=bool), BLUE, None)
+    _scatter(plain, responses, slice(None), BLUE, None)
     style_axes(plain, "response against active channels", _RATIO, _RATE)
     # One bar for every possible ratio, k/N, up to 40 bars.
     ratios.hist(responses.active_ratio, even_edges(responses.active_ratio, 1 / n_channels, 40).tolist(), color=BLUE)
@@ -43,8 +42,6 @@ def draw_burst_separation(responses: Responses) -> Figure:
     return figure
 
 
-def _scatter(
-    axes: Axes, responses: Responses, which: Bool[np.ndarray, " responses"], colour: str, label: str | None
-) -> None:
+def _scatter(axes: Axes, responses: Responses, which: np.ndarray | slice, colour: str, label: str | None) -> None:
     x, y, alpha = responses.active_ratio[which], responses.rate_hz[which], 0.6 if len(responses) > 300 else 0.9
     axes.scatter(x, y, s=9, alpha=alpha, color=colour, linewidths=0, label=label, rasterized=True)

@@ -25,12 +25,7 @@ from animat.report.style import (
 
 
 class Pair(NamedTuple):
-    """A comparison with the data that its row does not have.
-
-    Attributes:
-        first, second: each policy's mean return, shape (policies,).
-        random_first: mean return of random actions in the first arm; None if not known.
-    """
+    """A comparison with each policy's mean return, and that of random actions in the first arm if it is known."""
 
     row: ComparedReturns
     first: Float64[np.ndarray, " policies"]
@@ -52,7 +47,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
     figure.suptitle(title, fontsize=10)
     rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])
-    for whole, close, pair in zip(rows[0], rows[1], pairs, strict=True):
+    for whole, close, pair in zip(*rows, pairs, strict=True):
         row = pair.row
         sides = (
             (pair.first, pair.random_first, row.optimum_first, ORANGE),

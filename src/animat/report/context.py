@@ -12,22 +12,13 @@ _SPACING = 0.11
 
 
 def draw_context(rows: Mapping[str, Sequence[ContextRow]]) -> Figure:
-    """Context gaps of tasks and context scores of policies: one row per robot, one point with interval per culture.
-
-    Args:
-        rows: one row per culture, by the robot's name.
-    """
+    """Context gaps of tasks and context scores of policies: one row per robot, one point with interval per culture."""
     figure = new_figure(9.2, 1.7 + 0.55 * len(rows))
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "The task: is a reflex enough?", "context gap (0: a reflex does it all, 1: it does nothing)", "")
     style_axes(right, "The policies: more than a reflex?", "context score (0: the best reflex, 1: optimal)", "")
-    left.axvline(
-        CONTEXT_GAP_LEVEL,
-        color=ORANGE,
-        linewidth=1,
-        linestyle="--",
-        label=f"from {CONTEXT_GAP_LEVEL:g} on: needs context",
-    )
+    label = f"from {CONTEXT_GAP_LEVEL:g} on: needs context"
+    left.axvline(CONTEXT_GAP_LEVEL, color=ORANGE, linewidth=1, linestyle="--", label=label)
     for axes, name, colour in ((left, "gap", BLUE), (right, "score", BLACK)):
         axes.axvline(0, color=GREY, linewidth=0.8)
         nothing = "not known" if axes is left else "none: no task beyond a reflex, or not known"
@@ -58,11 +49,7 @@ def _points(axes: Axes, rows: Mapping[str, Sequence[ContextRow]], name: str, col
 
 
 def draw_whose_work(lost: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Return lost by each intervention, as a fraction of the advantage over random stimuli: one panel per robot.
-
-    Args:
-        lost: this fraction on each culture, by robot and intervention.
-    """
+    """Return lost on each culture, by robot and intervention, as a fraction of the advantage over random stimuli."""
     most = max(len(each) for each in lost.values())
     figure = new_figure(2.6 * len(lost) + 1.6, 1.5 + 0.34 * most)
     names = list(dict.fromkeys(name for each in lost.values() for name in each))

@@ -16,8 +16,7 @@ _TITLE_WIDTH = 36
 def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], title: str) -> Figure:
     """One panel per mapping and recording: mean returns with standard errors, random actions and the optimum.
 
-    Args:
-        panels_of: for each panel a title, and the trained policies followed by the controls.
+    Each panel has a title, and the trained policies followed by the controls.
     """
     most = max(len(rows) for _, rows in panels_of)
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 0.9 + 0.24 * most, title)

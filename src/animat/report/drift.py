@@ -22,10 +22,10 @@ class Drift:
     """Changes from recording to recording; NaN if there are no responses.
 
     Attributes:
-        minutes: starts of the recordings, shape (recordings,).
-        percentiles_hz: `PERCENTILES` of the pooled non-burst responses, shape (recordings, 5).
-        shares: P(x >= P50) of each condition, shape (recordings, conditions).
-        bursts: share of the responses that are bursts, shape (recordings,).
+        minutes: starts of the recordings.
+        percentiles_hz: `PERCENTILES` of the pooled non-burst responses.
+        shares: P(x >= P50) of each condition.
+        bursts: share of the responses that are bursts.
     """
 
     minutes: Float64[np.ndarray, " recordings"]
@@ -37,11 +37,12 @@ class Drift:
 def drift_of(series: Sequence[Responses]) -> Drift:
     """The numbers of the figure, from responses with the same conditions in order of time."""
     pooled = [responses.non_burst_rate_hz for responses in series]
+    unknown = np.full(len(PERCENTILES), np.nan)
     return Drift(
         np.array([responses.start_min for responses in series]),
-        np.array([np.percentile(x, PERCENTILES) if len(x) else np.full(len(PERCENTILES), np.nan) for x in pooled]),
+        np.array([np.percentile(x, PERCENTILES) if len(x) else unknown for x in pooled]),
         np.array([responses.shares_above_median() for responses in series]),
-        np.array([np.mean(r.is_burst) if len(r) else np.nan for r in series]),
+        np.array([np.mean(responses.is_burst) if len(responses) else np.nan for responses in series]),
     )
 
 

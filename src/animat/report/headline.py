@@ -15,17 +15,13 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
     """One panel per robot, one row per arm: the policies with their interval, random actions, the optimal return.
 
     The axis covers all returns; an interval that extends beyond it ends in an arrow. A narrow figure is as wide as a
-    phone, with the panels below each other.
-
-    Args:
-        rows: for each arm and robot the scores, and the mean return of each policy.
+    phone, with the panels below each other. Each score comes with the mean return of each policy.
     """
     robots = list(dict.fromkeys(row.robot for row, _ in rows))
     most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
-    height_in = 1.2 + 0.34 * most
-    figure = new_figure(3.6, height_in * len(robots)) if narrow else new_figure(4.6 * len(robots), height_in)
-    shape = (len(robots), 1) if narrow else (1, len(robots))
-    panels = list(figure.subplots(*shape, squeeze=False).flat)
+    height_in, n = 1.2 + 0.34 * most, len(robots)
+    figure = new_figure(3.6, height_in * n) if narrow else new_figure(4.6 * n, height_in)
+    panels = list(figure.subplots(*((n, 1) if narrow else (1, n)), squeeze=False).flat)
     for axes, robot in zip(panels, robots, strict=True):
         own = [each for each in rows if each[0].robot == robot]
         style_axes(axes, robot, "mean return of an episode", "")
@@ -52,5 +48,5 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
         axes.set_yticks(range(len(own)), [row.arm for row, _ in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
-    add_common_legend(figure, panels, columns=2 if narrow else 3 if len(robots) == 1 else 5)
+    add_common_legend(figure, panels, columns=2 if narrow else 3 if n == 1 else 5)
     return figure

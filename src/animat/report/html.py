@@ -6,17 +6,16 @@ import base64
 import math
 import os
 import re
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from animat.errors import InvalidFile
+from PIL import Image
+
 from animat.report.style import PNG_DPI
 from animat.writing import write_whole
 
-TEMPLATE = "report.html.j2"
 MINUS = "\u2212"
 
 # Hyphens that are minus signs: not those within words, ranges such as 2-10, options and file names, but those of
@@ -48,7 +47,6 @@ class Picture:
     Attributes:
         file: the PNG.
         title: also the alternative text.
-        caption: explains how to read it.
         beside: files with the same figure in other formats and with its numbers, relative to the page.
         narrow: the PNG for phones, as wide as their screen; None: the same PNG, which scrolls there.
     """
@@ -60,21 +58,10 @@ class Picture:
     narrow: Path | None = None
 
     @property
-    def data(self) -> str:
-        """The PNG as a data URL."""
-        return _data_url(self.file)
-
-    @property
-    def narrow_data(self) -> str | None:
-        """The PNG for phones as a data URL, if there is one."""
-        return None if self.narrow is None else _data_url(self.narrow)
-
-    @property
     def width_px(self) -> int:
         """Width on the page: 100 pixels per inch, so that text in figures is as large as text around them."""
-        # The first chunk of a PNG starts with the width.
-        (width,) = struct.unpack(">I", _bytes(self.file)[16:20])
-        return int(width * 100 // PNG_DPI)
+        with Image.open(self.file) as png:
+            return png.width * 100 // PNG_DPI
 
 
 @dataclass(frozen=True)
@@ -82,10 +69,7 @@ class Table:
     """A table of the page.
 
     Attributes:
-        title: above it.
-        head: names of the columns.
         rows: of cells: text, numbers (written with three digits) or None (written as a dash).
-        note: under it.
         beside: the file with all digits, relative to the page.
         marked: highlighted rows, by index.
         folded: whether it is hidden until its title is clicked, as it is long and repeats what is shown elsewhere.
@@ -148,7 +132,7 @@ def write_page(
     The lead follows the title; the colophon is lines at the end, with versions and seeds.
 
     Raises:
-        InvalidFile: if a figure cannot be read or the page cannot be written.
+        InvalidFile: if the page cannot be written.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -159,21 +143,13 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["cell"] = cell
-    environment.filters["prose"] = with_links
-    text = environment.get_template(TEMPLATE).render(title=title, lead=lead, sections=sections, colophon=colophon)
-    return write_whole(Path(path), text)
+    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url}
+    page = environment.get_template("report.html.j2")
+    return write_whole(Path(path), page.render(title=title, lead=lead, sections=sections, colophon=colophon))
 
 
-def _bytes(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise InvalidFile(f"{file}: expected a figure, got none: {error.strerror or error}") from error
-
-
-def _data_url(file: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(_bytes(file)).decode()
+def _data_url(png: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode()
 
 
 def cell(value: Any) -> str:

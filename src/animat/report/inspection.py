@@ -1,24 +1,27 @@
-"""An inspection as text for a terminal and as a folder of figures."""
+"""Inspections as text for a terminal, and as a folder of figures: of each recording, and of the series."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
+from animat.report.drift import draw_drift
 from animat.report.psth import draw_psth
-from animat.report.raster import draw_raster
+from animat.report.raster import draw_raster, draw_spontaneous
 from animat.report.response_histograms import draw_response_histograms
-from animat.report.spontaneous import draw_spontaneous
-from animat.report.style import save_figure
+from animat.report.responses_over_time import draw_responses_over_time
+from animat.report.style import Figure, save_figure
 from animat.responses.inspection import Inspection
 from animat.responses.network_bursts import BIN_S, NetworkBursts
 from animat.responses.psth import PostStimulusHistogram, post_stimulus_histogram
+from animat.responses.responses import Responses
 
 _MOST_CONDITIONS = 16
 _MARK = {"refuse": "!!", "warning": "! ", "note": "- "}
@@ -32,12 +35,12 @@ def inspection_text(inspection: Inspection) -> str:
     duration_s = inspection.duration_s
     span = f" in {duration_s:,.1f} s ({duration_s / 60:.1f} min)" if math.isfinite(duration_s) else ""
     start = f"from {inspection.start_min:g} min on the culture's clock"
+    trials = f" in {_count(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else ""
+    presented = f", {inspection.presentation}" if inspection.presentation else ""
     lines = [
         f"{inspection.name}: {inspection.verdict}",
         f"  {spikes} on {_count(inspection.n_channels, 'channel')}{span}, {start}",
-        f"  {inspection.n_stimuli:,} {'stimulus' if inspection.n_stimuli == 1 else 'stimuli'}"
-        + (f" in {_count(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
-        + (f", {inspection.presentation}" if inspection.presentation else ""),
+        f"  {_count(inspection.n_stimuli, 'stimulus', 'stimuli')}{trials}{presented}",
     ]
     if inspection.network_bursts is not None:
         lines += _spontaneous(inspection, inspection.network_bursts)
@@ -59,12 +62,11 @@ def inspection_text(inspection: Inspection) -> str:
     return "\n".join(lines)
 
 
-def _count(n: int, noun: str) -> str:
-    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+def _count(n: int, noun: str, plural: str = "") -> str:
+    return f"{n:,} {noun if n == 1 else plural or noun + 's'}"
 
 
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:
-    """The activity without stimulation."""
     lines = [f"  {inspection.spontaneous_rate_hz:.3g} Hz per channel"] if inspection.duration_s else []
     if len(bursts):
         per_min = 60 * len(bursts) / inspection.duration_s
@@ -89,13 +91,8 @@ def draw_inspection(
 
     Files are named after the inspection; `file_format` is one of `FORMATS`. For a recording without stimuli only a
     raster with its bursts is drawn, for a response table neither raster nor post-stimulus histogram.
-
-    Raises:
-        InvalidFile: if a file cannot be written.
     """
-    responses = inspection.responses
-    stem = figure_stem(inspection.name)
-    figures = {}
+    responses, figures = inspection.responses, {}
     if isinstance(recording, Recording):
         bursts = inspection.network_bursts
         figures["raster"] = draw_raster(recording, responses) if bursts is None else draw_spontaneous(recording, bursts)
@@ -105,6 +102,40 @@ def draw_inspection(
     if len(responses):
         figures["burst-separation"] = draw_burst_separation(responses)
         figures["responses"] = draw_response_histograms(responses)
+    return _save(figures, folder, figure_stem(inspection.name), file_format)
+
+
+def draw_series(
+    first: Recording | None, series: Sequence[Responses], folder: str | os.PathLike[str], file_format: str = "png"
+) -> list[Path]:
+    """Draw a series: `series-array`, `series-over-time`, `series-drift`; `file_format` is one of `FORMATS`.
+
+    The array is drawn if the positions of the first recording are known, the other figures if there are two recordings
+    or more. `series` may be in any order.
+
+    Raises:
+        InvalidArgument: for no responses.
+        Mismatch: for recordings with different conditions.
+    """
+    if not series:
+        raise InvalidArgument("series: expected the responses of at least one recording, got none")
+    ordered = sorted(series, key=lambda responses: responses.start_min)
+    for responses in ordered[1:]:
+        if [c.label for c in responses.conditions] != [c.label for c in ordered[0].conditions]:
+            raise Mismatch(
+                f"conditions: expected the same in all recordings of a series, but those at {responses.start_min:g} "
+                f"min differ from those at {ordered[0].start_min:g} min: inspect them separately"
+            )
+    figures = {}
+    if first is not None and first.channels.has_positions:
+        figures["array"] = draw_array(first)
+    if len(ordered) > 1 and all(len(responses) for responses in ordered):
+        figures["over-time"] = draw_responses_over_time(ordered)
+        figures["drift"] = draw_drift(ordered)
+    return _save(figures, folder, "series", file_format)
+
+
+def _save(figures: Mapping[str, Figure], folder: str | os.PathLike[str], stem: str, file_format: str) -> list[Path]:
     return [save_figure(figure, Path(folder) / f"{stem}-{what}.{file_format}") for what, figure in figures.items()]
 
 
@@ -126,8 +157,7 @@ def expect_unique_stems(names: Sequence[str], *others: str) -> None:
 
 def _histogram(recording: Recording, inspection: Inspection) -> PostStimulusHistogram:
     """A histogram that includes the window, and also the response if that comes later."""
-    end_ms = inspection.responses.window_ms[1]
-    response = inspection.response
+    end_ms, response = inspection.responses.window_ms[1], inspection.response
     if response is not None and response.start_ms >= end_ms:
         end_ms = response.end_ms
     to_ms = max(50.0, min(2 * end_ms, end_ms + 100))
@@ -144,10 +174,9 @@ def _table(inspection: Inspection) -> list[str]:
         f"  {'condition':<{width}}  responses  non-burst  median x (Hz)  P(x >= P50)",
     ]
     for c in shown:
-        numbers = (
-            f"{c.median_rate_hz:13.2f}  {c.share_above_median:11.2f}" if c.n_non_burst else f"{'-':>13}  {'-':>11}"
-        )
-        lines.append(f"  {c.label:<{width}}  {c.n_responses:>9,}  {c.n_non_burst:>9,}  {numbers}")
+        median, share = (f"{c.median_rate_hz:.2f}", f"{c.share_above_median:.2f}") if c.n_non_burst else ("-", "-")
+        counts = f"{c.n_responses:>9,}  {c.n_non_burst:>9,}"
+        lines.append(f"  {c.label:<{width}}  {counts}  {median:>13}  {share:>11}")
     if len(conditions) > len(shown):
         lines.append(f"  ... and {len(conditions) - len(shown)} more")
     return lines

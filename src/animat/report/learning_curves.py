@@ -18,7 +18,6 @@ class LearningCurve:
     """The learning curve of one arm.
 
     Attributes:
-        name: of the arm.
         iterations: done at the end of each chunk of training, shape (chunks,).
         returns: mean return of the episodes that ended by then (`over_rounds`), NaN if not known, shape
             (policies, chunks).
@@ -77,8 +76,7 @@ def over_rounds(
 
     Args:
         iterations: done at the end of each chunk, by all environments together.
-        episodes: number that ended in each chunk.
-        returns: their mean return; NaN if there are none.
+        episodes, returns: the number of episodes that ended in each chunk, and their mean return.
         longest: iterations of a round: those of the longest possible episode, times the number of environments.
 
     Returns:
@@ -107,9 +105,6 @@ def mean_with_interval(
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = filled.sum(axis=0) / known.sum(axis=0)
         resampled = (counts @ filled) / (counts @ known)
-    any_ended = np.isfinite(mean)
-    low, high = np.full_like(mean, np.nan), np.full_like(mean, np.nan)
     # Where no episode of the resampled policies ended, the mean replaces theirs.
-    drawn = np.where(np.isfinite(resampled), resampled, mean)[:, any_ended]
-    low[any_ended], high[any_ended] = np.quantile(drawn, [0.025, 0.975], axis=0)
+    low, high = np.quantile(np.where(np.isfinite(resampled), resampled, mean), [0.025, 0.975], axis=0)
     return mean, low, high

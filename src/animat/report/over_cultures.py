@@ -11,8 +11,7 @@ from animat.report.style import BLACK, BLUE, GREY, Figure, add_common_legend, ne
 def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> Figure:
     """One panel per robot, one row per comparison: a point for each culture, and their mean with its interval.
 
-    Args:
-        rows: comparisons, each with the difference on every culture, second arm minus first.
+    Each comparison comes with its difference on every culture, second arm minus first.
     """
     robots = list(dict.fromkeys(row.robot for row, _ in rows))
     most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)

@@ -10,19 +10,13 @@ from jaxtyping import Float64
 
 from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes
 
-MOST = len(PALETTE)
+_MOST = len(PALETTE)
 """The most arms in a panel, as there are no more colours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """The returns of one arm.
-
-    Attributes:
-        name: of the arm.
-        minutes: of the recordings, shape (recordings,).
-        returns: mean return of each policy at each recording, shape (policies, recordings).
-    """
+    """The returns of one arm: the mean return of each policy at each recording, with the recordings' minutes."""
 
     name: str
     minutes: Float64[np.ndarray, " recordings"]
@@ -40,31 +34,29 @@ class Courses:
 
     Attributes:
         title: the mapping.
-        courses: of the arms, with the same minutes; at most `MOST` are drawn.
-        random: return of random actions at the same minutes; None if not known.
-        optimum: optimal return on a coarse grid at the same minutes; None if not known.
+        courses: of the arms, with the same minutes.
+        random: return of random actions at these minutes.
+        optimum: optimal return on a coarse grid at these minutes; None if not known.
         fine_optimum: pairs of a minute and the optimal return on a fine grid, for some minutes.
-        left_out: number of arms that are not drawn.
     """
 
     title: str
     courses: tuple[Course, ...]
-    random: Float64[np.ndarray, " recordings"] | None = None
+    random: Float64[np.ndarray, " recordings"]
     optimum: Float64[np.ndarray, " recordings"] | None = None
     fine_optimum: tuple[tuple[float, float], ...] = ()
-    left_out: int = 0
 
 
-def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float | None = None) -> Figure:
-    """One panel per mapping: median and quartiles over policies of each arm, against the recording's minute.
+def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float) -> Figure:
+    """One panel per mapping: median and quartiles over policies of each of its first arms, against the minute.
 
     The end of training on the culture's clock is marked.
     """
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 3.4, title, share_x=True)
-    names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses))
+    names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses[:_MOST]))
     for axes, of in zip(panels, panels_of, strict=True):
-        for course in of.courses:
-            colour = PALETTE[names.index(course.name) % MOST]
+        for course in of.courses[:_MOST]:
+            colour = PALETTE[names.index(course.name) % _MOST]
             low, middle, high = course.quartiles
             axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
@@ -75,11 +67,10 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
         if of.fine_optimum:
             points = zip(*of.fine_optimum, strict=True)
             axes.plot(*points, "D", color=OPTIMUM, markersize=4, label="optimal return, fine grid")
-        if of.random is not None:
-            axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
-        if trained_until_min is not None:
-            axes.axvline(trained_until_min, color=GREY, linewidth=1.0, label="end of training")
-        more = f" ({of.left_out} more arms in the tables)" if of.left_out else ""
+        axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
+        axes.axvline(trained_until_min, color=GREY, linewidth=1.0, label="end of training")
+        left_out = len(of.courses) - _MOST
+        more = f" ({left_out} more arms in the tables)" if left_out > 0 else ""
         style_axes(axes, f"{of.title}{more}", "recording (min)", "return")
     add_common_legend(figure, panels, columns=3)
     return figure

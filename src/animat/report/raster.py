@@ -1,4 +1,4 @@
-"""The raster: every spike as a dot, in a stretch of the recording and around its stimuli."""
+"""The raster: every spike as a dot, around the stimuli of a recording, or over all of it with its network bursts."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from animat.report.style import (
     Axes,
     Figure,
     add_common_legend,
+    add_legend,
     condition_colours,
     new_figure,
     style_axes,
 )
+from animat.responses.network_bursts import NetworkBursts
 from animat.responses.responses import Responses
 from animat.responses.windows import HALF_NS_S, spikes_in
 from animat.tables import evenly
@@ -29,6 +31,8 @@ _MOST_LABELS = 12
 _MOST_DOTS = 3000
 """The most spikes around stimuli that can be told apart as dots."""
 _MOST_BINS = 100
+_MOST_SPIKES = 200_000
+_MOST_POINTS = 2_000
 
 
 def draw_raster(recording: Recording, responses: Responses) -> Figure:
@@ -46,6 +50,36 @@ def draw_raster(recording: Recording, responses: Responses) -> Figure:
     return figure
 
 
+def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
+    """Spikes by channel and the rate per channel, over the whole recording, with the network bursts marked."""
+    figure = new_figure(8.0, 7.0)
+    upper, lower = figure.subplots(2, 1, height_ratios=[2, 1], sharex=True)
+    n = len(recording.spike_times_s)
+    shown = evenly(n, _MOST_SPIKES)
+    _draw_spikes(upper, recording, shown, 4.0 if n < 10_000 else 1.0)
+    upper.set_xlim(recording.start_s, max(recording.stop_s, recording.start_s + 1e-3))
+    thinned = f"{len(shown):,} of " if len(shown) < n else ""
+    style_axes(upper, f"{thinned}{n:,} spikes, no stimuli", "", "channel (row)")
+    # No more bins than can be told apart; each shows its highest rate, so that a short burst keeps its height.
+    together = max(1, -(-len(bursts.count) // _MOST_POINTS))
+    rows = np.arange(0, len(bursts.count), together)
+    width_s = bursts.edges_s[1] - bursts.edges_s[0]
+    highest_hz = np.maximum.reduceat(bursts.count, rows) / (width_s * len(recording.channels))
+    lower.plot(bursts.edges_s[rows], highest_hz, color=BLACK, linewidth=0.8, label="highest in 50 ms")
+    threshold_hz = bursts.threshold / (width_s * len(recording.channels))
+    lower.axhline(threshold_hz, color=WINDOW, linewidth=1, label="threshold of network bursts")
+    lower.set_ylim(bottom=0)
+    style_axes(lower, f"{len(bursts):,} network bursts", "time (s)", "rate (Hz per channel)")
+    add_legend(lower, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0)
+    return figure
+
+
+def _draw_spikes(axes: Axes, recording: Recording, spikes: Int64[np.ndarray, " spikes"], size: float) -> None:
+    times_s, channels = recording.spike_times_s[spikes], recording.spike_channels[spikes]
+    axes.scatter(times_s, channels, s=size, color=BLACK, linewidths=0, rasterized=True)
+    axes.set_ylim(-1, len(recording.channels))
+
+
 def _draw_stretch(axes: Axes, recording: Recording) -> None:
     """All channels during the middle six stimuli of the recording; without stimuli, during the whole recording."""
     from matplotlib.ticker import MaxNLocator
@@ -57,15 +91,12 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
         margin_s = 0.4 * float(np.min(np.diff(shown))) if len(shown) > 1 else 0.05
         from_s, to_s = shown[0] - margin_s, shown[-1] + max(margin_s, 0.02)
     _, spike = spikes_in(recording, np.array([from_s]), np.array([to_s]))
-    axes.scatter(
-        recording.spike_times_s[spike], recording.spike_channels[spike], s=4, color=BLACK, linewidths=0, rasterized=True
-    )
+    _draw_spikes(axes, recording, spike, 4.0)
     # Other stimuli can fall into the stretch.
     inside = times_s[(times_s >= from_s) & (times_s <= to_s)]
     for time_s in inside:
         axes.axvline(time_s, color=RED, linewidth=1)
     axes.set_xlim(from_s, to_s)
-    axes.set_ylim(-1, len(recording.channels))
     title = f"{len(inside)} stimuli in the middle of the recording, each spike a dot" if len(inside) else "every spike"
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
     style_axes(axes, title, "time (s)", "channel (row)")

@@ -52,8 +52,7 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
         # The lowest panel has labels even if its column is not full.
         panels[min((column + 1) * rows, max(len(drawn), 1)) - 1].tick_params(labelbottom=True)
     figure.supxlabel("response x (Hz per channel)", fontsize=9)
-    left_out = len(n) - len(drawn)
-    if left_out:
+    if left_out := len(n) - len(drawn):
         title = f"the {len(drawn)} conditions with the most responses; {left_out} more are not drawn"
         figure.suptitle(title, fontsize=9)
     return figure

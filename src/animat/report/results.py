@@ -134,10 +134,8 @@ class ReflexComparison:
     """Trained policies and the best coupling, as in `animat.evaluation.coupling`; None for unknown values.
 
     Attributes:
-        coupling: mean return of the best coupling.
-        gap: the context gap of the task, with the ends of its 95 % interval.
+        gap, score: the context gap of the task and the context score of the policies, with their 95 % intervals.
         needs_context: whether the task significantly needs more than a reflex.
-        score: the context score of the policies, with the ends of its 95 % interval.
     """
 
     robot: str
@@ -161,7 +159,6 @@ class ObjectiveMet:
 
     Attributes:
         success_share, margin: of the goal, the same for all of its objectives.
-        objective: as text.
         satisfaction: of the objective, %.
     """
 
@@ -195,7 +192,6 @@ class OverCultures:
     """A comparison on a robot, over cultures.
 
     Attributes:
-        cultures: number of cultures.
         mean_first, mean_second: mean returns of the arms, each culture counting the same.
         difference: mean of the cultures' differences, second minus first.
         low_95, high_95: its percentile bootstrap interval over cultures, too narrow with few; None with fewer than two.

@@ -5,19 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from animat.errors import InvalidArgument
+from animat.lazy import Axes as Axes
+from animat.lazy import Figure as Figure
 from animat.writing import atomic_write
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes as Axes
-    from matplotlib.figure import Figure as Figure
-else:
-    # For annotations alone: matplotlib is loaded only to draw.
-    Axes = Figure = Any
 
 FORMATS = ("png", "svg", "pdf")
 
@@ -66,10 +61,10 @@ def add_common_legend(figure: Figure, panels: Sequence[Axes], *, columns: int) -
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        while columns > 1 and _legend_width_in(list(entries), columns) > figure.get_figwidth():
+        handles, labels = list(entries.values()), list(entries)
+        while columns > 1 and _legend_width_in(labels, columns) > figure.get_figwidth():
             columns -= 1
-        place: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
-        figure.legend(list(entries.values()), list(entries), fontsize=8, frameon=False, **place)
+        figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=columns)
 
 
 def _legend_width_in(labels: Sequence[str], columns: int) -> float:
@@ -100,12 +95,13 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     import matplotlib
 
     path = Path(path)
-    if path.suffix[1:].lower() not in FORMATS:
+    kind = path.suffix[1:].lower()
+    if kind not in FORMATS:
         raise InvalidArgument(f"{path}: expected a figure's name to end in .png, .svg or .pdf, got {path.suffix!r}")
     # With a date, the same figure would give different files; PNG has none.
-    metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower())
+    metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     with atomic_write(path) as beside, matplotlib.rc_context(_SAVING):
-        figure.savefig(beside, format=path.suffix[1:].lower(), dpi=PNG_DPI, metadata=metadata)
+        figure.savefig(beside, format=kind, dpi=PNG_DPI, metadata=metadata)
     return path
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from animat.errors import InvalidFile
@@ -32,29 +33,29 @@ class TensorBoard:
         self._writers: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
-        try:
+        with self._expect_writable():
             self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InvalidFile(f"{self._folder}: cannot be created: {error.strerror or error}") from error
         return self
 
     def __call__(self, row: CurveRow) -> None:
         """Write a row without its NaNs."""
-        try:
+        scalars = {"episodes": row.episodes, "return": row.mean_return}
+        scalars |= {"entropy": row.entropy, "alpha": row.alpha, "critic_loss": row.critic_loss}
+        with self._expect_writable():
             if row.policy not in self._writers:
                 self._writers[row.policy] = self._make(str(self._folder / row.policy))
-            writer = self._writers[row.policy]
-            scalars = {"episodes": row.episodes, "return": row.mean_return}
-            scalars |= {"entropy": row.entropy, "alpha": row.alpha, "critic_loss": row.critic_loss}
             for name, number in scalars.items():
                 if not math.isnan(number):
-                    writer.add_scalar(name, number, row.iterations)
-        except OSError as error:
-            raise InvalidFile(f"{self._folder}: cannot be written: {error.strerror or error}") from error
+                    self._writers[row.policy].add_scalar(name, number, row.iterations)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for writer in self._writers.values():
             writer.close()
         self._writers = {}
+
+    @contextmanager
+    def _expect_writable(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InvalidFile(f"{self._folder}: cannot be written: {error.strerror or error}") from error

@@ -37,7 +37,6 @@ def draw_history(
         rungs: chunks done at the end of each rung; the last is the full training.
         best: number of the best trial, its mean return when retrained, and the standard error.
         own: mean return and standard error of the initial settings, retrained; None if they diverged.
-        title: of the figure.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -48,8 +47,8 @@ def draw_history(
     for rung, (chunks, colour) in enumerate(zip(rungs, (*colours, BLUE), strict=True)):
         ended = [(number, means[-1]) for number, done, means in trials if done and done[-1] == chunks]
         is_whole = chunks == rungs[-1]
-        label = "fully trained" if is_whole else f"stopped at {100 * chunks / rungs[-1]:.0f} %"
         if ended:
+            label = "fully trained" if is_whole else f"stopped at {100 * chunks / rungs[-1]:.0f} %"
             marker, size = _MARKERS[len(rungs) - 1 - rung], 6 if is_whole else 4
             axes.plot(*zip(*ended, strict=True), marker, color=colour, markersize=size, label=label)
         whole = ended
@@ -58,16 +57,14 @@ def draw_history(
         last = max(number for number, _, _ in trials)
         x = [*(number for number, _ in whole), last]
         axes.step(x, [*so_far, so_far[-1]], where="post", color=BLUE, linewidth=1.2, label="best fully trained so far")
-    diverged = [number for number, done, _ in trials if not done]
-    if diverged:
+    if diverged := [number for number, done, _ in trials if not done]:
         low = axes.get_ylim()[0]
         axes.plot(diverged, [low] * len(diverged), "x", color=RED, label="diverged")
     if own is not None:
         axes.axhline(own[0], color=BLACK, linestyle="--", linewidth=1, label="own settings, retrained")
     number, mean, error = best
-    axes.errorbar(
-        [number], [mean], yerr=[error or 0.0], fmt="*", color=RED, markersize=11, capsize=3, label="best, retrained"
-    )
+    label = "best, retrained"
+    axes.errorbar([number], [mean], yerr=[error or 0.0], fmt="*", color=RED, markersize=11, capsize=3, label=label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style_axes(axes, title, "trial", "mean return of an episode")
     add_common_legend(figure, [axes], columns=3)

@@ -57,8 +57,8 @@ def draw_validation(name: str, validation: Validation) -> Figure:
     """Three panels: histograms of the transforms, the autocorrelation, and the lengths of runs above P50."""
     v = validation
     figure = new_figure(10.5, 3.7)
-    n = f"{sum(v.n_held):,} held-out responses"
-    figure.suptitle(f"{name}: {n}; shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators", fontsize=10)
+    shaded = f"shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators"
+    figure.suptitle(f"{name}: {sum(v.n_held):,} held-out responses; {shaded}", fontsize=10)
     calibration, correlation, runs = figure.subplots(1, 3)
     # The empirical kind would coincide with the histogram.
     shown = [v.of(kind) for kind in dict.fromkeys(("histogram", v.kind, "memory"))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import final
@@ -21,7 +21,7 @@ from animat.report.controls import draw_controls
 from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.over_time import MOST, Course, Courses, draw_over_time
+from animat.report.over_time import Course, Courses, draw_over_time
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
@@ -110,8 +110,7 @@ class RobotPictures(StudyTask):
         if timeline is not None and len(timeline) > 1:
             courses = _courses(known, rough, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
-            drawn = [replace(of, courses=of.courses[:MOST], left_out=len(of.courses[MOST:])) for of in courses]
-            figures["over-time"] = draw_over_time(drawn, f"{name}: at every recording", trained_until_min=until_min)
+            figures["over-time"] = draw_over_time(courses, f"{name}: at every recording", trained_until_min=until_min)
             tables.append(figure_tables.write_courses(folder, name, courses))
         progress.update(0.2, 1, "controls")
         controls = _controls(row for row in results.controls if row.robot == name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from statistics import fmean, stdev
 from typing import Any
 
@@ -14,13 +14,17 @@ _MOST_RETURNS = 200
 """Most returns drawn per agent: the last ones."""
 
 
-def by_agent(episodes: Sequence[Episode], header: Mapping[str, Any]) -> list[dict[str, Any]]:
+def by_agent(names: Sequence[str], episodes: Sequence[Episode], predictions: Any) -> list[dict[str, Any]]:
     """For each agent: the number of whole episodes, their returns, and the mean with its 95 % interval.
 
-    The header is that of the session's log, with or without a prediction.
+    The names of the agents and the predictions are those of the session's header; what is no prediction is left out.
     """
-    predicted = _predicted(header)
-    returns_of: dict[str, list[float]] = {name: [] for name in predicted}
+    predicted = {}
+    for name, row in mapped(predictions).items():
+        values = [number(mapped(row).get(key)) for key in ("mean", "low", "high")]
+        if None not in values:
+            predicted[text(name)] = values
+    returns_of: dict[str, list[float]] = {text(name): [] for name in names}
     for episode in episodes:
         returns = returns_of.setdefault(text(episode.agent), [])
         if episode.is_whole and number(episode.total) is not None:
@@ -45,10 +49,3 @@ def _half_width(returns: Sequence[float]) -> float | None:
     from scipy.special import stdtrit
 
     return float(stdtrit(len(returns) - 1, 0.975)) * stdev(returns) / math.sqrt(len(returns))
-
-
-def _predicted(header: Mapping[str, Any]) -> dict[str, list[float | None]]:
-    """Mean and interval of each agent; anything that is not a prediction is left out."""
-    rows = {text(name): mapped(row) for name, row in mapped(header.get("predicted")).items()}
-    predicted = {name: [number(row.get(key)) for key in ("mean", "low", "high")] for name, row in rows.items()}
-    return {name: values for name, values in predicted.items() if None not in values}

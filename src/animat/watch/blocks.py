@@ -27,13 +27,11 @@ def chart(
     """Curves over one axis.
 
     Args:
-        title: of the chart.
         x, y: names of the axes, with units.
         series: each made by `curve`.
         note: how to read it, with its main numbers.
         marks: places on the x axis with their labels.
         until: the smallest end of the x axis.
-        width: on the page.
     """
     labelled = [[number(at), text(label)] for at, label in marks]
     return {
@@ -42,11 +40,9 @@ def chart(
     }  # fmt: skip
 
 
-def curve(
-    name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str = "", most: int = 2000
-) -> dict[str, Any]:
+def curve(name: str, x: Sequence[float], y: Sequence[float], style: Style, colour: str) -> dict[str, Any]:
     """A curve of a chart: its name in the legend (empty: none), and its points, thinned if there are many."""
-    step = max(1, math.ceil(len(x) / most))
+    step = max(1, math.ceil(len(x) / 2000))
     xs, ys = ([number(float(value)) for value in values[::step]] for values in (x, y))
     return {"name": text(name), "x": xs, "y": ys, "style": style, "colour": colour}
 
@@ -55,22 +51,20 @@ def table(
     title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], note: str = "", *, width: Width = "half"
 ) -> dict[str, Any]:
     """Rows of texts and numbers; the page formats the numbers."""
-    cells = [[_number_or_text(value) for value in row] for row in rows]
+    cells = [[_cell(value) for value in row] for row in rows]
     return {
         "kind": "table", "title": title, "head": list(head), "rows": cells, "words": text(note, 2000), "width": width,
     }  # fmt: skip
 
 
-def _number_or_text(value: Any) -> Any:
-    if isinstance(value, float):
-        return number(value)
-    return value if value is None or isinstance(value, int) else text(value)
-
-
 def facts(title: str, rows: Sequence[tuple[str, Any]], note: str = "") -> dict[str, Any]:
     """Names with one value each."""
-    pairs = [[name, number(value) if isinstance(value, int | float) else text(value, 1000)] for name, value in rows]
+    pairs = [[name, _cell(value, 1000)] for name, value in rows]
     return {"kind": "facts", "title": title, "rows": pairs, "words": text(note, 2000)}
+
+
+def _cell(value: Any, most: int = 300) -> Any:
+    return number(value) if value is None or isinstance(value, int | float) else text(value, most)
 
 
 def time_left(seconds: float | None, state: dict[str, Any]) -> str:

@@ -5,20 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 from animat.closed_loop.session_data import LOG_FILE
 from animat.cultures.under_way import UNDER_WAY
 from animat.errors import InvalidArgument
-from animat.folder_kinds import MARKERS
+from animat.folder_kinds import MARKERS, Kind
+from animat.watch.state import changed_s
 
-Kind = Literal["session", "training", "study", "cultures", "tuning", "recording"]
-
-_MARKED: tuple[Kind, ...] = ("session", "training", "tuning", "study", "cultures")
-_MARKS = tuple((kind, MARKERS[kind][0]) for kind in _MARKED)
+_MARKS = {kind: names[0] for kind, names in MARKERS.items() if kind not in ("recording", "live")}
 """The file that identifies each kind."""
-_DEPTH, _MOST_FOLDERS, _MOST_ITEMS = 4, 4000, 2000
+_DEPTH, _MOST_FOLDERS, _MOST_ITEMS, _MOST_RECORDINGS = 4, 4000, 2000, 500
 _SKIPPED = ("jobs", "figures", "tables", "checkpoints")
 
 
@@ -56,53 +54,39 @@ def place_within(folder: Path, place: str) -> Path:
 
 def _folders(folder: Path) -> Iterator[Path]:
     """The folder and its subfolders, level by level."""
-    level, seen = [folder], 0
-    for _ in range(_DEPTH):
-        below: list[Path] = []
-        for parent in level:
-            seen += 1
-            if seen > _MOST_FOLDERS:
-                return
-            yield parent
-            try:
-                with os.scandir(parent) as entries:
-                    below += [
-                        parent / entry.name
-                        for entry in entries
-                        if entry.is_dir(follow_symlinks=False) and entry.name[0] != "." and entry.name not in _SKIPPED
-                    ]
-            except OSError:
-                continue
-        level = sorted(below)
+    folders = [(folder, 1)]
+    # The list grows while it is read.
+    for parent, depth in islice(folders, _MOST_FOLDERS):
+        yield parent
+        if depth < _DEPTH:
+            _, names, _ = next(os.walk(parent), ("", [], []))
+            below = [parent / name for name in sorted(names) if name[0] != "." and name not in _SKIPPED]
+            folders += [(each, depth + 1) for each in below if not each.is_symlink()]
 
 
 def _in_folder(root: Path, folder: Path) -> Iterator[Item]:
     place = "" if folder == root else folder.relative_to(root).as_posix()
-    for kind, name in _MARKS:
+    for kind, name in _MARKS.items():
         file = folder / name
         try:
             if file.is_file() and file.resolve().is_relative_to(root.resolve()):
                 yield Item(kind, place, max(file.stat().st_mtime, folder.stat().st_mtime))
         except OSError:
             continue
-    times_s = [time_s for time_s in map(changed_s, (*recordings_in(folder), folder / UNDER_WAY)) if time_s is not None]
-    if times_s:
-        yield Item("recording", place, max(times_s))
+    if times_s := recordings_in(folder):
+        yield Item("recording", place, max(times_s.values()))
 
 
-def changed_s(file: Path) -> float | None:
-    """When a file last changed; None if there is none, or it is a link."""
-    try:
-        return None if file.is_symlink() else file.stat().st_mtime
-    except OSError:
-        return None
-
-
-def recordings_in(folder: Path) -> list[Path]:
-    """The NWB recordings in a folder by name, except that of a session."""
+def recordings_in(folder: Path) -> dict[Path, float]:
+    """The NWB recordings in a folder, and the one in progress, with when each last changed; none of a session."""
     try:
         if (folder / LOG_FILE).exists():
-            return []
-        return [file for file in sorted(folder.glob("[!.]*.nwb")) if file.is_file() and not file.is_symlink()][:500]
+            return {}
+        files = [*sorted(folder.glob("[!.]*.nwb"))[:_MOST_RECORDINGS], folder / UNDER_WAY]
+        return {
+            file: time_s
+            for file in files
+            if file.is_file() and not file.is_symlink() and (time_s := changed_s(file)) is not None
+        }
     except OSError:
-        return []
+        return {}

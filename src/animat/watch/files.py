@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,60 +13,46 @@ from animat.errors import InvalidFile
 from animat.execution.task import NOTICES, UNFINISHED
 from animat.plain_file import read_plain_text
 from animat.training.policy import CURVE, whole_curve
-from animat.watch.plain import listed, number, text
+from animat.watch.plain import mapped, text
 
 _MOST_BYTES = 2**24
 _MOST_CURVE_BYTES = 2**22
 _MOST_EPISODES_BYTES = 2**27
 
+JobProgress = dict[str, tuple[float, str]]
+"""The share done of each job, and a message."""
 
-def json_of(path: Path) -> Any:
-    """The contents of a JSON file; None if it cannot be read."""
+
+def json_of(path: Path) -> dict[str, Any]:
+    """The contents of a JSON file with names and values; empty if there is none or it cannot be read."""
+    return mapped(_json_of(path))
+
+
+def _json_of(path: Path) -> Any:
     try:
         return json.loads(read_plain_text(path, _MOST_BYTES))
     except (InvalidFile, ValueError, RecursionError):
         return None
 
 
-JobProgress = dict[str, tuple[float, str, float]]
-"""The share done of each job, a message, and when it was reported."""
-
-
 def job_progress(folder: Path) -> JobProgress:
     """The last progress reported by the jobs of an unfinished run."""
     progress = {}
     for path in sorted((folder / UNFINISHED / NOTICES).glob("*.json"))[:1000]:
-        report = listed(json_of(path))
-        try:
-            changed_s = path.stat().st_mtime
-        except OSError:
-            continue
-        if len(report) == 2 and number(report[0]) is not None:
+        report = _json_of(path)
+        if report is not None:
+            share, message = report
             # Of policies that are trained together, only one reports a message.
-            message = "" if report[1] is None else text(report[1])
-            progress[path.stem.replace("+", "/")] = (float(report[0]), message, changed_s)
+            progress[path.stem.replace("+", "/")] = float(share), text(message or "")
     return progress
 
 
 def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks columns"]]:
     """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            curve = _complete(_array_in(archive, "curve.npy"))
-            if curve is None or curve.ndim != 3:
-                return {}
-            members = _array_in(archive, "members.npy").tolist()
-            return {int(member): curve[:, row] for row, member in enumerate(members)}
-    except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive
+    arrays = _arrays_in(path, ("curve", "members"), _MOST_CURVE_BYTES)
+    if arrays is None or (curve := _complete(arrays[0], 3)) is None:
         return {}
-
-
-def _array_in(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    member = archive.getinfo(name)
-    if member.file_size > _MOST_CURVE_BYTES:
-        raise ValueError(name)
-    with archive.open(member) as file:
-        return np.lib.format.read_array(io.BytesIO(file.read(_MOST_CURVE_BYTES)), allow_pickle=False)
+    return {int(member): curve[:, row] for row, member in enumerate(arrays[1].tolist())}
 
 
 def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
@@ -77,42 +61,34 @@ def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
 
     try:
         with safe_open(path, framework="numpy") as file:
-            curve = file.get_tensor("learning_curve")
+            return _complete(file.get_tensor("learning_curve"), 2)
     except (OSError, SafetensorError, ValueError, TypeError):
         return None
-    return _complete(curve) if curve.ndim == 2 else None
 
 
-def _complete(curve: np.ndarray) -> Float64[np.ndarray, "*_ columns"] | None:
+def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ columns"] | None:
     """Learning curves with the columns of `CURVE`; None for anything else."""
     whole = whole_curve(curve)
-    return np.asarray(whole, np.float64) if whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f" else None
+    is_curve = whole.ndim == dimensions and whole.shape[-1] == len(CURVE) and whole.dtype.kind == "f"
+    return np.asarray(whole, np.float64) if is_curve else None
 
 
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
     """Mean return, number of policies and number of episodes of an arm of a study; None if not known."""
-    try:
-        if path.stat().st_size > _MOST_EPISODES_BYTES:
-            return None
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            if sum(member.file_size for member in file.zip.infolist()) > _MOST_EPISODES_BYTES:
-                return None
-            columns = (file[name] for name in ("return", "actor", "over_time", "agent", "at_min"))
-            returns, actors, over_time, agents, at_min = columns
-        # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
-        own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max())
-        mean = float(returns[own].mean()) if own.any() else float("nan")
-    except Exception:  # as for a checkpoint
+    arrays = _arrays_in(path, ("return", "actor", "over_time", "agent", "at_min"), _MOST_EPISODES_BYTES)
+    if arrays is None:
         return None
-    return (mean, len(np.unique(actors[own])), int(own.sum())) if np.isfinite(mean) else None
+    returns, actors, over_time, agents, at_min = arrays
+    # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
+    own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max(initial=-np.inf))
+    return (float(returns[own].mean()), len(np.unique(actors[own])), int(own.sum())) if own.any() else None
 
 
-def newest_s(paths: list[Path]) -> float:
-    """When one of these last changed; 0 if there are none."""
-    times = [0.0]
-    for path in paths:
-        try:
-            times.append(path.stat().st_mtime)
-        except OSError:
-            continue
-    return max(times)
+def _arrays_in(path: Path, names: tuple[str, ...], most_bytes: int) -> list[np.ndarray] | None:
+    """Arrays of a numpy archive; None if it cannot be read or they are too large."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            sizes = [file.zip.getinfo(f"{name}.npy").file_size for name in names]
+            return [file[name] for name in names] if sum(sizes) <= most_bytes else None
+    except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive
+        return None

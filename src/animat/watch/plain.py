@@ -6,33 +6,21 @@ import json
 import math
 from typing import Any
 
-_MOST_LETTERS = 300
-
 
 def number(value: Any) -> float | None:
     """A finite number; None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return value if math.isfinite(value) else None
-    except OverflowError:
-        return None
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return value if is_number and math.isfinite(value) else None
 
 
-def whole(value: Any) -> int | None:
-    """A whole number that JavaScript can hold; None for anything else."""
-    is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53
-    return value if is_whole else None
+def numbers(values: Any) -> list[float | None]:
+    """The items of a list as numbers; a number as a list of one; an empty list for None."""
+    if isinstance(values, list):
+        return [number(item) for item in values[:64]]
+    return [] if number(values) is None else [number(values)]
 
 
-def numbers(value: Any) -> list[float | None]:
-    """The items of a list as numbers; a number as a list of one; an empty list for anything else."""
-    if isinstance(value, list | tuple):
-        return [number(item) for item in value[:64]]
-    return [] if number(value) is None else [number(value)]
-
-
-def text(value: Any, most: int = _MOST_LETTERS) -> str:
+def text(value: Any, most: int = 300) -> str:
     """A value as text that a page can show, truncated if it is long."""
     string = value if isinstance(value, str) else json.dumps(value, default=str)
     # Halves of surrogate pairs cannot be sent.
@@ -48,9 +36,9 @@ def short(value: Any) -> str:
     return f"{known:,}" if isinstance(known, int) else f"{known:.4g}"
 
 
-def listed(value: Any) -> list[Any]:
-    """A list; empty for anything else."""
-    return value if isinstance(value, list) else []
+def settings(values: dict[str, Any]) -> str:
+    """Settings by name, in a few characters each."""
+    return ", ".join(f"{text(name, 40)} {short(value)}" for name, value in values.items())
 
 
 def mapped(value: Any) -> dict[str, Any]:

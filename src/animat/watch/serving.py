@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import secrets
 import socket
@@ -11,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -65,15 +64,16 @@ def serve(folder: Path, port: int, announce: Callable[[str], None], *, parent: i
         port = listening.getsockname()[1]
         app = app_for(folder, token, port)
         app.state.asked_s = time.monotonic()
-        settings: dict[str, Any] = {
-            "log_level": "critical", "access_log": False, "lifespan": "off", "ws": "none", "proxy_headers": False,
-        }  # fmt: skip
-        # No header names the server, not even in refusals.
-        server = uvicorn.Server(uvicorn.Config(app, server_header=False, timeout_graceful_shutdown=1, **settings))
+        config = uvicorn.Config(
+            app, log_level="critical", access_log=False, lifespan="off", ws="none", proxy_headers=False,
+            # No header names the server, not even in refusals.
+            server_header=False, timeout_graceful_shutdown=1,
+        )  # fmt: skip
+        server = uvicorn.Server(config)
         if parent is not None:
             threading.Thread(target=_end_after, args=(parent, app, server), daemon=True).start()
         announce(f"http://127.0.0.1:{port}/{token}/")
-        with contextlib.suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
 
 

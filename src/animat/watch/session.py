@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import math
+import os
 import time
+from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
-from animat.closed_loop.outline import Outline
-from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
+from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, STOP_FILE
+from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile
 from animat.progress import format_duration
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
 from animat.watch.blocks import time_left
-from animat.watch.picture import is_drawn
-from animat.watch.plain import listed, mapped, number, numbers, text, whole
+from animat.watch.picture import drawn_robot, picture_of
+from animat.watch.plain import mapped, number, numbers, text
 from animat.watch.spikes import packed
 from animat.watch.state import is_locked
-from animat.watch.sums import Sums, first_readout
+from animat.watch.sums import PercentilesSince, Sums, first_readout
 from animat.watch.tail import Tail
 from animat.watch.view import View
 
-MOST_SPAN_S = 60.0
-"""Longest span shown at once."""
 _MOST_RECORDS = 8000
 """Most records in a view: at 80 Hz more than a minute and a half."""
 _GROW_S, _COUNT_S = 0.6, 0.15
@@ -37,142 +39,137 @@ _SILENT_S = 5.0
 """After which a session without new records no longer counts as running: it logs every request to a culture."""
 _NO_TIME = 64
 """Most consecutive records without a time."""
+_TRAIL = 400
+"""Number of earlier ticks searched for a robot's trail."""
+_NUMBERS = (
+    "number", "episode", "iteration", "chosen", "delivered", "spikes", "rate_hz", "reward", "late_s", "decided_s",
+)  # fmt: skip
+_COLUMNS = (*_NUMBERS, "is_burst", "time_s", "agent", "handled", "pulse_time_s", "command", "observation", "total")
 
 
 class SessionView(View):
     """The folder of a session, with its log."""
 
+    kind = "session"
+
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.tail = Tail(folder / LOG_FILE)
+        self.tail = Tail(self.file)
         self._generation = -1
         self._agents: list[dict[str, Any]] = []
-        self._agents_at = -1, -1
-        self._agents_until_s, self._done = 0.0, 0
+        self._agents_due_s, self._done = 0.0, 0
 
     def close(self) -> None:
         self.tail.close()
 
-    def about(self) -> dict[str, Any]:
+    def picture(self, at: int) -> bytes | None:
+        """A PNG of the robot at a record; None without a tick there, or for a robot that cannot be drawn here."""
+        with self._reading():
+            self._look()
+            tick = self._tick_of(at)
+            if tick is None or self._robot is None:
+                return None
+            earlier: list[Any] = []
+            for before in range(at - 1, max(-1, at - _TRAIL), -1):
+                past = self._tick_of(before)
+                if past is not None and past["episode"] != tick["episode"]:
+                    break
+                if past is not None and past["observation"]:
+                    earlier.append(past["observation"])
+            return picture_of(self._robot, tick, earlier[::-1])
+
+    def _title(self) -> str:
+        fields = self._fields
+        return f"{text(fields['loop']['robot']['name'])} on the {text(fields.get('culture', ''))} culture"
+
+    def _about(self) -> dict[str, Any]:
         self._look()
         header, fields = self._header, self._fields
-        loop, channels = mapped(fields.get("loop")), header.channels
-        robot = text(mapped(loop.get("robot")).get("name", "robot"))
+        loop, channels = fields["loop"], header.channels
+        # In older logs it is a name.
+        mapping = mapped(loop.get("mapping")).get("name", loop.get("mapping"))
         return {
             "generation": self.tail.generation,
-            "title": f"{robot} on the {text(fields.get('culture', ''))} culture",
+            "title": self._title(),
             "conditions": list(map(text, header.conditions)),
-            "agents": [text(agent.get("name")) for agent in map(mapped, listed(fields.get("agents")))],
             "observed": list(map(text, header.observed)),
             "readouts": list(map(text, header.readouts)),
-            "mapping": text(mapped(loop.get("mapping")).get("name", loop.get("mapping"))),
-            "thresholds": _thresholds(loop.get("mapping")),
+            "mapping": text(mapping),
+            "thresholds": _thresholds(mapping),
             "adaptive": bool(loop.get("adaptive")),
-            "percentiles_hz": first_readout(listed(loop.get("percentiles"))),
-            "planned": len(listed(fields.get("turns"))),
-            "limits": {text(name): number(value) for name, value in mapped(fields.get("limits")).items()},
-            "account": {text(name): number(value) for name, value in mapped(fields.get("account")).items()},
-            "is_drawn": is_drawn(loop),
+            "percentiles_hz": first_readout(loop.get("percentiles")),
+            "planned": len(fields.get("turns", ())),
+            "limits": {text(name): number(value) for name, value in fields.get("limits", {}).items()},
+            "account": {text(name): number(value) for name, value in fields.get("account", {}).items()},
+            "is_drawn": self._robot is not None,
             "channels": {
                 "x_um": list(map(number, channels.x_um.tolist())),
                 "y_um": list(map(number, channels.y_um.tolist())),
-                "electrode": list(map(whole, channels.electrode.tolist())),
+                "electrode": channels.electrode.tolist(),
             },
         }
 
-    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """The seconds before a time on the session's clock; None: now, or its end.
-
-        Raises:
-            InvalidFile: if there is no longer a session.
-            InvalidArgument: for an invalid span.
-        """
-        if not 0 < span_s <= MOST_SPAN_S:
-            raise InvalidArgument(f"span: expected above 0 and at most {MOST_SPAN_S:g} s, got {span_s:g}")
+    def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         is_whole = self._look()
         self._sums.go_on(_COUNT_S)
-        end_s = self._end_s()
+        last = self._span_before(len(self.tail) - 1)
+        end_s = 0.0 if last is None else last[1]
         to_s = end_s if to_s is None else min(to_s, end_s)
         from_s = to_s - span_s
         shown = self._between(from_s, to_s)
-        ticks = [(at, tick) for at, record in shown if (tick := self._tick(at, record)) is not None]
-        ticks = [(at, tick) for at, tick in ticks if (tick["time_s"] or 0.0) <= to_s]
+        ticks = [self._tick(at, record) for at, record in shown if record.fields.get("tick")]
+        ticks = [tick for tick in ticks if tick["time_s"] <= to_s]
         adapted = [
             (span[1], first_readout(record.fields["percentiles_hz"]))
             for _, record in shown
             if "percentiles_hz" in record.fields and (span := _span(record.fields)) is not None
         ]
-        spikes, counts = packed([record for _, record in shown], from_s, to_s, len(self._header.channels))
+        times_s = np.concatenate([np.empty(0), *(record.spike_times_s for _, record in shown)])
+        rows = np.concatenate([np.empty(0, np.int64), *(record.spike_channels for _, record in shown)])
+        spikes, counts = packed(times_s, rows, from_s, to_s, len(self._header.channels))
         return {
             "generation": self.tail.generation,
             "end_s": end_s,
             "from_s": from_s,
             "to_s": to_s,
-            "ticks": {name: [tick[name] for _, tick in ticks] for name in _COLUMNS},
+            "ticks": {name: [tick[name] for tick in ticks] for name in _COLUMNS},
             "spikes": spikes,
             "counts": counts,
-            "pulsed": listed(ticks[-1][1]["electrodes"]) if ticks else [],
+            "pulsed": ticks[-1]["electrodes"] if ticks else [],
             # The last tick with an observation.
-            "picture": next((at for at, tick in ticks[::-1] if tick["observation"]), None),
+            "picture": next((tick["at"] for tick in ticks[::-1] if tick["observation"]), None),
             "is_found": is_whole,
             **self._so_far(),
             "percentiles": _in_force(self._sums.percentiles, adapted),
         }
 
-    def tick_at(self, at: int) -> tuple[Record, list[list[float | None]]] | None:
-        """The record of a tick, and the earlier observations of its episode, for a picture; None without a tick."""
-        self._look()
-        record = self.tail.record(at)
-        tick = None if record is None else record.fields.get("tick")
-        if record is None or not isinstance(tick, dict):
-            return None
-        earlier: list[list[float | None]] = []
-        for before in range(at - 1, max(-1, at - _TRAIL), -1):
-            previous = self.tail.record(before)
-            past = None if previous is None else previous.fields.get("tick")
-            if isinstance(past, dict) and past.get("episode") != tick.get("episode"):
-                break
-            if isinstance(past, dict) and past.get("observation"):
-                earlier.append(numbers(past["observation"]))
-        return record, earlier[::-1]
-
-    @property
-    def robot_data(self) -> dict[str, Any]:
-        """The header's description of the robot and its goal."""
-        self._look()
-        return mapped(self._fields.get("loop"))
-
     def _look(self) -> bool:
         """Find new records in the log; False if there are more than could be found in time."""
         is_whole = self.tail.grow(_GROW_S)
-        if self._generation != self.tail.generation or not hasattr(self, "_fields"):
+        if self._generation != self.tail.generation:
             first = self.tail.record(0)
             if first is None:
-                raise InvalidFile(f"{self.tail.path}: expected a log of a session, got one without a whole beginning")
-            self._header: Header = read_header(self.tail.path, first.fields)
+                raise InvalidFile(f"{self.file}: expected a log of a session, got one without a whole beginning")
+            self._header: Header = read_header(self.file, first.fields)
             self._fields = first.fields
-            self._sums = Sums(self.tail)
+            self._robot = drawn_robot(first.fields["loop"])
+            self._sums, self._agents_due_s = Sums(self.tail), 0.0
             self._generation = self.tail.generation
         return is_whole
 
     def _so_far(self) -> dict[str, Any]:
         sums = self._sums
-        outline = sums.outline
-        fullest = sums.on_electrode.most_common(1)
-        # With thousands of episodes, not every time.
-        is_due = self._done < _MANY or time.monotonic() > self._agents_until_s
-        if self._agents_at != (outline.ticks, self._generation) and is_due:
-            self._agents_at = outline.ticks, self._generation
-            episodes = outline.episodes
-            self._done = sum(episode.is_whole for episode in episodes)
-            self._agents = by_agent(episodes, self._fields)
-            self._agents_until_s = time.monotonic() + _AGENTS_S
-        done = self._done
-        last = self._last_tick()
-        planned, wall_s = len(listed(self._fields.get("turns"))), number(mapped(last).get("wall_s"))
-        # The time before the first move is spent only once.
-        moving_s = None if wall_s is None else wall_s - (number(outline.moved_at_s) or 0.0)
-        left_s = None if not done or moving_s is None else moving_s * (planned - done) / done
+        outline, fullest = sums.outline, sums.on_electrode.most_common(1)
+        if time.monotonic() >= self._agents_due_s:
+            self._done = sum(episode.is_whole for episode in outline.episodes)
+            self._agents = by_agent(self._header.agents, outline.episodes, self._fields.get("predicted"))
+            # With thousands of episodes, not every time.
+            self._agents_due_s = time.monotonic() + (_AGENTS_S if self._done > _MANY else 0.0)
+        left_s = None
+        if self._done and sums.wall_s is not None:
+            # The time before the first move is spent only once.
+            moving_s = sums.wall_s - (outline.moved_at_s or 0.0)
+            left_s = moving_s * (len(self._fields.get("turns", ())) - self._done) / self._done
         state = self._state()
         return {
             **state,
@@ -181,27 +178,27 @@ class SessionView(View):
             "n_ticks": outline.ticks,
             "pulses": outline.pulses,
             "fullest": [text(fullest[0][0]), fullest[0][1]] if fullest else None,
-            "bursts": outline.bursts,
+            "bursts": number(outline.bursts),
             "late": outline.late,
             "latest_s": number(outline.latest_s),
-            "unanswered": _unanswered(outline),
+            "unanswered": outline.unanswered_pulses,
             "faults": sums.faults,
             "n_faults": sums.n_faults,
-            "episodes_done": done,
+            "episodes_done": self._done,
             "time_left": time_left(left_s, state),
             "agents": self._agents,
         }
 
     def _state(self) -> dict[str, Any]:
         """The session's state, with a message."""
-        silent_s = max(0.0, time.time() - self.tail.path.stat().st_mtime)
+        silent_s = max(0.0, time.time() - self.file.stat().st_mtime)
         silent = f"nothing was written for {format_duration(silent_s)}"
         stop = (self.folder / STOP_FILE).exists()
-        last = {} if not len(self.tail) else (self.tail.peek(len(self.tail) - 1) or {})
+        last = self.tail.peek(len(self.tail) - 1) or {}
         damage = self.tail.damage
         if last.get("kind") == "end":
             state, message = "ended", text(last.get("message"))
-        elif silent_s < _SILENT_S + (number(mapped(self._fields.get("loop")).get("pause_s")) or 0.0):
+        elif silent_s < _SILENT_S + self._fields["loop"].get("pause_s", 0.0):
             # A record that is just being written looks like a truncated one.
             state, message, damage = "running", "stopping" if stop else "", ""
         elif is_locked(self.folder):
@@ -210,18 +207,7 @@ class SessionView(View):
             state, message = "silent", f"{silent}, and the log has no end: it was killed, or it hangs"
         return {"state": state, "message": message, "damage": damage, "stop": stop}
 
-    def _end_s(self) -> float:
-        at = self._before(len(self.tail) - 1)
-        return 0.0 if at is None else at[1]
-
-    def _last_tick(self) -> dict[str, Any] | None:
-        for at in range(len(self.tail) - 1, max(0, len(self.tail) - _NO_TIME), -1):
-            tick = (self.tail.peek(at) or {}).get("tick")
-            if isinstance(tick, dict):
-                return tick
-        return None
-
-    def _before(self, at: int) -> tuple[float, float] | None:
+    def _span_before(self, at: int) -> tuple[float, float] | None:
         """The span of the last record up to `at` that has a time."""
         for earlier in range(at, max(0, at - _NO_TIME), -1):
             span = _span(self.tail.peek(earlier) or {})
@@ -231,16 +217,13 @@ class SessionView(View):
 
     def _between(self, from_s: float, to_s: float) -> list[tuple[int, Record]]:
         """The records that concern a span, found by bisection, as they are in the order of time."""
-        low, high = 1, len(self.tail)
-        while low < high:
-            middle = (low + high) // 2
-            span = self._before(middle)
-            if span is not None and span[0] > to_s:
-                high = middle
-            else:
-                low = middle + 1
+
+        def start_s(at: int) -> float:
+            span = self._span_before(at)
+            return -math.inf if span is None else span[0]
+
         records: list[tuple[int, Record]] = []
-        for at in range(low - 1, 0, -1):
+        for at in range(bisect_right(range(1, len(self.tail)), to_s, key=start_s), 0, -1):
             record = self.tail.record(at)
             if record is None:
                 continue
@@ -250,68 +233,63 @@ class SessionView(View):
             records.append((at, record))
         return records[::-1]
 
-    def _tick(self, at: int, record: Record) -> dict[str, Any] | None:
-        tick = record.fields.get("tick")
-        if not isinstance(tick, dict):
-            return None
-        totals = self._sums.totals
-        electrodes = [row[3] for row in listed(record.fields.get("stimuli")) if isinstance(row, list) and len(row) == 4]
+    def _tick_of(self, at: int) -> dict[str, Any] | None:
+        record = self.tail.record(at)
+        return None if record is None else record.fields.get("tick") or None
+
+    def _tick(self, at: int, record: Record) -> dict[str, Any]:
+        tick, totals = record.fields["tick"], self._sums.totals
         return {
-            **{name: _plain(tick.get(name)) for name in _NUMBERS},
-            "time_s": number(tick.get("read_after_s")),
-            "agent": text(tick.get("agent", "")),
-            "handled": text(tick.get("handled", "")),
-            "pulse_time_s": [] if NOTHING in listed(tick.get("patterns")) else numbers(tick.get("pulse_time_s")),
-            "command": numbers(tick.get("command")),
-            "observation": numbers(tick.get("observation")),
+            **{name: number(tick.get(name)) for name in _NUMBERS},
+            "at": at,
+            "is_burst": bool(tick["is_burst"]),
+            "time_s": number(tick["read_after_s"]),
+            "agent": text(tick["agent"]),
+            "handled": text(tick["handled"]),
+            "pulse_time_s": [] if NOTHING in tick["patterns"] else numbers(tick["pulse_time_s"]),
+            "command": numbers(tick["command"]),
+            "observation": numbers(tick["observation"]),
             "total": number(totals[at]) if at < len(totals) else None,
-            "electrodes": list(map(whole, listed(electrodes[-1]))) if electrodes else [],
+            "electrodes": [number(each) for *_, electrodes in record.fields["stimuli"][-1:] for each in electrodes],
         }
 
 
-_Row = tuple[float, list[float | None]]
-"""When thresholds changed, and the percentiles in Hz since then."""
-_TRAIL = 400
-"""Number of earlier ticks searched for a robot's trail."""
-_NUMBERS = (
-    "number", "episode", "iteration", "chosen", "delivered", "spikes", "rate_hz", "reward", "late_s", "decided_s",
-    "is_burst",
-)  # fmt: skip
-_COLUMNS = (*_NUMBERS, "time_s", "agent", "handled", "pulse_time_s", "command", "observation", "total")
-
-
-def _plain(value: Any) -> float | bool | None:
-    return value if isinstance(value, bool) else number(value)
-
-
 def _span(fields: dict[str, Any]) -> tuple[float, float] | None:
-    start, duration = number(fields.get("start_s")), number(fields.get("duration_s"))
-    if fields.get("kind") != "seen" or start is None or duration is None or number(start + duration) is None:
+    start_s, duration_s = number(fields.get("start_s")), number(fields.get("duration_s"))
+    if fields.get("kind") != "seen" or start_s is None or duration_s is None:
         return None
-    return start, start + duration
+    return start_s, start_s + duration_s
 
 
 def _thresholds(mapping: Any) -> list[int]:
     """Which of the eleven percentiles a mapping compares responses with; both ends if not known."""
-    from animat.coding.mapping import Thresholds
-
-    name = mapping if isinstance(mapping, str) else mapped(mapping).get("name")
     known = {kind.name: list(kind.percentile_indices) for kind in (Thresholds(1), Thresholds(9))}
-    return known.get(str(name), [0, 10])
+    return known.get(mapping, [0, 10])
 
 
-def _unanswered(outline: Outline) -> int | None:
-    try:
-        return outline.unanswered_pulses
-    except (KeyError, TypeError, AttributeError):
-        return None
-
-
-def _in_force(rows: Sequence[_Row], shown: Sequence[_Row], most: int = 400) -> list[_Row]:
-    """The session's rows, evenly thinned to `most` but including the last, and all rows of the span shown."""
-    step = max(1, math.ceil(len(rows) / most))
+def _in_force(rows: Sequence[PercentilesSince], shown: Sequence[PercentilesSince]) -> list[PercentilesSince]:
+    """The session's rows, evenly thinned to 400 but including the last, and all rows of the span shown."""
+    step = max(1, math.ceil(len(rows) / 400))
     rows = [*rows[:-1:step], *rows[-1:]]
     if not shown:
         return rows
     from_s, to_s = shown[0][0], shown[-1][0]
     return [*(row for row in rows if row[0] < from_s), *shown, *(row for row in rows if row[0] > to_s)]
+
+
+def stop_session(folder: Path) -> None:
+    """Ask a session to end, without waiting or reading anything first, as it may be urgent.
+
+    Raises:
+        InvalidArgument: if there is no session, or it has ended.
+        InvalidFile: if the file cannot be created.
+    """
+    if not (folder / LOG_FILE).is_file():
+        raise InvalidArgument(f"{folder.name}: expected a session to stop, got none")
+    if (folder / RECORDING_FILE).exists():
+        raise InvalidArgument(f"{folder.name}: the session has ended: there is nothing to stop")
+    try:
+        # Never through a link, which may lead anywhere.
+        os.close(os.open(folder / STOP_FILE, os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
+    except OSError as error:
+        raise InvalidFile(f"{folder / STOP_FILE}: cannot be created: {error.strerror or error}") from error

@@ -7,10 +7,10 @@ from typing import Any
 
 from animat.execution.task import PLANNED, UNFINISHED
 from animat.watch.blocks import Width, facts, table, time_left
-from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes, newest_s
-from animat.watch.plain import listed, mapped, number, text
-from animat.watch.state import state_of
-from animat.watch.view import View, in_blocks, titled
+from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes
+from animat.watch.plain import text
+from animat.watch.state import changed_s, state_of
+from animat.watch.view import View, in_blocks
 
 _MOST_RECEIPTS, _MOST_SHOWN = 5000, 300
 _CONTEXT = "context study"
@@ -20,16 +20,16 @@ _FAILED = "A job that fails ends the study, and its command names it: the folder
 class StudyView(View):
     """The folder of a study."""
 
-    def about(self) -> dict[str, Any]:
-        """The robots that are studied."""
-        manifest = self._manifest()
-        names = [mapped(spec).get("name", "robot") for spec in listed(mapped(manifest.get("study")).get("robots"))]
-        names += listed(mapped(manifest.get(_CONTEXT)).get("robots"))
-        robots, kind = ", ".join(map(text, names)), _CONTEXT if _CONTEXT in manifest else "study"
-        return titled(f"{kind} {f'of {robots}' if robots else ''}".strip())
+    kind = "study"
 
-    def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """The progress of its jobs."""
+    def _title(self) -> str:
+        manifest = self._manifest()
+        names = [spec["name"] for spec in manifest.get("study", {}).get("robots", ())]
+        names += manifest.get(_CONTEXT, {}).get("robots", ())
+        robots, kind = ", ".join(map(text, names)), _CONTEXT if _CONTEXT in manifest else "study"
+        return f"{kind} {f'of {robots}' if robots else ''}".strip()
+
+    def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
         self._manifest()
         done = done_jobs(self.folder)
         progress = running_jobs(self.folder, done)
@@ -37,8 +37,7 @@ class StudyView(View):
         self._speed.see(worked)
         # A study that has ended leaves nothing unfinished.
         is_done = bool(done) and not (self.folder / UNFINISHED).exists()
-        changed_s = newest_s([self.folder, self.folder / "jobs", *(self.folder / UNFINISHED).glob("*/*.json")])
-        state = state_of(self.folder, changed_s, is_done=is_done)
+        state = state_of(self.folder, is_done=is_done)
         is_running = state["state"] == "running"
         running = progress if is_running else {}
         waiting = [name for name in costs if name not in done and name not in running]
@@ -49,18 +48,15 @@ class StudyView(View):
             ("failed", "none" if is_running or is_done else "not known here"),
             ("time left", time_left(self._speed.left_s(sum(costs.values()) - worked), state)),
         ]
-        done_rows = [[name, files] for name, files in list(done.items())[-_MOST_SHOWN:]]
-        blocks = [
-            facts("Jobs", rows, "" if is_done else _FAILED),
-            *([] if is_done else [running_table(running)]),
-            _results_table(self.folder, "two-thirds" if is_done else "whole"),
-            table("Done", ["job", "files"], done_rows, width="whole" if is_done else "half"),
-            *([] if is_done else [table("Waiting", ["job"], [[name] for name in waiting[:_MOST_SHOWN]])]),
-        ]
-        return in_blocks(state, blocks)
-
-    def _manifest(self) -> dict[str, Any]:
-        return self._described("study.json", "study")
+        results = _results_table(self.folder, "two-thirds" if is_done else "whole")
+        done_rows = list(done.items())[-_MOST_SHOWN:]
+        done_table = table("Done", ["job", "files"], done_rows, width="whole" if is_done else "half")
+        if is_done:
+            return in_blocks(state, [facts("Jobs", rows), results, done_table])
+        waiting_table = table("Waiting", ["job"], [[name] for name in waiting[:_MOST_SHOWN]])
+        return in_blocks(
+            state, [facts("Jobs", rows, _FAILED), running_table(running), results, done_table, waiting_table]
+        )
 
 
 def share_of(folder: Path) -> float:
@@ -72,26 +68,16 @@ def share_of(folder: Path) -> float:
 
 def _work(folder: Path, done: dict[str, int], progress: JobProgress) -> tuple[float, dict[str, float]]:
     """The work done, and the cost of each job, as the unfinished study lists it."""
-    planned = mapped(json_of(folder / UNFINISHED / PLANNED))
-    costs = {text(name): float(cost) for name, cost in planned.items() if number(cost) is not None}
+    costs = {text(name): float(cost) for name, cost in json_of(folder / UNFINISHED / PLANNED).items()}
     worked = sum(costs.get(name, 0.0) for name in done)
-    return worked + sum(share * costs.get(name, 0.0) for name, (share, *_) in progress.items()), costs
+    return worked + sum(share * costs.get(name, 0.0) for name, (share, _) in progress.items()), costs
 
 
 def done_jobs(folder: Path) -> dict[str, int]:
     """The number of output files of each job with a receipt, in the order of the receipts."""
-    receipts = []
-    for path in (folder / "jobs").glob("[!.]*.json"):
-        try:
-            receipts.append((path.stat().st_mtime, path))
-        except OSError:
-            continue
-    counts = {}
-    for _, path in sorted(receipts)[:_MOST_RECEIPTS]:
-        receipt = mapped(json_of(path))
-        if isinstance(receipt.get("job"), str):
-            counts[text(receipt["job"])] = len(mapped(receipt.get("outputs")))
-    return counts
+    receipts = sorted((changed_s(path) or 0.0, path) for path in (folder / "jobs").glob("[!.]*.json"))
+    contents = (json_of(path) for _, path in receipts[:_MOST_RECEIPTS])
+    return {text(receipt["job"]): len(receipt["outputs"]) for receipt in contents if receipt}
 
 
 def running_jobs(folder: Path, done: dict[str, int]) -> JobProgress:
@@ -101,25 +87,23 @@ def running_jobs(folder: Path, done: dict[str, int]) -> JobProgress:
 
 def running_table(progress: JobProgress, width: Width = "two-thirds") -> dict[str, Any]:
     """The running jobs."""
-    has_messages = any(message for _, message, _ in progress.values())
-    rows = [
-        [name, f"{100 * share:.0f} %", *([message] if has_messages else [])]
-        for name, (share, message, _) in progress.items()
-    ]
-    head = ["job", "done", *(["message"] if has_messages else [])]
+    head = ["job", "done", "message"]
+    rows = [[name, f"{100 * share:.0f} %", message] for name, (share, message) in progress.items()]
+    if not any(message for _, message in progress.values()):
+        head, rows = head[:2], [row[:2] for row in rows]
     return table("Running", head, rows, "" if rows else "nothing is running", width=width)
 
 
 def _results_table(folder: Path, width: Width) -> dict[str, Any]:
     """The mean return of each arm on each robot, as soon as its policies have been evaluated."""
-    rows = []
+    rows: list[list[Any]] = []
     for path in sorted(folder.glob("episodes/*/*/episodes.npz"))[:_MOST_SHOWN]:
         means = mean_of_episodes(path)
         if means is not None:
             rows.append([path.parts[-3], path.parts[-2], *means])
     for path in sorted(folder.glob("culture-*/*/simulated.json"))[:_MOST_SHOWN]:
-        for row in listed(mapped(json_of(path)).get("rows"))[:1]:
-            values = [number(mapped(row).get(name)) for name in ("mean_return", "actors", "episodes")]
+        for row in json_of(path).get("rows", ())[:1]:
+            values = [row[name] for name in ("mean_return", "actors", "episodes")]
             rows.append([path.parts[-2], f"policies, {path.parts[-3]}", *values])
     note = "Over all policies, on the last recording; the report has comparisons." if rows else "none yet"
     return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, note, width=width)

@@ -1,8 +1,4 @@
-"""The log of a closed loop, followed while another process writes it: where records begin, and each on request.
-
-Nothing is locked or written. A truncated record may be one that is just being written: it is checked again each time.
-Only whole records are ever shown.
-"""
+"""The log of a closed loop, followed while another process writes it, without locking it."""
 
 from __future__ import annotations
 
@@ -10,16 +6,11 @@ import os
 import time
 import zlib
 from array import array
-from collections import OrderedDict
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from animat.closed_loop.log import HEAD, MAGIC, RECORD, Record, parse_fields, parse_record
 from animat.errors import InvalidFile
-
-T = TypeVar("T")
 
 _KEPT = 4096
 """Number of records kept in memory: those of the last seconds are requested again and again."""
@@ -31,7 +22,7 @@ _LOOKS = 512
 
 
 class Tail:
-    """A log that may grow.
+    """A log that may grow; a truncated record may be one that is just being written, and is checked again each time.
 
     Attributes:
         generation: changes when the file is replaced or becomes shorter.
@@ -88,42 +79,35 @@ class Tail:
 
     def record(self, number: int) -> Record | None:
         """A record; None if it is not whole, in which case the log ends before it."""
-        if number in self._kept:
-            self._kept.move_to_end(number)
-            return self._kept[number]
-        record = self._read(number, parse_record)
-        if record is not None:
-            self._kept[number] = record
-            if len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return record
+        if number not in self._kept:
+            data = self._data(number)
+            if data is None:
+                return None
+            if len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[number] = parse_record(self.path, data)
+        return self._kept[number]
 
     def peek(self, number: int) -> dict[str, Any] | None:
         """The fields of a record, without keeping it; None if it is not whole."""
-        if (kept := self._kept.get(number)) is not None:
-            return kept.fields
-        return self._read(number, parse_fields)
+        if number in self._kept:
+            return self._kept[number].fields
+        data = self._data(number)
+        return None if data is None else parse_fields(self.path, data)
 
-    def _read(self, number: int, parse: Callable[[Path, bytes], T]) -> T | None:
-        """Parse the bytes of a record, if their checksum is right."""
+    def _data(self, number: int) -> bytes | None:
+        """The bytes of a record, if their checksum is right; otherwise the log ends before it."""
         if self._file is None or not 0 <= number < len(self):
             return None
         place, end = self._places[number], self._places[number + 1]
         data = os.pread(self._file, end - place, place)
         if len(data) == end - place and zlib.crc32(memoryview(data)[HEAD.size :]) == HEAD.unpack_from(data)[3]:
-            with suppress(InvalidFile):
-                return parse(self.path, data)
-        self._end_before(number)
-        return None
-
-    def _end_before(self, number: int) -> None:
-        """Show nothing from a damaged record on."""
-        place = self._places[number]
+            return data
         self._damaged_at = place
         self.damage = f"{self._places[-1] - place:,} bytes after the last whole record are damaged"
         del self._places[number + 1 :]
-        for later in [kept for kept in self._kept if kept >= number]:
-            del self._kept[later]
+        self._kept.clear()
+        return None
 
     def _open(self) -> int:
         """Open the file, or reopen it if it was replaced; returns its size."""
@@ -148,5 +132,5 @@ class Tail:
 
     def _begin(self) -> None:
         self._places = array("Q", [len(MAGIC)])
-        self._kept: OrderedDict[int, Record] = OrderedDict()
+        self._kept: dict[int, Record] = {}
         self._damaged_at = -1

@@ -3,47 +3,79 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, first_line
+from animat.folder_kinds import MARKERS, Kind
 from animat.progress import Speed
 from animat.watch.files import json_of
 
-_SPAN_S = 60.0
-"""Over which the speed of work is measured."""
+_MOST_SPAN_S = 60.0
+"""Longest span shown at once, and over which the speed of work is measured."""
 
 
 class View(abc.ABC):
-    """A folder that is viewed repeatedly."""
+    """A folder that is viewed repeatedly.
+
+    Attributes:
+        kind: of the folder.
+        file: that identifies it.
+    """
+
+    kind: ClassVar[Kind]
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._speed = Speed(_SPAN_S)
+        self.folder, self.file = folder, folder / MARKERS[self.kind][0]
+        self._speed = Speed(_MOST_SPAN_S)
 
-    @abc.abstractmethod
     def about(self) -> dict[str, Any]:
-        """What does not change while work goes on."""
+        """What does not change while work goes on; errors are those of `view`."""
+        with self._reading():
+            return self._about()
 
-    @abc.abstractmethod
     def view(self, to_s: float | None, span_s: float) -> dict[str, Any]:
-        """The current view, of the seconds before a time; most views have no clock."""
+        """The current view, of the seconds before a time (None: now, or the end); most views have no clock.
+
+        Raises:
+            InvalidFile: if the folder's files cannot be read, or hold something else.
+            InvalidArgument: for an invalid span.
+        """
+        if not 0 < span_s <= _MOST_SPAN_S:
+            raise InvalidArgument(f"span: expected above 0 and at most {_MOST_SPAN_S:g} s, got {span_s:g}")
+        with self._reading():
+            return self._view(to_s, span_s)
 
     def close(self) -> None:  # noqa: B027 - most keep nothing open
         """Close files."""
 
-    def _described(self, name: str, what: str) -> dict[str, Any]:
-        """The content of the file that describes every folder of this kind."""
-        content = json_of(self.folder / name)
-        if not isinstance(content, dict):
-            raise InvalidFile(f"{self.folder / name}: expected the description of a {what}, got none")
+    def _about(self) -> dict[str, Any]:
+        return {"generation": 0, "title": self._title()}
+
+    @abc.abstractmethod
+    def _title(self) -> str: ...
+
+    @abc.abstractmethod
+    def _view(self, to_s: float | None, span_s: float) -> dict[str, Any]: ...
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Raise InvalidFile for any other error: anything may be in a file."""
+        try:
+            yield
+        except InvalidFile:
+            raise
+        except Exception as error:
+            raise InvalidFile(f"{self.file}: cannot be shown: {first_line(error)}") from error
+
+    def _manifest(self) -> dict[str, Any]:
+        """The content of the file that describes the folder."""
+        content = json_of(self.file)
+        if not content:
+            raise InvalidFile(f"{self.file}: expected the description of a {self.kind}, got none")
         return content
-
-
-def titled(title: str) -> dict[str, Any]:
-    """The description of an item with only a title."""
-    return {"generation": 0, "title": title}
 
 
 def in_blocks(state: dict[str, Any], blocks: Sequence[dict[str, Any]], damage: str = "") -> dict[str, Any]:

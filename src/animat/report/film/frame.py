@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from animat.report.film.scene import Moment, Scene
@@ -58,7 +58,8 @@ class Frames:
         past = scene.moments[max(0, first - 1) : now + 1]
         top = 18
         if scene.n_channels:
-            self._draw_raster(_Strip(draw, (top, 150), time_s, (-1, scene.n_channels), "spikes by channel", ""), time_s)
+            spikes = _Strip(draw, (top, 150), time_s, (-1, scene.n_channels), "spikes by channel", has_scale=False)
+            spikes.raster(scene)
             top = 178
         # Without neurons there is no response.
         n_strips = 3 if self._most_hz else 2
@@ -66,14 +67,14 @@ class Frames:
         strips = [(top + i * height, top + (i + 1) * height - 26) for i in range(n_strips)]
         if self._most_hz:
             beyond = "; triangles: larger" if self._is_some_beyond else ""
-            response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), "response", f"Hz per channel{beyond}")
+            response = _Strip(draw, strips[0], time_s, (0.0, self._most_hz), f"response (Hz per channel{beyond})")
             for each in past:
                 if math.isfinite(each.rate_hz):
                     response.dot(each.time_s, each.rate_hz, self._colours.get(each.delivered, _INK))
-        command = _Strip(draw, strips[-2], time_s, (-1.0, 1.0), "command", "", zero=True)
+        command = _Strip(draw, strips[-2], time_s, (-1.0, 1.0), "command", zero=True)
         for i in range(scene.robot.n_commands if scene.robot.n_commands > 1 else 0):
             command.name(i)
-        total = _Strip(draw, strips[-1], time_s, self._totals, "return so far", "")
+        total = _Strip(draw, strips[-1], time_s, self._totals, "return so far")
         for episode in dict.fromkeys(each.episode for each in past):
             of_it = [each for each in past if each.episode == episode]
             until_s = time_s if episode == moment.episode else of_it[-1].time_s
@@ -110,14 +111,6 @@ class Frames:
             draw.text((x, HEIGHT_PX - 8), label, colour if is_now else _FAINT, font, anchor="ls")
             x += int(font.getlength(label)) + 14
 
-    def _draw_raster(self, strip: _Strip, time_s: float) -> None:
-        scene = self._scene
-        pulses_s = scene.pulse_times_s
-        for pulse_s in pulses_s[(pulses_s > time_s - SHOWN_S) & (pulses_s <= time_s)].tolist():
-            strip.tick(pulse_s)
-        first, last = np.searchsorted(scene.spike_times_s, (time_s - SHOWN_S, time_s))
-        strip.points(scene.spike_times_s[first:last], scene.spike_channels[first:last])
-
 
 class _Strip:
     """A panel over the last seconds, the newest at the right."""
@@ -129,14 +122,14 @@ class _Strip:
         now_s: float,
         span: tuple[float, float],
         name: str,
-        unit: str,
         *,
+        has_scale: bool = True,
         zero: bool = False,
     ) -> None:
         self._draw, (self._top, self._bottom), self._now_s, self._span = draw, rows_px, now_s, span
         draw.rectangle((_LEFT, self._top, _RIGHT, self._bottom), "#ffffff", _LINE)
-        draw.text((_LEFT, self._top - 3), f"{name} ({unit})" if unit else name, _INK, _font(12), anchor="ls")
-        if name != "spikes by channel":
+        draw.text((_LEFT, self._top - 3), name, _INK, _font(12), anchor="ls")
+        if has_scale:
             for value, row in ((span[1], self._top + 5), (span[0], self._bottom - 4)):
                 draw.text((_LEFT - 5, row), f"{value:,.4g}", _FAINT, _font(11), anchor="rm")
         if zero:
@@ -166,12 +159,15 @@ class _Strip:
             points += [(self._x(time_s), self._y(value)), (self._x(end_s), self._y(value))]
         self._draw.line(points, colour, 2)
 
-    def tick(self, time_s: float) -> None:
-        self._draw.line((self._x(time_s), self._top + 1, self._x(time_s), self._top + 5), RED, 2)
-
-    def points(self, times_s: Float[np.ndarray, " spikes"], rows: Float[np.ndarray, " spikes"]) -> None:
+    def raster(self, scene: Scene) -> None:
+        """Draw a point for each spike, and a tick at the upper edge for each pulse."""
+        from_s, (low, high) = self._now_s - SHOWN_S, self._span
+        pulses_s = scene.pulse_times_s
+        for at in map(self._x, pulses_s[(pulses_s > from_s) & (pulses_s <= self._now_s)].tolist()):
+            self._draw.line((at, self._top + 1, at, self._top + 5), RED, 2)
+        shown = slice(*np.searchsorted(scene.spike_times_s, (from_s, self._now_s)))
+        times_s, rows = scene.spike_times_s[shown], scene.spike_channels[shown]
         x = np.rint(_RIGHT - (self._now_s - times_s) * (_RIGHT - _LEFT) / SHOWN_S)
-        low, high = self._span
         y = np.rint(self._top + 7 + (high - rows) * (self._bottom - self._top - 8) / (high - low))
         self._draw.point(np.stack([x, y], axis=1).reshape(-1).tolist(), _INK)
 

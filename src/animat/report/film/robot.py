@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from animat.closed_loop.runner import HostRunner
-from animat.report.film.scene import Scene
+from animat.report.film.scene import Moment, Scene
 from animat.robots.drawing import Picture, draw_robot
 from animat.robots.host import HostRobot
 
@@ -18,12 +18,10 @@ MOST_EARLIER = 500
 
 def pictures_of(scene: Scene) -> Callable[[int], Picture | None]:
     """A function that draws the robot at each moment, called with rising numbers; it returns None without a picture."""
-    if isinstance(scene.robot, HostRobot):
-        return _Replay(scene).picture
-    if not hasattr(scene.robot, "draw"):
+    if not isinstance(scene.robot, HostRobot) and not hasattr(scene.robot, "draw"):
         return lambda number: None
     # Several frames in a row show the same moment.
-    return lru_cache(1)(partial(_draw, scene))
+    return lru_cache(1)(_Replay(scene).picture if isinstance(scene.robot, HostRobot) else partial(_draw, scene))
 
 
 def _draw(scene: Scene, number: int) -> Picture | None:
@@ -43,26 +41,20 @@ class _Replay:
     """A host robot moved by the same commands again; without a picture from where its observations differ."""
 
     def __init__(self, scene: Scene) -> None:
-        assert isinstance(scene.robot, HostRobot)
-        self._scene, self._next = scene, 0
+        self._moments, self._done = scene.moments, 0
         self._runner = HostRunner(scene.robot, np.random.default_rng(scene.runner_seed), with_pictures=True)
         self._episode: int | None = None
         self._is_same = True
-        self._picture: Picture | None = None
 
     def picture(self, number: int) -> Picture | None:
-        if self._next > number:
-            return self._picture
-        while self._next <= number:
-            self._move(self._next)
-            self._next += 1
-        self._picture = self._runner.picture() if self._is_same else None
-        return self._picture
+        for moment in self._moments[self._done : number + 1]:
+            self._move(moment)
+        self._done = number + 1
+        return self._runner.picture() if self._is_same else None
 
-    def _move(self, number: int) -> None:
-        moment = self._scene.moments[number]
+    def _move(self, moment: Moment) -> None:
         if moment.episode != self._episode:
-            self._episode, self._is_same = moment.episode, True
+            self._episode = moment.episode
             observation = self._runner.reset(moment.turn)
         elif moment.command is None or not self._is_same:
             return

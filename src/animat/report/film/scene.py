@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,8 +18,6 @@ class Moment:
 
     Attributes:
         time_s: when the state begins.
-        agent: that acts.
-        episode: number of the episode.
         iteration: of the robot; -1 before it moves.
         turn: number that decides how the episode starts.
         observation: in the robot's units; empty if it was not recorded.
@@ -26,7 +25,6 @@ class Moment:
         total: sum of the episode's rewards so far.
         delivered: label of the condition that was delivered; "" for none.
         rate_hz: the response; NaN if nothing was read.
-        ended: whether the episode has ended.
     """
 
     time_s: float
@@ -35,14 +33,10 @@ class Moment:
     iteration: int
     turn: int
     observation: tuple[float, ...]
-    command: float | tuple[float, ...] | None
-    total: float
-    delivered: str
-    rate_hz: float
-    ended: bool = False
-
-
-_NO_TIMES, _NO_CHANNELS = np.empty(0), np.empty(0, np.int64)
+    command: float | tuple[float, ...] | None = None
+    total: float = 0.0
+    delivered: str = ""
+    rate_hz: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +44,8 @@ class Scene:
     """A stretch of time with everything that is drawn.
 
     Attributes:
-        title: of the film.
-        robot: that is moved.
-        conditions: labels of the conditions, in their order.
+        conditions: their labels, in their order.
         moments: in order of time; those of the first episode from its start, so that a host robot can be replayed.
-        start_s, stop_s: of the film.
         spike_times_s, spike_channels: recorded spikes, in order of time.
         pulse_times_s: of all stimuli.
         n_channels: of the array; 0 without an array, when only responses are shown.
@@ -68,9 +59,9 @@ class Scene:
     moments: tuple[Moment, ...]
     start_s: float
     stop_s: float
-    spike_times_s: Float64[np.ndarray, " spikes"] = field(default_factory=_NO_TIMES.copy)
-    spike_channels: Int64[np.ndarray, " spikes"] = field(default_factory=_NO_CHANNELS.copy)
-    pulse_times_s: Float64[np.ndarray, " pulses"] = field(default_factory=_NO_TIMES.copy)
+    spike_times_s: Float64[np.ndarray, " spikes"] = field(default_factory=lambda: np.empty(0))
+    spike_channels: Int64[np.ndarray, " spikes"] = field(default_factory=lambda: np.empty(0, np.int64))
+    pulse_times_s: Float64[np.ndarray, " pulses"] = field(default_factory=lambda: np.empty(0))
     n_channels: int = 0
     lost_bytes: int = 0
     runner_seed: tuple[int, int] = (0, 0)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ import numpy as np
 from animat.closed_loop.header import read_header
 from animat.closed_loop.session import read_session
 from animat.closed_loop.session_data import LOG_FILE, expect_session_log
+from animat.closed_loop.tick import Tick
 from animat.errors import InvalidArgument, UnusableData
 from animat.goals.robot import robot_of
 from animat.report.film.scene import Moment, Scene
@@ -21,6 +20,8 @@ from animat.stimulation.stimulus import NOTHING
 
 USUAL_S = 60.0
 """The length of a film by default."""
+LOOK_BACK_S = 5.0
+"""Time before a span whose spikes and pulses are in its first frames."""
 
 
 def is_session(path: Path) -> bool:
@@ -41,15 +42,13 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
         UnusableData: for a session without episodes.
     """
     session = read_session(path)
-    file = session.folder / LOG_FILE
-    header, header_data = read_header(file, session.log.header), session.log.header
+    file, fields = session.folder / LOG_FILE, session.log.header
+    header = read_header(file, fields)
     from_s, to_s = span_s or (0.0, USUAL_S)
     is_found = span_s is not None
-    reading = _Reading(header.conditions)
     with expect_session_log(file):
-        reading.window_s = float(header_data["loop"]["window_ms"][1]) * 1e-3
-        # A missing "robot" is an error here, not below.
-        robot_data, seed = header_data["loop"] | {"robot": header_data["loop"]["robot"]}, int(header_data["seed"])
+        seed, window_s = int(fields["seed"]), float(fields["loop"]["window_ms"][1]) * 1e-3
+        reading = _Reading(header.conditions, window_s)
         for record in session.log.records:
             is_past = is_found and record.fields["kind"] == "seen" and record.fields.get("start_s", 0.0) >= to_s
             # In a pause before the first trial nothing moves yet; the robot's state is known from that trial.
@@ -63,22 +62,20 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
                 to_s = from_s + USUAL_S
             if not is_past and reading.stop_s > from_s - LOOK_BACK_S and len(record.spike_times_s):
                 reading.spikes.append((record.spike_times_s, record.spike_channels))
-    if not reading.moments:
+    moments = reading.moments
+    if not moments:
         raise UnusableData(f"{file}: expected at least one episode, got none: {session.ending.message}")
     if not from_s < min(reading.stop_s, to_s):
         raise InvalidArgument(
             f"span_s: expected a stretch that begins within the session's {reading.stop_s:.1f} s, got {from_s:g} to "
             f"{to_s:g}"
         )
-    moments = reading.moments
     first = max((each.episode for each in moments if each.time_s <= from_s), default=moments[0].episode)
-    # The empty arrays are for a session without spikes.
-    spikes = [(np.empty(0), np.empty(0, np.int64)), *reading.spikes]
-    times_s, channels = (np.concatenate(each) for each in zip(*spikes, strict=True))
+    times_s, channels = (np.concatenate(each) for each in zip(*reading.spikes, strict=True))
     order = np.argsort(times_s, kind="stable")
-    robot = robot_of(robot_data)
+    robot = robot_of({"robot": None} | fields["loop"])
     return Scene(
-        title=f"{robot.name} on the {header_data.get('culture', '')} culture",
+        title=f"{robot.name} on the {fields.get('culture', '')} culture",
         robot=robot,
         conditions=header.conditions,
         moments=tuple(each for each in moments if each.episode >= first),
@@ -93,17 +90,16 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
     )
 
 
-LOOK_BACK_S = 5.0
-"""Time before a span whose spikes and pulses are in its first frames."""
-
-
 class _Reading:
-    def __init__(self, conditions: tuple[str, ...]) -> None:
+    """What a film needs of a session's records."""
+
+    def __init__(self, conditions: tuple[str, ...], window_s: float) -> None:
         self.moments: list[Moment] = []
-        self.spikes: list[tuple[np.ndarray, np.ndarray]] = []
+        # The empty arrays are for a session without spikes.
+        self.spikes: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0, np.int64))]
         self.pulses_s: list[float] = []
-        self.stop_s = self.window_s = 0.0
-        self._conditions, self._turns = conditions, Counter[str]()
+        self.stop_s = 0.0
+        self._conditions, self._window_s, self._turns = conditions, window_s, Counter[str]()
         self._starts: dict[int, tuple[float, ...]] = {}
 
     def add(self, fields: dict[str, Any]) -> None:
@@ -113,32 +109,28 @@ class _Reading:
             if fields.get("start_s") is not None:
                 self.stop_s = max(self.stop_s, fields["start_s"] + fields["duration_s"])
             if fields["tick"]:
-                self._add_tick(fields["tick"])
+                self._add_tick(Tick.from_dict(fields["tick"]))
 
-    def _add_tick(self, tick: dict[str, Any]) -> None:
-        before = self.moments[-1] if self.moments else None
-        agent, episode = str(tick["agent"]), int(tick["episode"])
-        is_rest = NOTHING in tick["patterns"]
-        self.pulses_s += () if is_rest else tick["pulse_time_s"]
-        if before is None or before.episode != episode:
+    def _add_tick(self, tick: Tick) -> None:
+        if NOTHING not in tick.patterns:
+            self.pulses_s += tick.pulse_time_s
+        if not self.moments or self.moments[-1].episode != tick.episode:
             # If a session ends before the robot moves, only its start is known.
-            start = Moment(tick["read_after_s"], agent, episode, -1, self._turns[agent], (), None, 0.0, "", math.nan)
-            before = replace(start, observation=self._starts.get(episode, ()))
-            self._turns[agent] += 1
-            self.moments.append(before)
-        command = tick["command"]
+            turn, start = self._turns[tick.agent], self._starts.get(tick.episode, ())
+            self.moments.append(Moment(tick.read_after_s, tick.agent, tick.episode, -1, turn, start))
+            self._turns[tick.agent] += 1
+        before = self.moments[-1]
         self.moments.append(
             Moment(
-                time_s=float(tick["read_after_s"]) + self.window_s,
-                agent=agent,
-                episode=episode,
-                iteration=int(tick["iteration"]),
+                time_s=tick.read_after_s + self._window_s,
+                agent=tick.agent,
+                episode=tick.episode,
+                iteration=tick.iteration,
                 turn=before.turn,
-                observation=tuple(tick["observation"]) or before.observation,
-                command=tuple(command) if isinstance(command, list) else command,
-                total=before.total + (tick["reward"] or 0.0),
-                delivered=self._conditions[tick["delivered"]] if tick["pulse_time_s"] else "",
-                rate_hz=float(tick["rate_hz"]),
-                ended=bool(tick["terminated"] or tick["truncated"]),
+                observation=tick.observation or before.observation,
+                command=tick.command,
+                total=before.total + (tick.reward or 0.0),
+                delivered=self._conditions[tick.delivered] if tick.pulse_time_s else "",
+                rate_hz=tick.rate_hz,
             )
         )

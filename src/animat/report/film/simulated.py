@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,7 +24,6 @@ _PAUSE_S = 1.0
 """Between episodes, during which the last frame stays."""
 _WITHOUT_NEURONS_S = 0.02
 """An iteration of a policy that moves its robot directly, whose duration is unknown: as in Gymnasium."""
-
 _ALIKE = ("robot", "mapping", "readouts", "conditions", "commands", "delivery", "percentiles")
 
 
@@ -73,7 +71,7 @@ def scene_of_policies(
         if time_s >= to_s:
             break
         observation, neurons, total = runner.reset(episode), state.neurons, 0.0
-        moments.append(Moment(time_s, name, episode, -1, episode, tuple(observation.tolist()), None, 0.0, "", math.nan))
+        moments.append(Moment(time_s, name, episode, -1, episode, tuple(observation.tolist())))
         for iteration in range(robot.episode_limit):
             observed = np.concatenate([observation, np.asarray(neurons)]) if policy.neural_observation else observation
             uniforms = jnp.asarray(rng.random(environment.noise_size, np.float32))
@@ -82,20 +80,16 @@ def scene_of_policies(
             neurons, u = response.history, np.asarray(command, np.float64)
             moved = runner.step(u)
             observation, total = moved.observation, total + moved.reward
-            truncated, label, period_s = iteration + 1 >= robot.episode_limit, "", _WITHOUT_NEURONS_S
+            label, period_s = "", _WITHOUT_NEURONS_S
             if simulator is not None:
                 condition = first.conditions[int(delivered)]
                 pulses = 1 if first.presentation is None else first.presentation.pulses
                 label, period_s = condition.label, pulses / (condition.frequencies_hz or (1 / _WITHOUT_NEURONS_S,))[0]
             time_s += period_s
-            ended = moved.terminated or moved.truncated or truncated
-            rate_hz = float(np.mean(response.rate_hz))
+            at, rate_hz = tuple(observation.tolist()), float(np.mean(response.rate_hz))
             commands = tuple(u.tolist()) if u.ndim else float(u)
-            at = tuple(observation.tolist())
-            moments.append(
-                Moment(time_s, name, episode, iteration, episode, at, commands, total, label, rate_hz, ended)
-            )
-            if ended or time_s >= to_s:
+            moments.append(Moment(time_s, name, episode, iteration, episode, at, commands, total, label, rate_hz))
+            if moved.terminated or moved.truncated or time_s >= to_s:
                 break
         time_s += _PAUSE_S
     if from_s >= time_s:

@@ -6,6 +6,7 @@ import os
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 
@@ -24,7 +25,7 @@ FRAMES_PER_S = {".mp4": 25, ".gif": 10}
 """By the film's suffix."""
 _COLOURS = 96
 """Of a GIF."""
-ROBOTS = (ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL)
+_ROBOTS = (ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, TRAIL)
 """Colours of robots, which need not be in the first frame."""
 
 
@@ -39,28 +40,22 @@ def check_film(path: str | os.PathLike[str]) -> None:
         raise InvalidArgument(f"{path}: expected a film's name to end in .mp4 or .gif, got {path.suffix!r}")
     if path.is_dir():
         raise InvalidArgument(f"{path}: expected a file for the film, got a folder")
-    if path.suffix.lower() == ".mp4":
-        try:
-            import imageio_ffmpeg  # noqa: F401
-        except ImportError as error:
-            raise InvalidArgument(
-                f"{path}: expected the package imageio-ffmpeg for an MP4, which is not installed: "
-                f"{install_command('film')}, or end the name in .gif"
-            ) from error
+    if path.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise InvalidArgument(
+            f"{path}: expected the package imageio-ffmpeg for an MP4, which is not installed: "
+            f"{install_command('film')}, or end the name in .gif"
+        )
 
 
 def write_film(scene: Scene, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-    """Film a scene in real time, as .mp4 or .gif; the file is written atomically.
+    """Film a scene in real time, as .mp4 or .gif (`check_film`); the file is written atomically.
 
     Raises:
-        InvalidArgument: as `check_film`.
         InvalidFile: if it cannot be written.
     """
-    path, progress = Path(path), progress or Silent()
-    check_film(path)
-    kind = path.suffix.lower()
-    frames = Frames(scene, pictures_of(scene))
-    pictures = _pictures(scene, frames, FRAMES_PER_S[kind], progress)
+    path = Path(path)
+    kind, frames = path.suffix.lower(), Frames(scene, pictures_of(scene))
+    pictures = _pictures(scene, frames, FRAMES_PER_S[kind], progress or Silent())
     with atomic_write(path) as beside:
         if kind == ".gif":
             _write_gif(pictures, frames.colours, beside)
@@ -79,9 +74,9 @@ def _pictures(scene: Scene, frames: Frames, frames_per_s: int, progress: Progres
 def _write_gif(pictures: Iterator[Image.Image], colours: Sequence[str], path: Path) -> None:
     first = next(pictures)
     # One palette for all frames, without dithering, so that unchanged pixels cost nothing.
-    every = Image.new("RGB", (first.width, first.height + 20 * (len(colours) + len(ROBOTS))))
+    swatches: list[str | tuple[int, int, int]] = [*colours, *_ROBOTS]
+    every = Image.new("RGB", (first.width, first.height + 20 * len(swatches)))
     every.paste(first)
-    swatches: list[str | tuple[int, int, int]] = [*colours, *ROBOTS]
     for number, colour in enumerate(swatches):
         row = first.height + 20 * number
         every.paste(colour, (0, row, first.width, row + 20))

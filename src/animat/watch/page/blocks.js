@@ -1,6 +1,6 @@
 // Views made of tables, lists and charts.
 
-import { Frame, colour, list, make, series, shown, spanOf, table, unpacked } from "./draw.js";
+import { Frame, colour, list, listColours, make, shown, spanOf, table, unpacked } from "./draw.js";
 
 // Typographic minus, at-least and plus-minus signs, in texts as in numbers.
 const signs = (text) => text.replace(/(^|[\s(,])-(?=\d)/g, "$1\u2212").replaceAll(">=", "\u2265").replaceAll("+- ", "\u00b1\u00a0");
@@ -19,7 +19,10 @@ export class BlocksPage {
       this.main.replaceChildren();
       this.made = view.blocks.map((block) => this.#make(block));
     }
-    view.blocks.forEach((block, i) => this[block.kind](this.made[i], block));
+    view.blocks.forEach((block, i) => {
+      this.made[i].words.textContent = signs(block.words);
+      this[block.kind](this.made[i], block);
+    });
   }
 
   #make(block) {
@@ -35,16 +38,14 @@ export class BlocksPage {
   table({ body, words }, block) {
     // No head without rows.
     table(body, block.rows.length ? block.head : [], block.rows.map((row) => row.map(cell)));
-    words.textContent = signs(block.rows.length ? block.words : block.words || "none");
+    if (!block.rows.length && !block.words) words.textContent = "none";
   }
 
-  facts({ body, words }, block) {
+  facts({ body }, block) {
     list(body, block.rows.map(([name, value]) => [name, cell(value)]));
-    words.textContent = signs(block.words);
   }
 
-  chart({ body, words, legend }, block) {
-    words.textContent = signs(block.words);
+  chart({ body, legend }, block) {
     body.hidden = !block.series.length;
     if (body.hidden) { legend.replaceChildren(); return; }
     const xs = block.series.flatMap((each) => each.x), ys = block.series.flatMap((each) => each.y);
@@ -52,12 +53,11 @@ export class BlocksPage {
     frame.text(block.y, 0, 10, colour("faint"));
     let free = frame.g.measureText(block.y).width + 6;
     const named = block.series.filter((each) => each.name);
-    const paint = (each) => (each.colour ? colour(each.colour) : series(named.indexOf(each)));
     for (const each of block.series) {
       const how = { line: { width: 2.2 }, thin: { width: 0.8 }, dashed: { dashes: [5, 4] }, steps: { steps: true }, dots: null }[each.style];
-      if (how) frame.line(each.x, each.y, paint(each), how);
+      if (how) frame.line(each.x, each.y, colour(each.colour), how);
       // A single point makes no line.
-      if (!how || each.x.filter((x, i) => x !== null && each.y[i] !== null).length === 1) each.x.forEach((x, i) => { if (x !== null && each.y[i] !== null) frame.dot(x, each.y[i], paint(each)); });
+      if (!how || each.x.filter((x, i) => x !== null && each.y[i] !== null).length === 1) each.x.forEach((x, i) => { if (x !== null && each.y[i] !== null) frame.dot(x, each.y[i], colour(each.colour)); });
     }
     for (const [at, what] of block.marks) {
       frame.line([at, at], frame.y, colour("red"), { dashes: [4, 3], width: 1 });
@@ -67,16 +67,10 @@ export class BlocksPage {
       frame.text(what, from, 10, colour("faint"));
       free = from + wide + 6;
     }
-    legend.replaceChildren(...named.map((each) => {
-      const mark = make("i", { className: each.style === "dashed" ? "dashed" : "" });
-      mark.style.color = paint(each);
-      return make("span", {}, mark, each.name);
-    }));
+    listColours(legend, named.map((each) => [each.name, colour(each.colour), each.style === "dashed" ? "dashed" : ""]));
   }
 
-  raster({ body, words, legend }, block) {
-    legend.replaceChildren();
-    words.textContent = signs(block.words);
+  raster({ body }, block) {
     const frame = new Frame(body, [block.from_s, block.to_s], [-0.5, Math.max(0.5, block.n_channels - 0.5)], { top: 18, left: 52, xLabel: "recording's clock (s)" });
     frame.spikes(unpacked(block.spikes.times), unpacked(block.spikes.channels), block.n_channels);
     frame.g.fillStyle = colour("red");

@@ -72,37 +72,27 @@ export class Frame {
     this.left = options.left ?? Math.min(width / 3, 8 + Math.max(18, ...labels.map((each) => g.measureText(each).width)));
     this.right = width - (options.right ?? 8);
     this.top = options.top ?? 6;
-    this.bottom = height - (options.xMarks === null ? 6 : options.xLabel ? 34 : 20);
+    this.bottom = height - 34;
     this.#axes(yMarks, labels, options);
   }
 
   #axes(yMarks, labels, options) {
     const { g } = this;
-    g.lineWidth = 1;
-    g.textBaseline = "middle";
-    g.textAlign = "right";
+    Object.assign(g, { lineWidth: 1, textBaseline: "middle", textAlign: "right", fillStyle: colour("faint") });
     yMarks.forEach((each, i) => {
       const at = this.atY(each);
       if (at < this.top - 1 || at > this.bottom + 1) return;
       if (!options.yLabels) this.#rule(this.left, at, this.right, at, colour("grid"));
-      g.fillStyle = colour("faint");
       g.fillText(labels[i], this.left - 5, at);
     });
-    if (options.xMarks !== null) {
-      g.textAlign = "center";
-      g.textBaseline = "top";
-      const most = Math.max(2, Math.floor((this.right - this.left) / 70));
-      for (const each of options.xMarks ?? marks(this.x[0], this.x[1], most)) {
-        if (options.isCounted && !Number.isInteger(each)) continue;
-        const at = this.atX(each);
-        if (at < this.left - 1 || at > this.right + 1) continue;
-        this.#rule(at, this.bottom, at, this.bottom + 3, colour("faint"));
-        g.fillStyle = colour("faint");
-        const half = g.measureText(shown(each, 6)).width / 2;
-        g.fillText(shown(each, 6), Math.min(at, this.width - half - 1), this.bottom + 5);
-      }
-      if (options.xLabel) g.fillText(options.xLabel, (this.left + this.right) / 2, this.bottom + 20);
+    Object.assign(g, { textBaseline: "top", textAlign: "center" });
+    for (const each of marks(this.x[0], this.x[1], Math.max(2, Math.floor((this.right - this.left) / 70)))) {
+      const at = this.atX(each), half = g.measureText(shown(each, 6)).width / 2;
+      if (at < this.left - 1 || at > this.right + 1 || (options.isCounted && !Number.isInteger(each))) continue;
+      this.#rule(at, this.bottom, at, this.bottom + 3, colour("faint"));
+      g.fillText(shown(each, 6), Math.min(at, this.width - half - 1), this.bottom + 5);
     }
+    g.fillText(options.xLabel, (this.left + this.right) / 2, this.bottom + 20);
     g.strokeStyle = colour("line");
     g.strokeRect(this.left + 0.5, this.top + 0.5, this.right - this.left - 1, this.bottom - this.top - 1);
   }
@@ -120,37 +110,27 @@ export class Frame {
 
   atY(value) { return this.bottom - ((value - this.y[0]) / (this.y[1] - this.y[0] || 1)) * (this.bottom - this.top); }
 
-  // Clips whatever `draw` draws to the frame.
-  within(draw) {
+  // Joins points, clipped to the frame; null breaks the line. With steps, each value holds until the next.
+  line(xs, ys, stroke, { steps = false, width = 1.6, dashes = [] } = {}) {
     const { g } = this;
     g.save();
     g.beginPath();
     g.rect(this.left, this.top, this.right - this.left, this.bottom - this.top);
     g.clip();
-    draw(g);
-    g.restore();
-  }
-
-  // Joins points; null breaks the line. With steps, each value holds until the next.
-  line(xs, ys, stroke, { steps = false, width = 1.6, dashes = [] } = {}) {
-    this.within((g) => {
-      g.strokeStyle = stroke;
-      g.lineWidth = width;
-      g.lineJoin = "round";
-      g.setLineDash(dashes);
-      g.beginPath();
-      let pen = false, lastY = 0;
-      xs.forEach((x, i) => {
-        if (x === null || ys[i] === null || ys[i] === undefined) { pen = false; return; }
-        const at = [this.atX(x), this.atY(ys[i])];
-        if (pen && steps) g.lineTo(at[0], lastY);
-        if (pen) g.lineTo(...at); else g.moveTo(...at);
-        lastY = at[1];
-        pen = true;
-      });
-      g.stroke();
-      g.setLineDash([]);
+    Object.assign(g, { strokeStyle: stroke, lineWidth: width, lineJoin: "round" });
+    g.setLineDash(dashes);
+    g.beginPath();
+    let pen = false, lastY = 0;
+    xs.forEach((x, i) => {
+      if (x === null || ys[i] === null || ys[i] === undefined) { pen = false; return; }
+      const at = [this.atX(x), this.atY(ys[i])];
+      if (pen && steps) g.lineTo(at[0], lastY);
+      if (pen) g.lineTo(...at); else g.moveTo(...at);
+      lastY = at[1];
+      pen = true;
     });
+    g.stroke();
+    g.restore();
   }
 
   dot(x, y, fill, { radius = 3, ring = false } = {}) {
@@ -182,12 +162,9 @@ export class Frame {
     this.g.drawImage(sheet.canvas, this.left, this.top, width / ratio, height / ratio);
   }
 
-  text(words, x, y, fill, align = "left", baseline = "middle") {
-    const { g } = this;
-    g.fillStyle = fill;
-    g.textAlign = align;
-    g.textBaseline = baseline;
-    g.fillText(words, x, y);
+  text(words, x, y, fill) {
+    Object.assign(this.g, { fillStyle: fill, textAlign: "left", textBaseline: "middle" });
+    this.g.fillText(words, x, y);
   }
 }
 
@@ -216,6 +193,14 @@ export function make(name, properties = {}, ...children) {
 
 export function list(target, pairs) {
   target.replaceChildren(...pairs.flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: value })]));
+}
+
+export function listColours(target, entries) {
+  target.replaceChildren(...entries.map(([name, stroke, className = ""]) => {
+    const mark = make("i", { className });
+    mark.style.color = stroke;
+    return make("span", {}, mark, name);
+  }));
 }
 
 // Numbers are right-aligned, texts left-aligned; "none yet" is aligned like the numbers of its column.

@@ -83,8 +83,6 @@ function showState() {
   const state = { running: "● running", ended: "■ ended", silent: "▲ silent" }[view.state] ?? "";
   const line = `${state}${view.message ? `: ${view.message}` : ""}${view.damage ? `; ${view.damage}` : ""}`;
   if ($("state").textContent !== line) $("state").textContent = line;
-  const canStop = thing.kind === "session";
-  $("stop").hidden = !canStop;
   $("stop").disabled = view.state === "ended" || view.stop;
   $("stop").textContent = view.stop && view.state === "running" ? "Stopping…" : "Stop the session";
   $("controls").hidden = !KINDS[thing.kind].seeks;
@@ -129,8 +127,11 @@ function choose(item) {
   following = true;
   to = null;
   $("things").value = `${item.kind} ${item.place}`;
-  // Nothing of the previous item may be mistaken for this one's.
-  $("stop").hidden = $("controls").hidden = true;
+  // Nothing of the previous item may be mistaken for this one's. A session can be stopped even if it cannot be shown.
+  $("controls").hidden = true;
+  $("stop").hidden = item.kind !== "session";
+  $("stop").disabled = false;
+  $("stop").textContent = "Stop the session";
   $("title").textContent = KINDS[item.kind].name;
   $("state").textContent = "reading…";
   $("main").replaceChildren();

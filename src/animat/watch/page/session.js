@@ -1,19 +1,17 @@
 // The view of a closed loop.
 
-import { Frame, colour, list, make, ordered, series, shown, spanOf, table, unpacked } from "./draw.js";
+import { Frame, colour, list, listColours, make, ordered, series, shown, spanOf, table, unpacked } from "./draw.js";
 
 // The same left margin for every canvas over time, so that their times line up.
 const LEFT = 52, CLOCK = "session's clock (s)";
 const units = (column) => column.replaceAll("_per_", "/").replace(/_([^_]+)$/, (all, unit) => (/^(m|s|rad|deg|Hz|V|N)(\/.*)?$/.test(unit) ? ` (${unit})` : all)).replaceAll("_", " ");
 
-function card(main, kind, title, canvasKind, extra = []) {
-  const canvas = canvasKind === null ? null : make("canvas", { className: canvasKind });
-  const words = make("p", { className: "words" });
-  const heading = make("h2", { textContent: title });
-  const section = make("section", { className: kind }, heading, ...(canvas ? [canvas] : []), ...extra, words);
-  if (canvas) canvas.setAttribute("aria-label", title);
+function card(main, kind, title, canvasKind = "") {
+  const canvas = make("canvas", { className: canvasKind }), words = make("p", { className: "words" });
+  const section = make("section", { className: kind }, make("h2", { textContent: title }), canvas, words);
+  canvas.setAttribute("aria-label", title);
   main.append(section);
-  return { canvas, words, heading, section };
+  return { canvas, words, section };
 }
 
 export class SessionPage {
@@ -29,8 +27,8 @@ export class SessionPage {
     this.raster = card(main, "two-thirds", "Spikes by channel", "tall");
     this.legend = make("div", { className: "legend", id: "legend" });
     this.raster.section.insertBefore(this.legend, this.raster.words);
-    this.response = card(main, "half", "Response (Hz per channel) against thresholds", "");
-    this.command = card(main, "half", "Command", "");
+    this.response = card(main, "half", "Response (Hz per channel) against thresholds");
+    this.command = card(main, "half", "Command");
     this.array = card(main, "third", "Array: firing rate of each channel", "square");
     this.observed = make("section", { className: "two-thirds" }, make("h2", { textContent: "Observation" }));
     const grid = make("div", { className: "pair" });
@@ -43,12 +41,12 @@ export class SessionPage {
       return { canvas, words };
     });
     if (!about.observed.length) this.observed.append(make("p", { className: "words", textContent: "the log has no observations" }));
-    this.total = card(main, "half", "Return so far in the episode", "");
-    this.late = card(main, "half", "Lateness and time to decide (ms)", "");
+    this.total = card(main, "half", "Return so far in the episode");
+    this.late = card(main, "half", "Lateness and time to decide (ms)");
     this.agentTable = make("table", { id: "agents" });
-    this.returns = card(main, "", "Return of whole episodes: predicted and measured", "tall", []);
+    this.returns = card(main, "", "Return of whole episodes: predicted and measured", "tall");
     this.returns.section.append(make("div", { className: "table" }, this.agentTable));
-    this.drift = card(main, "half", "Percentiles of the responses over the session (Hz)", "");
+    this.drift = card(main, "half", "Percentiles of the responses over the session (Hz)");
     this.totals = make("dl", { id: "totals" });
     this.faults = make("table", { id: "faults" });
     this.faultWords = make("p", { className: "words" });
@@ -129,33 +127,29 @@ export class SessionPage {
     const frame = new Frame(this.raster.canvas, this.span, [-0.5, Math.max(n - 0.5, 0.5)], { top: 18, left: LEFT, xLabel: CLOCK });
     frame.spikes(unpacked(view.spikes.times), unpacked(view.spikes.channels), n);
     const { ticks } = view;
-    ticks.pulse_time_s.forEach((pulses, i) => {
-      for (const pulse of pulses) {
-        if (pulse < this.span[0] || pulse > this.span[1]) continue;
+    let pulses = 0;
+    ticks.pulse_time_s.forEach((times, i) => {
+      for (const time of times) {
+        if (time < this.span[0] || time > this.span[1]) continue;
+        pulses += 1;
         frame.g.fillStyle = this.condition(ticks.delivered[i]);
-        frame.g.fillRect(frame.atX(pulse) - 1, 4, 2, 12);
+        frame.g.fillRect(frame.atX(time) - 1, 4, 2, 12);
       }
     });
     const thin = view.spikes.every > 1 ? `; every ${view.spikes.every}th is drawn` : "";
-    const pulses = ticks.pulse_time_s.flat().filter((each) => each >= this.span[0] && each <= this.span[1]).length;
     this.raster.words.textContent = view.spikes.n || n
       ? `${shown(view.spikes.n)} spikes on ${shown(n)} channels in ${shown(this.span[1] - this.span[0])} s${thin}; ${shown(pulses)} pulses, marked above the frame in the colour of their stimulus`
       : "the log has no spikes";
     if (!this.legendOf || this.legendOf !== colour("paper")) {
       this.legendOf = colour("paper");
-      this.legend.replaceChildren(...this.about.conditions.map((label, i) => {
-        const mark = make("i");
-        mark.style.color = this.condition(i);
-        return make("span", {}, mark, label);
-      }));
+      listColours(this.legend, this.about.conditions.map((label, i) => [label, this.condition(i)]));
     }
   }
 
   #drawArray(view) {
     const { x_um: x, y_um: y, electrode } = this.about.channels;
-    const known = x.map((each, i) => each !== null && y[i] !== null);
-    const count = known.filter(Boolean).length;
-    if (!count) {
+    const placed = x.map((_, i) => i).filter((i) => x[i] !== null && y[i] !== null);
+    if (!placed.length) {
       this.array.words.textContent = "the log has no channel positions";
       this.array.canvas.hidden = true;
       return;
@@ -164,8 +158,7 @@ export class SessionPage {
     const rates = view.counts.map((each) => each / seconds);
     const sorted = [...rates].sort((a, b) => a - b);
     const most = Math.max(sorted[Math.floor(0.98 * (sorted.length - 1))] ?? 0, 1e-9);
-    const xs = x.filter((_, i) => known[i]), ys = y.filter((_, i) => known[i]);
-    let [across, down] = [spanOf(xs, 20), spanOf(ys, 20)];
+    let [across, down] = [x, y].map((each) => spanOf(placed.map((i) => each[i]), 20));
     const { canvas } = this.array;
     const width = canvas.clientWidth - 50, height = canvas.clientHeight - 45;
     // The same scale in both directions.
@@ -175,39 +168,28 @@ export class SessionPage {
     down = widened(down, height);
     const frame = new Frame(canvas, across, [down[1], down[0]], { xLabel: "x and y (µm)", left: 44 });
     const steps = 12;
-    rates.forEach((rate, i) => {
-      if (!known[i]) return;
-      frame.g.fillStyle = ordered(Math.round(Math.min(1, rate / most) * (steps - 1)), steps);
+    for (const i of placed) {
+      frame.g.fillStyle = ordered(Math.round(Math.min(1, rates[i] / most) * (steps - 1)), steps);
       frame.g.fillRect(frame.atX(x[i]) - 1.5, frame.atY(y[i]) - 1.5, 3, 3);
-    });
-    const pulsed = new Set(view.pulsed.filter((each) => each !== null));
-    let found = 0;
-    electrode.forEach((each, i) => {
-      if (!pulsed.has(each) || !known[i]) return;
-      found += 1;
-      frame.dot(x[i], y[i], colour("red"), { radius: 6, ring: true });
-    });
-    const where = pulsed.size ? `last pulse on electrodes ${[...pulsed].join(", ")}, ringed${found < pulsed.size ? `; no channel reads ${pulsed.size - found} of them` : ""}` : "no pulse at the last tick";
+    }
+    const pulsed = new Set(view.pulsed.filter((each) => each !== null)), ringed = placed.filter((i) => pulsed.has(electrode[i]));
+    for (const i of ringed) frame.dot(x[i], y[i], colour("red"), { radius: 6, ring: true });
+    const unread = pulsed.size - ringed.length;
+    const where = pulsed.size ? `last pulse on electrodes ${[...pulsed].join(", ")}, ringed${unread > 0 ? `; no channel reads ${unread} of them` : ""}` : "no pulse at the last tick";
     this.array.words.textContent = `0 to ${shown(most, 3)} Hz (the brightest), mean ${shown(rates.reduce((a, b) => a + b, 0) / Math.max(1, rates.length), 3)} Hz; ${where}`;
-  }
-
-  #percentilesAt(view, time) {
-    let found = this.about.percentiles_hz;
-    for (const [from, percentiles] of view.percentiles) if (from <= time) found = percentiles;
-    return found;
   }
 
   #drawResponse(view, last) {
     const { ticks } = view;
-    const now = this.#percentilesAt(view, this.span[1]);
+    const changes = [[-Infinity, this.about.percentiles_hz], ...view.percentiles].filter(([from], i, all) => from <= this.span[1] && (all[i + 1]?.[0] ?? Infinity) > this.span[0]);
+    const now = changes.at(-1)[1];
     // Bursts would flatten all other responses: they are drawn at the upper edge.
     const sorted = ticks.rate_hz.filter((each, i) => each !== null && !ticks.is_burst[i]).sort((a, b) => a - b);
     const high = sorted[Math.floor(0.97 * (sorted.length - 1))] ?? 1;
     const frame = new Frame(this.response.canvas, this.span, [0, Math.max(high, now[9] ?? 0, 1e-6) * 1.25], { left: LEFT, xLabel: CLOCK });
-    const changes = [[-Infinity, this.about.percentiles_hz], ...view.percentiles].filter(([from], i, all) => from <= this.span[1] && (all[i + 1]?.[0] ?? Infinity) > this.span[0]);
     for (const which of this.about.thresholds) {
       const xs = [...changes.map(([from]) => Math.max(from, this.span[0])), this.span[1]];
-      const ys = [...changes.map(([, of]) => of[which] ?? null), changes.at(-1)?.[1][which] ?? null];
+      const ys = [...changes.map(([, of]) => of[which] ?? null), now[which] ?? null];
       frame.line(xs, ys, colour("grey"), { steps: true, width: 1, dashes: [4, 3] });
     }
     ticks.rate_hz.forEach((rate, i) => {
@@ -219,23 +201,20 @@ export class SessionPage {
     this.response.words.textContent = `${response}; thresholds${of} (dashed, ${this.about.adaptive ? "adaptive" : "fixed"}): ${thresholds} Hz. A dot has the colour of its stimulus, a ring is a burst; responses above the frame are drawn at its edge.`;
   }
 
-  // Ticks by episode: lines do not connect episodes.
-  #runs(ticks) {
-    const runs = [];
-    ticks.episode.forEach((episode, i) => {
-      if (!runs.length || runs.at(-1).episode !== episode) runs.push({ episode, at: [] });
-      runs.at(-1).at.push(i);
+  // Draws known values over time; lines do not connect episodes. Returns the first tick of each episode.
+  #lines(frame, ticks, values, stroke, options) {
+    const firsts = ticks.episode.map((_, i) => i).filter((i) => i === 0 || ticks.episode[i] !== ticks.episode[i - 1]);
+    firsts.forEach((first, run) => {
+      const known = values.map((_, i) => i).slice(first, firsts[run + 1]).filter((i) => values[i] !== null);
+      frame.line(known.map((i) => ticks.time_s[i]), known.map((i) => values[i]), stroke, options);
     });
-    return runs;
+    return firsts;
   }
 
   #drawCommand(ticks, last) {
     const frame = new Frame(this.command.canvas, this.span, [-1.1, 1.1], { left: LEFT, xLabel: CLOCK, yMarks: [-1, -0.5, 0, 0.5, 1] });
     const n = Math.max(0, ...ticks.command.map((each) => each.length));
-    for (const { at } of this.#runs(ticks)) {
-      const moved = at.filter((i) => ticks.command[i].length);
-      for (let k = 0; k < n; k += 1) frame.line(moved.map((i) => ticks.time_s[i]), moved.map((i) => ticks.command[i][k] ?? null), series(k), { steps: true });
-    }
+    for (let k = 0; k < n; k += 1) this.#lines(frame, ticks, ticks.command.map((each) => each[k] ?? null), series(k), { steps: true });
     const now = last < 0 ? [] : ticks.command[last];
     const names = this.about.readouts.length > 1 ? this.about.readouts : [];
     const words = now.map((each, k) => `${names[k] ? `${names[k]}: ` : ""}${shown(each)}`).join(", ");
@@ -246,10 +225,7 @@ export class SessionPage {
     this.observations.forEach(({ canvas, words }, k) => {
       const values = ticks.observation.map((each) => each[k] ?? null);
       const frame = new Frame(canvas, this.span, spanOf(values, 1e-6), { top: 4, left: LEFT, xLabel: CLOCK });
-      for (const { at } of this.#runs(ticks)) {
-        const seen = at.filter((i) => values[i] !== null);
-        frame.line(seen.map((i) => ticks.time_s[i]), seen.map((i) => values[i]), series(k));
-      }
+      this.#lines(frame, ticks, values, series(k));
       const now = last < 0 ? null : values[last];
       words.textContent = `${units(this.about.observed[k])}: ${now === null ? "none at the last tick" : shown(now, 5)}`;
     });
@@ -257,12 +233,8 @@ export class SessionPage {
 
   #drawTotal(ticks, last) {
     const frame = new Frame(this.total.canvas, this.span, spanOf([0, ...ticks.total], 0.5), { left: LEFT, xLabel: CLOCK });
-    for (const { at } of this.#runs(ticks)) {
-      const known = at.filter((i) => ticks.total[i] !== null);
-      frame.line(known.map((i) => ticks.time_s[i]), known.map((i) => ticks.total[i]), colour("blue"), { steps: true });
-    }
-    for (const { at } of this.#runs(ticks)) {
-      const first = at[0], x = frame.atX(ticks.time_s[first]);
+    for (const first of this.#lines(frame, ticks, ticks.total, colour("blue"), { steps: true })) {
+      const x = frame.atX(ticks.time_s[first]);
       if (x > frame.left - 1 && x + frame.g.measureText(ticks.agent[first]).width < frame.right - 3) frame.text(ticks.agent[first], x + 3, frame.top + 9, colour("faint"));
     }
     this.total.words.textContent = last < 0 ? "no episode in this span" : `${ticks.agent[last]}, episode ${shown(ticks.episode[last])}: ${ticks.total[last] === null ? "being added up" : shown(ticks.total[last], 6)}; the sum restarts with each episode`;
@@ -281,11 +253,7 @@ export class SessionPage {
   }
 
   #drawAgents(view) {
-    // In the session's order, including agents that have not acted yet.
-    const order = new Map(this.about.agents.map((name, i) => [name, i]));
-    const acted = new Set(view.agents.map((each) => each.name));
-    const waiting = this.about.agents.filter((name) => !acted.has(name)).map((name) => ({ name, n: 0, returns: [], mean: null, half: null, predicted: null }));
-    const agents = [...view.agents, ...waiting].sort((a, b) => (order.get(a.name) ?? 1e9) - (order.get(b.name) ?? 1e9));
+    const { agents } = view;
     const rows = Math.max(1, agents.length);
     this.returns.canvas.style.height = `${Math.max(90, 26 * rows + 40)}px`;
     const all = agents.flatMap((each) => [...each.returns, ...(each.predicted ?? [])]);
