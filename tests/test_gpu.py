@@ -23,7 +23,7 @@ from animat import devices
 from animat.errors import Mismatch, UnusableData
 from animat.execution import gpu, training_task
 from animat.execution import training as in_folders
-from animat.execution.gpu import WithGpu, find_gpu, group_by_program
+from animat.execution.gpu import find_gpu, group_by_program, submit_with_gpu
 from animat.execution.jobs import Jobs
 from animat.execution.task import TaskResult, reported
 from animat.execution.training import TrainGroup, train
@@ -160,7 +160,7 @@ def test_tasks_of_one_program_are_done_at_once_and_the_others_on_cores(at_once: 
     tasks = [first, Join("a"), second]
     notices = [tmp_path / f"{number}.json" for number in range(3)]
     with ThreadPoolExecutor(1, "cores") as cores, ThreadPoolExecutor(1, "gpu") as process:
-        done = [future.result() for future in WithGpu(cores, process).submit_tasks(tasks, tmp_path, notices)]
+        done = [future.result() for future in submit_with_gpu(cores, process, tasks, tmp_path, notices)]
     assert [sorted(each.files) for each in done] == [
         ["moving/p0.safetensors", "moving/p1.safetensors"],
         ["a"],
@@ -182,7 +182,7 @@ def test_what_fails_at_once_fails_for_each(tmp_path: Path) -> None:
             return failing
 
     with ThreadPoolExecutor(1) as cores, Process(1) as process:
-        futures = WithGpu(cores, process).submit_tasks(tasks, tmp_path, [tmp_path / "a", tmp_path / "b"])
+        futures = submit_with_gpu(cores, process, tasks, tmp_path, [tmp_path / "a", tmp_path / "b"])
         assert not any(future.done() for future in futures)
         failing.set_exception(UnusableData("no number"))
     assert [str(future.exception()) for future in futures] == ["no number"] * 2

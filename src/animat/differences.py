@@ -24,16 +24,13 @@ _NOTHING = _Nothing()
 
 
 def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Collection[str] = ()) -> str:
-    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`.
+    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`; empty if none.
 
     Args:
-        found: the data in the folder: numbers, strings, and lists and dictionaries of these.
+        found: the data in the folder.
         wanted: the data requested now.
         name: of both, for the beginning of the message.
         ignoring: keys that do not matter, at any depth.
-
-    Returns:
-        The place and both values, abbreviated if long; an empty string if there is no difference.
     """
     if isinstance(found, dict) and isinstance(wanted, dict):
         pairs = [
@@ -71,10 +68,7 @@ def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_description(path: Path, what: str) -> dict[str, Any] | None:
-    """Read the JSON description of the folder that a file is in, with its fingerprint; None if there is no such file.
-
-    `what` names the folder's content, such as `study`, in the message of the InvalidFile raised if it cannot be read.
-    """
+    """Read the JSON description, with a fingerprint, of a folder that holds `what`; None if there is no such file."""
     if not path.exists():
         return None
     try:

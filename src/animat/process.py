@@ -26,8 +26,7 @@ class Process:
     """A process that executes calls, with the same import path as this one.
 
     Args:
-        where: the core it is pinned to; `gpu`: not pinned, and may use the GPU; `plain`: neither, and its standard
-            error is discarded.
+        where: the core it is pinned to; `gpu`: not pinned, and may use the GPU; `plain`: neither, and silent.
     """
 
     def __init__(self, where: int | Literal["gpu", "plain"]) -> None:
@@ -50,12 +49,11 @@ class Process:
         self.kill = self._popen.kill
 
     def answer(self, call: bytes, within_s: float | None = None) -> Any:
-        """Execute a call, a pickled (function, arguments, named arguments), and return its result.
+        """Execute a call, a pickled (function, arguments, named arguments): returns its result, or raises its error.
 
         Raises:
             BrokenExecutor: if the process ends during the call.
             TimeoutError: if the answer does not come in time; the process is then killed.
-            Exception: what the call raised.
         """
         assert self._popen.stdin is not None and self._popen.stdout is not None
         try:
@@ -128,10 +126,7 @@ def answer(work: bytes) -> bytes:
 
 
 def pin_worker(core: int | None) -> None:
-    """Make this process a worker on one core, or on the GPU (None), that ends with the process that started it.
-
-    Call it before JAX or BLAS is loaded.
-    """
+    """Make this process a worker on one core, or on the GPU (None); before JAX or BLAS is loaded."""
     if core is None:
         os.environ.pop("JAX_PLATFORMS", None)
         # Leave memory to other processes, and compute products of 32-bit numbers in 32 bits.

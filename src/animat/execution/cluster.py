@@ -39,9 +39,6 @@ def expect_distributed() -> Any:
 class Cluster(Executor):
     """The workers of a Dask cluster that have the same software versions as this process.
 
-    Work that fails, or whose process or worker ends, is tried three times in all
-    (`animat.execution.dispatch.Dispatch`).
-
     Args:
         where: the scheduler's address, or the file to which it wrote its address (`dask scheduler --scheduler-file`).
         longest_s: longest duration of a batch of small calls; 0: no batches.
@@ -87,16 +84,7 @@ class Cluster(Executor):
     def submit_task(
         self, task: Task, folder: Path, notice: Path, *, name: str, cost_s: float, reads: Mapping[str, str]
     ) -> Future[TaskResult]:
-        """Submit a task (`carry_out_alone`).
-
-        Args:
-            task, folder, notice: arguments of `carry_out_alone`.
-            name, cost_s: as in `Job`.
-            reads: the digest of each file in the folder that it reads, by its place.
-
-        Raises:
-            AnimatError: if the scheduler has ended.
-        """
+        """Submit a job's task (`carry_out_alone`); `reads` has the digests of the files in the folder that it reads."""
         if self._has_shared_folder:
             pickled = pickle.dumps((carry_out_alone, (task, folder, notice), {}))
             return self._submit(Call(name, lambda _: pickled, cost_s))

@@ -38,12 +38,10 @@ class Call:
     """A call that waits or runs.
 
     Attributes:
-        name: its name in messages.
         pickled: returns the pickled function, arguments and keyword arguments for a worker with this folder.
         cost_s: approximate duration; None if unknown.
         reads: files that are sent along, by the digests under which they are stored.
         finish: function applied here to the returned value.
-        future: its result.
         failures, deaths: how often it failed, and how often its process or its worker ended.
     """
 
@@ -96,12 +94,7 @@ class Dispatch:
     """A client's calls, and where they run; everything but `submit` happens in the client's own thread.
 
     A call whose process or worker ended runs alone on a worker from then on, so that neither it nor another call is
-    blamed for the other's death.
-
-    Args:
-        client: Dask's client.
-        select_usable: takes the workers, as the scheduler describes them, and returns those that may get work.
-        longest_s: longest expected duration of a batch; 0: no batches.
+    blamed for the other's death. Of the workers, those that `select_usable` returns get work.
     """
 
     def __init__(

@@ -18,14 +18,10 @@ T = TypeVar("T")
 
 @final
 class PinnedProcesses(ThreadPoolExecutor):
-    """Threads that each pass their work to their own process, pinned to its own core.
+    """Threads that each pass their work to their own process, pinned to its own core (None: to none, with the GPU).
 
-    A process is reused until it has grown large, and ends with the process that started it. If a `with` block is left
-    by an error, running work is ended. Work whose process ends raises a `BrokenExecutor`.
-
-    Args:
-        cores: one process per entry, started when there is work for it; a core named twice gets two. None: a process
-            that is not pinned and may use the GPU.
+    A process is started when there is work for it, and reused until it has grown large. If a `with` block is left by an
+    error, running work is ended. Work whose process ends raises a `BrokenExecutor`.
     """
 
     def __init__(self, cores: Sequence[int | None]) -> None:

@@ -45,13 +45,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        """Run the task, and return the files it wrote, each atomically and reproducibly
-        (`animat.execution.receipts.digest_of`).
-
-        Args:
-            folder: the folder of all its files.
-            progress: updated while it runs.
-        """
+        """Run the task in the folder of all its files, and return those it wrote, each atomically and reproducibly."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +57,7 @@ class TaskResult:
 
 
 def carry_out_alone(task: Task, folder: Path, notice: Path) -> TaskResult:
-    """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed.
-
-    Raises:
-        InvalidFile: if the folder of the notice, which is inside `folder`, is not visible here.
-        AnimatError: if the task fails.
-    """
+    """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed."""
     if not notice.parent.is_dir():
         raise InvalidFile(
             f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it"
@@ -117,11 +106,7 @@ def _has_locked(lock: IO[str]) -> bool:
 
 
 def carry_out(task: Task, folder: Path, notice: Path) -> TaskResult:
-    """Run a task, which reports its progress in the file `notice` (`reported`).
-
-    Raises:
-        AnimatError: if the task fails; in one line, even for unexpected errors.
-    """
+    """Run a task, which reports its progress in the file `notice`; every error is an AnimatError in one line."""
     return carry_out_together([task], folder, [notice], lambda progress: [task.run(folder, progress)])[0]
 
 

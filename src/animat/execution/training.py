@@ -118,16 +118,10 @@ def train(
         if not is_ours(folder, manifest):
             write_description(folder, manifest)
         missing = [group for group in groups if not _is_trained(group, folder)]
-        left = [
-            Job(
-                as_range(group.members),
-                TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)),
-                cost_s=CHUNKS * len(group.members),
-            )
-            for group in missing
-        ]
         curves = Curves(folder, [group.members for group in groups], callbacks, _phase_of(missing, progress))
-        if left:
+        if missing:
+            tasks = [TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)) for group in missing]
+            left = [Job(as_range(task.group.members), task, cost_s=CHUNKS * len(task.group.members)) for task in tasks]
             jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
             try:
                 jobs.run(workers=workers, executor=executor, progress=curves, has_gpu=gpu is not None)
@@ -140,11 +134,10 @@ def train(
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)
-        policies = {}
-        for i in range(training.policies):
-            policies[f"p{i}"] = policy = Policy.load(folder / f"p{i}.safetensors")
+        policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+        for name, policy in policies.items():
             if len(policy.assessments):
-                policies[f"p{i}"] = replace(policy, best=Policy.load(folder / BEST / f"p{i}.safetensors"))
+                policies[name] = replace(policy, best=Policy.load(folder / BEST / f"{name}.safetensors"))
         if training.episodes_assessed and not (folder / TABLE).exists():
             write_assessments(folder, policies)
         curves.finish(policies)
@@ -154,13 +147,7 @@ def train(
 @final
 @dataclass(frozen=True, eq=False)
 class TrainGroup(TrainingTask):
-    """Train a group of policies, resuming from its checkpoint.
-
-    Attributes:
-        group: the group.
-        checkpoint_s: seconds between checkpoints.
-        writes_rows: whether it writes the rows of the learning curves to a file for callbacks.
-    """
+    """Train a group of policies, resuming from its checkpoint; for callbacks it writes the rows to a file."""
 
     group: Group
     checkpoint_s: float
@@ -194,11 +181,8 @@ def as_range(members: Sequence[int]) -> str:
 
 
 def _is_trained(group: Group, folder: Path) -> bool:
-    for member in group.members:
-        path = folder / f"p{member}.safetensors"
-        if not path.exists() or Policy.load(path).provenance.get("fingerprint") != group.fingerprint:
-            return False
-    return True
+    files = [folder / f"p{member}.safetensors" for member in group.members]
+    return all(file.exists() and Policy.load(file).provenance.get("fingerprint") == group.fingerprint for file in files)
 
 
 def _train_in_memory(

@@ -23,12 +23,10 @@ class TrainingWork:
     """A group of policies to train.
 
     Attributes:
-        group: the group.
         place: the folder of its policies.
         checkpoint: the file of its checkpoint if it is trained alone.
-        checkpoint_s: seconds between checkpoints.
-        add_chunk: as in `animat.training.group.train_group`.
-        description: a description to write next to the policies; None: it already exists.
+        checkpoint_s, add_chunk: as in `animat.training.group.train_groups`.
+        description: to write next to the policies; None: it already exists.
     """
 
     group: Group
@@ -69,10 +67,9 @@ def train_alone(work: TrainingWork, progress: Progress) -> list[Path]:
 
 
 def train_together(tasks: Sequence[TrainingTask], folder: Path, notices: Sequence[Path]) -> list[TaskResult]:
-    """Carry out tasks of one program: all of their policies at once, or as many as fit into memory.
+    """`carry_out_together` for tasks of one program: all of their policies at once, or as many as fit into memory.
 
-    If it is killed before it returns and called again with the same tasks, it writes the same bits. Arguments and
-    errors are those of `animat.execution.task.carry_out_together`.
+    If it is killed before it returns and called again with the same tasks, it writes the same bits.
     """
 
     def run(progress: Progress) -> list[list[Path]]:

@@ -32,16 +32,7 @@ def store(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def carry_out_unshared(task: Task, reads: Mapping[str, str], folder: Path) -> UnsharedResult:
-    """`carry_out` in a temporary folder made of the files in the worker's `folder` (`store`).
-
-    Args:
-        task, folder: the task, and the worker's folder.
-        reads: the digest of each file that the task reads, by its place.
-
-    Raises:
-        InvalidFile: if a file was not sent.
-        AnimatError: if the task fails.
-    """
+    """`carry_out` in a temporary folder made of files in the worker's `folder` (`store`), their digests by place."""
     with tempfile.TemporaryDirectory(dir=folder, prefix="animat-task-") as temporary:
         root = Path(temporary)
         for place, digest in reads.items():

@@ -17,8 +17,7 @@ class CurveRow:
         mean_return: their mean return; NaN if none ended.
         entropy: entropy of the actions at the end of the chunk, nats, over transitions drawn from the replay.
         alpha: weight of the entropy bonus at that time.
-        critic_loss: critics' loss at that time, over the same transitions. These three are NaN for policies whose files
-            do not have them, as they were trained before the values were stored.
+        critic_loss: critics' loss at that time, over the same transitions. Older files lack these three: NaN.
     """
 
     policy: str
@@ -31,11 +30,10 @@ class CurveRow:
 
 
 class TrainingCallback(Protocol):
-    """A function that `train` calls with each row, in the process that called `train`.
+    """A function that `train` calls with each row of each policy, in order, including those from before a continuation.
 
-    The rows of a policy arrive in order, each once per call of `train`, including those from before a continuation.
-    Nothing that a callback does changes what is learned. An exception that it raises ends the training, as Ctrl-C does;
-    call `train` again to continue.
+    It is called in the process that called `train`, and changes nothing that is learned. An exception that it raises
+    ends the training, as Ctrl-C does; call `train` again to continue.
     """
 
     def __call__(self, row: CurveRow) -> None:

@@ -31,17 +31,10 @@ ASSESSED = ("iterations", "minute", "lesson", "success", "mean_return")
 def assess(
     environment: Varied[Any], episodes: int, actor: Network, simulator: NeuronSimulator | None, key: PRNGKeyArray
 ) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
-    """Run a policy's most probable actions in the episodes that `key` determines.
+    """The return of each episode of a policy's most probable actions, and whether it succeeded.
 
-    Args:
-        environment: an environment with what varies in it, and the ranges.
-        episodes: number of episodes (static).
-        actor: the policy's network.
-        simulator: the neurons; None for a policy without neurons.
-        key: the same in each assessment of a training, so that policies and minutes are comparable.
-
-    Returns:
-        The return of each episode, and whether it succeeded.
+    The episodes follow from `key`: the same in each assessment of a training, so that policies and minutes are
+    comparable. Their number is static.
     """
     limited = EpisodeLimit(environment)
     start_key, iteration_key = jax.random.split(key)
@@ -67,9 +60,8 @@ class CourseState(NamedTuple):
 
     Attributes:
         lesson: each policy's lesson, counted from 0.
-        table: assessments, one row per chunk, NaN for those still to come; columns as `ASSESSED`.
-        best: each policy's network at its best assessment.
-        best_at: row of that assessment.
+        table: assessments, NaN for those still to come; columns as `ASSESSED`.
+        best: each policy's network at its best assessment, which is row `best_at`.
         score: share of successes and mean return of `best`, on the simulator in use.
     """
 
@@ -81,11 +73,7 @@ class CourseState(NamedTuple):
 
 
 def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tuple[int, int]]:
-    """The first and the last recording that each lesson's episodes draw from, among those that shadowing would use.
-
-    Raises:
-        InvalidArgument: for a lesson without any recording.
-    """
+    """The first and the last recording that each lesson's episodes draw from, among those that shadowing would use."""
     stages = stages_of(training.lessons)
     if timeline is None or training.shadowing != "drawn":
         return [(0, 0)] * len(stages)
@@ -130,14 +118,7 @@ def programs_with_ranges(
 
 
 class Course:
-    """The lessons of a group's policies during training.
-
-    Args:
-        training: the training.
-        environment: the environment that its policies act in.
-        timeline: the culture's simulators; None without neurons.
-        policies: number of policies.
-    """
+    """The lessons of a group's policies during training."""
 
     def __init__(
         self, training: Training, environment: Environment[Any], timeline: SimulatorTimeline | None, policies: int

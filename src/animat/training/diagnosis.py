@@ -40,13 +40,7 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, available: Int[Array, ""]) -> Diagnosis:
-    """Diagnose a learner, always with the same random numbers.
-
-    Args:
-        environment, settings: those of its training (static).
-        learner: the learner after a chunk.
-        available: number of transitions in its replay; 0 gives NaN.
-    """
+    """Diagnose a learner, always with the same random numbers; NaN if its replay has no transitions available."""
     n_drawn = environment.n_drawn
     uniforms = jax.random.uniform(jax.random.key(0), (1 + 2 * n_drawn, _TRANSITIONS))
     batch = draw_batch(environment, learner.replay, available, uniforms[0])

@@ -45,11 +45,7 @@ class Provenance(TypedDict, total=False):
 
 
 def expect_provenance(provenance: Any) -> None:
-    """Refuse a provenance with an invalid entry among those that are read.
-
-    Raises:
-        InvalidArgument: naming the entry, what was expected and what came.
-    """
+    """Refuse a provenance with an invalid entry among those that are read."""
     trained = read_record(Provenance, provenance, "provenance").get("training") or {}
     # `Policy.trained_until_min` needs both.
     if trained.get("duration_min") is not None and "chunks" not in trained:

@@ -31,13 +31,7 @@ Kind = TypeVar("Kind", bound=Robot[Any])
 
 @dataclass(frozen=True)
 class Varying:
-    """What varies in any lesson of a training; static, as the compiled program depends on it.
-
-    Attributes:
-        parameters: names of the robot's parameters.
-        starts: names of numbers of its state.
-        recordings: whether each episode draws its simulator.
-    """
+    """What varies in any lesson of a training; static, as the compiled program depends on it."""
 
     parameters: tuple[str, ...]
     starts: tuple[str, ...]
@@ -45,13 +39,7 @@ class Varying:
 
 
 class Ranges(NamedTuple):
-    """The low and the high end of whatever varies, in the order of `Varying`.
-
-    Attributes:
-        parameters: ranges of the robot's parameters.
-        starts: ranges of numbers of its state; NaN: as the robot's reset sets them.
-        recordings: the first and the last row of the simulators.
-    """
+    """The low and the high end of whatever varies, in the order of `Varying`; a start of NaN is as `reset` sets it."""
 
     parameters: Float[Stored, "*policies 2 parameters"]
     starts: Float[Stored, "*policies 2 starts"]
@@ -80,11 +68,7 @@ class Varied(Wrapper[RobotState]):
     """Draws what varies at each reset; the episode keeps it until its end, even if the ranges change.
 
     Where recordings vary, `simulator` is a stack of simulators, one per recording. `State.info` holds the `parameters`
-    drawn, and the row of the `recording`.
-
-    Attributes:
-        varying: what varies.
-        ranges: the ranges; may be traced.
+    drawn, and the row of the `recording`. The ranges may be traced.
     """
 
     varying: Varying
@@ -135,10 +119,7 @@ class Varied(Wrapper[RobotState]):
 
 
 def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
-    """The robot with changed parameters, which may be traced: created without its checks, which need numbers.
-
-    A goal stays unchanged, in the units and scales of the original robot.
-    """
+    """The robot with changed parameters, which may be traced: created without its checks; a goal stays unchanged."""
     if isinstance(robot, RobotWithGoal):
         with_goal = copy(robot)
         object.__setattr__(with_goal, "robot", with_parameters(robot.robot, values))
