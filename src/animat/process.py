@@ -1,8 +1,4 @@
-"""A process that executes calls: on one core, on the GPU, or as plain Python, such as the one that reads HDF5.
-
-It runs as `python -m animat.process CORE`, or with `gpu` or `plain` in place of the core. Calls arrive pickled on its
-standard input, from the process that started it; what they return or raise is pickled on its standard output.
-"""
+"""A process that executes pickled calls from its standard input: on one core, on the GPU, or as plain Python."""
 
 from __future__ import annotations
 

@@ -1,18 +1,53 @@
-"""Learning curves during training: training processes write the rows to files, which the waiting process reads."""
+"""Learning curves during training: processes write rows to files, which the waiting one reads for callbacks."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress
-from animat.training.callbacks import CurveRow, TrainingCallback
 from animat.training.group import Chunk
 from animat.training.policy import Policy
+
+
+@dataclass(frozen=True)
+class CurveRow:
+    """A row of a policy's learning curve, as in the policy's file: one chunk of the training.
+
+    Attributes:
+        policy: name of the policy, such as `p0`.
+        iterations: iterations done at the end of the chunk.
+        episodes: number of episodes that ended in the chunk.
+        mean_return: their mean return; NaN if none ended.
+        entropy: entropy of the actions at the end of the chunk, nats, over transitions drawn from the replay.
+        alpha: weight of the entropy bonus at that time.
+        critic_loss: critics' loss at that time, over the same transitions. Older files lack these three: NaN.
+    """
+
+    policy: str
+    iterations: int
+    episodes: int
+    mean_return: float
+    entropy: float
+    alpha: float
+    critic_loss: float
+
+
+class TrainingCallback(Protocol):
+    """A function that `train` calls with each row of each policy, in order, including those from before a continuation.
+
+    It is called in the process that called `train`, and changes nothing that is learned. An exception that it raises
+    ends the training, as Ctrl-C does; call `train` again to continue.
+    """
+
+    def __call__(self, row: CurveRow) -> None:
+        """Process a row."""
 
 
 class CurveFile:
@@ -24,7 +59,6 @@ class CurveFile:
         self._path.write_text("")
 
     def add(self, chunk: Chunk) -> None:
-        """Add one chunk of the training."""
         with self._path.open("a") as file:
             file.write(json.dumps(chunk.tolist()) + "\n")
 
@@ -54,7 +88,6 @@ class Curves:
         self._progress.update(done, total, note)
 
     def add(self, members: tuple[int, ...], chunk: Chunk) -> None:
-        """Report one chunk of a group."""
         self._n_reported[members] += 1
         for member, (iterations, episodes, *others) in zip(members, chunk.tolist(), strict=True):
             row = CurveRow(f"p{member}", int(iterations), int(episodes), *others)

@@ -1,8 +1,4 @@
-"""The extension of a Dask worker: `dask worker ADDRESS --preload animat.execution.dask_worker`.
-
-Each of its threads has its own core, with a pinned process that does the work: its death is recognised as such, and
-meanwhile the worker keeps answering the scheduler.
-"""
+"""The extension of a Dask worker, `--preload animat.execution.dask_worker`: a pinned process for each of its threads."""
 
 from __future__ import annotations
 

@@ -135,7 +135,6 @@ class Dispatch:
             self._assign()
 
     async def _poll_workers(self) -> None:
-        """Ask the scheduler which workers exist."""
         if self._client.status != "running":
             return self._end()
         try:
@@ -232,7 +231,6 @@ class Dispatch:
         return _SMALL_S if call.cost_s is None else call.cost_s * self._took_s / self._expected_s
 
     async def _run(self, batch: _Batch) -> None:
-        """Run a batch at its place, and handle the outcome."""
         try:
             await self._send(batch)
         except Exception as error:
@@ -305,7 +303,6 @@ class Dispatch:
             del left[running]
 
     async def _on_call_done(self, event: tuple[float, dict[str, Any]]) -> None:
-        """Handle the event that a call of a batch is done."""
         _, message = event
         batch = self._batches.get(message["batch"])
         if batch is None:

@@ -32,11 +32,9 @@ class PinnedProcesses(ThreadPoolExecutor):
         self._lock, self._is_killed = threading.Lock(), False
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Submit a call, which is pickled immediately."""
         return super().submit(self._run, pickle.dumps((fn, args, kwargs)))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut the executor down and end its processes."""
         super().shutdown(wait, cancel_futures=cancel_futures)
         for process in self._processes if wait else ():
             process.end()

@@ -34,7 +34,6 @@ class Receipt:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the receipt."""
         return hashlib.sha256(self._text().encode()).hexdigest()
 
     def _text(self) -> str:
@@ -62,13 +61,11 @@ class Receipt:
 
 
 def receipt_path(receipts: Path, job: str) -> Path:
-    """Path of a job's receipt."""
     # No job's name has a "+", so two jobs never share a path.
     return receipts / f"{job.replace('/', '+')}.json"
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's contents."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -14,7 +14,7 @@ from typing import final
 from animat.coding.decoder import expect_fit
 from animat.devices import gpu_here
 from animat.errors import InvalidArgument, UnusableData, expect_kind, expect_several
-from animat.execution.curves import CurveFile, Curves
+from animat.execution.curves import CurveFile, Curves, TrainingCallback
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
@@ -22,7 +22,6 @@ from animat.execution.training_task import TrainingTask, TrainingWork
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
 from animat.robots.host import HostRobot
-from animat.training.callbacks import TrainingCallback
 from animat.training.course import rows_of
 from animat.training.folder import (
     MANIFEST,

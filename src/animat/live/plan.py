@@ -39,9 +39,6 @@ class Timetable:
         interval_min: minutes of the culture's clock between the starts of two recordings.
         duration_min: minutes of the culture's clock from the first recording to the end of training.
         speed: minutes of the culture's clock per minute of real time: 1 for a living culture.
-
-    Raises:
-        InvalidArgument: for a number that is not above 0.
     """
 
     interval_min: Positive = 10.0

@@ -51,8 +51,6 @@ class LiveRun:
     """The results of a live run.
 
     Attributes:
-        recordings: the files.
-        policies: by name.
         swaps: each time a group of policies switched to newer simulators, with the date.
         iterations: fewest training iterations of a policy.
         culture_min, wall_s: time from the first recording to the end of training.
@@ -68,7 +66,6 @@ class LiveRun:
     gap: RealityGap
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
         return {
             "recordings": [str(file) for file in self.recordings],
             "policies": list(self.policies),
@@ -317,7 +314,6 @@ class _Run:
                 self.write("training began", **swap)
 
     def write(self, what: str, **fields: Any) -> dict[str, Any]:
-        """Log an event, with the date and both clocks."""
         line = {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "wall_s": round(time.monotonic() - self._wall_zero_s, 3),

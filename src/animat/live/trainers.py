@@ -57,7 +57,6 @@ class Exchange:
 
     @property
     def is_finished(self) -> bool:
-        """Whether training is to end."""
         return (self.folder / "finish").exists()
 
 
@@ -135,7 +134,6 @@ class Trainers:
 
     @property
     def iterations(self) -> int:
-        """Fewest iterations of a group."""
         fewest: int = min(report["iterations"] for report in self._reports.values())
         return fewest
 

@@ -8,8 +8,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from animat.errors import InvalidFile
+from animat.execution.curves import CurveRow
 from animat.extras import expect_extra
-from animat.training.callbacks import CurveRow
 
 
 class TensorBoard:

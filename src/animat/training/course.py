@@ -56,7 +56,7 @@ def assess(
 
 
 class CourseState(NamedTuple):
-    """The progress of a group's policies. Its shapes are fixed from the start, as it is part of a checkpoint.
+    """The progress of a group's policies, as part of a checkpoint, whose shapes are fixed from the start.
 
     Attributes:
         lesson: each policy's lesson, counted from 0.
@@ -140,13 +140,11 @@ class Course:
         return jax.tree.map(lambda stages: stages[self.state.lesson], self._ranges)  # type: ignore[no-any-return]
 
     def begin(self, keys: Any) -> Learner:
-        """As `animat.training.sac.begin`, for all policies."""
         learners: Learner = self._programs[0](self.ranges, keys)
         self.state = self.state._replace(best=jax.tree.map(np.zeros_like, jax.device_get(learners.deployed)))
         return learners
 
     def train(self, learners: Learner, *arguments: Any) -> Any:
-        """As `animat.training.sac.train_chunk`, for all policies."""
         return self._programs[1](self.ranges, learners, *arguments)
 
     def assess(self, index: int, deployed: Network, simulator: NeuronSimulator | None) -> None:

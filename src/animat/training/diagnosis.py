@@ -1,7 +1,4 @@
-"""Diagnostics of a learner between two chunks, which help to explain its learning curve.
-
-They are computed after the chunk: no bit of what is learned depends on them, and no gradient step is slower.
-"""
+"""Diagnostics of a learner between two chunks, to explain its learning curve; nothing that is learned depends on them."""
 
 from __future__ import annotations
 
@@ -30,8 +27,6 @@ class Diagnosis(NamedTuple):
 
     Attributes:
         entropy: mean of H(pi(.|o)), nats; for continuous actions the mean of -log pi(a|o), one action drawn per state.
-        alpha: weight of the entropy bonus.
-        critic_loss: the critics' loss, as in `animat.training.sac.discrete_losses`.
     """
 
     entropy: Float[Array, ""]

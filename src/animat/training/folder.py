@@ -97,7 +97,6 @@ def describe(
 
 
 def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
-    """How the simulators were made, without the responses themselves."""
     return {
         **timeline.fitted,
         "conditions": [condition.label for condition in timeline.conditions],

@@ -48,13 +48,9 @@ AddChunk: TypeAlias = Callable[[Chunk], None]
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Some of a training's policies, and the simulators they are trained on.
+    """Some of a training's policies, by their numbers, and the simulators they are trained on.
 
-    Attributes:
-        members: numbers of the policies.
-        timeline: the culture's simulators; None without neurons.
-        fingerprint: of training and timeline together; a checkpoint with another fingerprint is refused.
-        provenance: stored in the policies.
+    A checkpoint with another fingerprint is refused. The provenance is stored in the policies.
     """
 
     training: Training

@@ -1,7 +1,6 @@
 """Soft Actor-Critic for bodies that are stepped on the host: acting and learning are compiled, the bodies are not.
 
-A round is that of `animat.training.sac`: every body does one iteration, which is stored, then come the gradient steps.
-It is divided where the bodies move: one compiled program takes what they did, learns, and acts for the next round.
+A round is divided where the bodies move: one compiled program takes what they did, learns, and acts for the next one.
 """
 
 from __future__ import annotations
@@ -129,7 +128,6 @@ class _Chunks:
         self._bodies: Bodies | None = None
 
     def begin(self, keys: PRNGKeyArray) -> Learner:
-        """Untrained policies."""
         # Seeds follow from each policy's key, like its other draws.
         policy_seeds = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
         self._seeds = [(*seed, body) for seed in policy_seeds for body in range(self._n)]
@@ -140,7 +138,6 @@ class _Chunks:
     def __call__(
         self, learners: Learner, simulator: NeuronSimulator | None, first_round: Array, last_round: Array
     ) -> tuple[Learner, Finished]:
-        """As `animat.training.sac.train_chunk`."""
         members = len(learners.returns)
         finished = Finished(np.zeros(members), np.zeros(members))  # type: ignore[arg-type]
         if int(last_round) == int(first_round):

@@ -1,7 +1,4 @@
-"""The entries of a policy's provenance that code reads: how it was trained, and on which simulators.
-
-The other entries are for people and are kept unchanged. JAX is not imported here: policies are loaded without it.
-"""
+"""The entries of a policy's provenance that code reads, without JAX; the others are for people, and kept unchanged."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """An environment whose episodes are drawn from ranges of the robot's parameters, its starts, and the recordings.
 
-The ranges are arrays, traced like the simulator. A new lesson changes data, not code: nothing is recompiled, and
-policies that are trained side by side can be at different lessons.
+The ranges are arrays, traced like the simulator: for another lesson nothing is recompiled.
 """
 
 from __future__ import annotations
