@@ -605,7 +605,7 @@ BAD = {
     "a training's description that somebody edited": (
         lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),
         ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
-        ["expected a folder of this training, got one of another (training.robot.name: None there, 'cartpole' now)"],
+        ["expected a folder of this training, got one of another (training: [1] there, {'"],
     ),
     "zero sessions": (
         nothing,

@@ -1,4 +1,4 @@
-"""The extension of a Dask worker, `--preload animat.execution.dask_worker`: a pinned process for each of its threads."""
+"""The extension of a Dask worker (`--preload animat.execution.dask_worker`): a pinned process for each thread."""
 
 from __future__ import annotations
 

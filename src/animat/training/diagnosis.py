@@ -1,4 +1,4 @@
-"""Diagnostics of a learner between two chunks, to explain its learning curve; nothing that is learned depends on them."""
+"""Diagnostics of a learner between two chunks, to explain its learning curve; they do not affect what is learned."""
 
 from __future__ import annotations
 

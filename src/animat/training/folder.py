@@ -38,6 +38,8 @@ _INFORMATIVE = ("sources", "random_return")
 """Entries of a description that do not determine the policies."""
 _NOT_REPORTED = ("fingerprint", *_INFORMATIVE, "burst_thresholds")
 """Entries not reported as the difference between two trainings: they differ with the responses."""
+_FIRST = ("training", "robot")
+"""Entries reported first: what follows from the robot, such as the default iterations, is not the cause."""
 
 
 def expect_trainable(training: Training, *, is_saved: bool) -> None:
@@ -112,7 +114,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
     if (stored := _stored_description(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
         unknown = ("simulators", *_INFORMATIVE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
-        if difference := _first_difference(stored, describe(training, None), unknown):
+        if difference := first_difference(stored, describe(training, None), ignoring=unknown, first=_FIRST):
             raise folder_mismatch(folder, "training", difference)
 
 
@@ -144,8 +146,8 @@ def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
     """Whether the folder already holds this training; False if it is free; raises Mismatch or InvalidFile otherwise."""
     stored = _stored_description(folder)
     if stored is not None and stored["fingerprint"] != manifest["fingerprint"]:
-        difference = _first_difference(stored, manifest, _NOT_REPORTED) or "other responses"
-        raise folder_mismatch(folder, "training", difference)
+        difference = first_difference(stored, manifest, ignoring=_NOT_REPORTED, first=_FIRST)
+        raise folder_mismatch(folder, "training", difference or "other responses")
     return stored is not None
 
 
@@ -158,22 +160,6 @@ def _stored_description(folder: Path) -> dict[str, Any] | None:
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     expect_no_other(folder, "training")
     return None
-
-
-def _first_difference(stored: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
-    # The robot first: differences that follow from it, such as the default iterations, are not the cause.
-    theirs, ours = _robot_in(stored), _robot_in(manifest)
-    return first_difference(theirs, ours, "training.robot.name") or first_difference(
-        stored, manifest, ignoring=ignoring
-    )
-
-
-def _robot_in(manifest: dict[str, Any]) -> Any:
-    """The robot's name; None if an edited description lacks it."""
-    try:
-        return manifest["training"]["robot"]["name"]
-    except (KeyError, TypeError):
-        return None
 
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:
