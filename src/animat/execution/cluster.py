@@ -70,10 +70,14 @@ class Cluster(Executor):
         self._futures: set[Future[Any]] = set()
         self._has_shared_folder, self._local = has_shared_folder, PinnedProcesses(own_cores()[-1:])
         try:
-            self._expect_workers(self._client.scheduler_info()["workers"])
+            workers = self._client.scheduler_info()["workers"]
+            if workers and not self._usable(workers):
+                raise Mismatch(f"cluster: {_why_refused(*next(iter(workers.items())))}, and there is no other")
         except BaseException:
             self._client.close()
             raise
+        if not workers:
+            print("cluster: waiting for workers", file=sys.stderr)
         self._dispatch = Dispatch(self._client, self._usable, longest_s)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
@@ -124,12 +128,6 @@ class Cluster(Executor):
         call.future.add_done_callback(self._futures.discard)
         self._dispatch.submit(call)
         return call.future
-
-    def _expect_workers(self, workers: dict[str, Any]) -> None:
-        if workers and not self._usable(workers):
-            raise Mismatch(f"cluster: {_why_refused(*next(iter(workers.items())))}, and there is no other")
-        if not workers:
-            print("cluster: waiting for workers", file=sys.stderr)
 
     def _usable(self, workers: dict[str, Any]) -> dict[str, Any]:
         """The workers with the same versions; a warning names each of the others, once, if there are any of these."""

@@ -60,7 +60,7 @@ def train(
     it trains the others together again, and their last bits differ.
 
     Args:
-        training: the training.
+        training: what to train.
         timeline: the culture's simulators; None for a training without neurons.
         folder: folder for the policies, created if missing. None: train in this process and write nothing; if stopped,
             training starts again. This also allows robots and mappings that are not registered.
@@ -69,18 +69,16 @@ def train(
             this machine.
         progress: updated during training.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
-        sources: names of the recordings, for the manifest.
-        random_return: mean return of random actions, for the manifest: a line in the live page's learning curves.
-        callbacks: functions called with every row of the learning curves as it is produced; no bit of what is learned
-            depends on them.
+        sources, random_return: for the manifest: names of the recordings, and the mean return of random actions, a line
+            in the live page's learning curves.
+        callbacks: called with every row of the learning curves as it is produced; they change no bit.
 
     Returns:
         The policies by name, `p0` first. Assessed policies carry their best version, which the folder has in `best/`,
         with all assessments in `assessments.csv`.
 
     Raises:
-        InvalidArgument: if neurons are missing for a mapping or given without one, if there are not as many readouts as
-            the robot has commands, for fewer than one worker or any with an executor, or as in `expect_trainable`.
+        InvalidArgument: for a training that cannot be trained, with these simulators, workers or executor.
         Mismatch: if the folder holds another training or other work, or another run is active in it.
         InvalidFile: if a file cannot be read or written.
         UnusableData: if what was learned is no longer finite; none of it is left in the folder.

@@ -25,7 +25,7 @@ from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
 from animat.training.course import Course
 from animat.training.diagnosis import Diagnosis, diagnosis_program
-from animat.training.host import programs_on_host
+from animat.training.host import OnHost
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
 from animat.training.sac import begin, train_chunk
@@ -191,7 +191,8 @@ class SideBySide:
             self._course = Course(training, self._environment, group.timeline, len(self._places))
             beginning, self._chunk = self._course.begin, self._course.train
         elif isinstance(training.robot, HostRobot):
-            beginning, self._chunk = programs_on_host(self._environment, training.algorithm)
+            on_host = OnHost(self._environment, training.algorithm)
+            beginning, self._chunk = on_host.begin, on_host.train
         else:
             beginning, self._chunk = programs(self._environment, training.algorithm, self._own_simulators)
         keys = [jax.random.fold_in(jax.random.key(each.training.seed), member) for each, member in self._places]

@@ -111,16 +111,12 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
     )
 
 
-def programs_on_host(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The counterpart of `animat.training.group.programs` for a robot that is stepped on the host.
+class OnHost:
+    """`begin` and `train_chunk` of `animat.training.sac` for policies of a robot that is stepped on the host.
 
     Between chunks the learners hold the bodies as data (`Snapshot`), so checkpoints are like those of other robots.
     """
-    chunks = _Chunks(environment, algorithm)
-    return chunks.begin, chunks
 
-
-class _Chunks:
     def __init__(self, environment: Environment[Any], algorithm: SAC) -> None:
         assert isinstance(environment.robot, HostRobot)
         self._robot, self._n = environment.robot, algorithm.environments
@@ -135,7 +131,7 @@ class _Chunks:
         none = Snapshot.initial(self._robot, len(keys) * self._n)
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
-    def __call__(
+    def train(
         self, learners: Learner, simulator: NeuronSimulator | None, first_round: Array, last_round: Array
     ) -> tuple[Learner, Finished]:
         members = len(learners.returns)
