@@ -58,12 +58,10 @@ class Process:
             if within_s is not None and not select.select([self._popen.stdout], [], [], within_s)[0]:
                 raise TimeoutError(f"no answer within {within_s:g} s")
             answer = pickle.load(self._popen.stdout)
-        except (BrokenPipeError, EOFError) as error:
-            raise BrokenExecutor(f"its process ended with status {self._popen.wait()}") from error
         except BaseException as error:
             self.kill()  # It may still be running, with nobody to read its answer.
             status = self._popen.wait()
-            if isinstance(error, pickle.UnpicklingError):
+            if isinstance(error, BrokenPipeError | EOFError | pickle.UnpicklingError):
                 raise BrokenExecutor(f"its process ended with status {status}") from error
             raise
         value, raised = pickle.loads(answer)

@@ -20,8 +20,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, f
 from animat.execution.dask_worker import VERSIONS_PREFIX, versions_tag, work
 from animat.execution.dispatch import LONGEST_S, Call, Dispatch
 from animat.execution.pinned import PinnedProcesses, own_cores
-from animat.execution.task import Task, TaskResult, carry_out_alone
-from animat.execution.unshared import bring_back, carry_out_unshared
+from animat.execution.task import Task, TaskResult, bring_back, carry_out_alone, carry_out_unshared
 from animat.extras import expect_extra
 
 P = ParamSpec("P")
@@ -100,7 +99,7 @@ class Cluster(Executor):
                 lambda worker_folder: pickle.dumps((carry_out_unshared, (task, dict(reads), worker_folder), {})),
                 cost_s,
                 reads={digest: folder / place for place, digest in reads.items()},
-                finish=lambda unshared: bring_back(unshared, folder),
+                finish=lambda came_back: bring_back(*came_back, folder),
             )
         )
 

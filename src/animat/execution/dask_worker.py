@@ -21,7 +21,7 @@ from typing import Any, TextIO
 
 from animat.errors import AnimatError, InvalidFile
 from animat.execution.pinned import PinnedProcesses, own_cores
-from animat.execution.unshared import store
+from animat.execution.task import store
 
 VERSIONS_PREFIX, PLACE_PREFIX = "animat:", "animat-place:"
 """Prefixes of the resources whose names give a worker's software versions and its identity."""

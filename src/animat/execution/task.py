@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import platform
+import tempfile
 import threading
 import time
 import traceback
@@ -19,6 +20,7 @@ from typing import IO, Any
 from animat.errors import AnimatError, InvalidFile, first_line, out_of_memory
 from animat.execution.receipts import digest_of
 from animat.progress import Progress
+from animat.writing import write_whole
 
 SILENT_S = 60.0
 """Silence after which a process is considered frozen."""
@@ -28,6 +30,8 @@ PLANNED = ".planned.json"
 """File in it with the cost of each job by name, from which others compute the progress."""
 NOTICES = ".notices"
 """Folder in it with the last progress of each job."""
+_STORE = "animat-files"
+"""Folder of the files that a worker was sent, in its own folder."""
 
 
 class Task(abc.ABC):
@@ -167,3 +171,35 @@ def memory_of(task: Task) -> str:
 def _unexpected(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{first_line(error)} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"
+
+
+def store(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Store contents in a worker's folder, each under its digest."""
+    (folder / _STORE).mkdir(exist_ok=True)
+    for digest, content in contents.items():
+        write_whole(folder / _STORE / digest, content)
+
+
+def carry_out_unshared(task: Task, reads: Mapping[str, str], folder: Path) -> tuple[TaskResult, dict[str, bytes]]:
+    """`carry_out` in a temporary folder made of files in the worker's `folder` (`store`), their digests by place.
+
+    Returns the contents of the files that the task wrote, too.
+    """
+    with tempfile.TemporaryDirectory(dir=folder, prefix="animat-task-") as temporary:
+        root = Path(temporary)
+        for place, digest in reads.items():
+            (root / place).parent.mkdir(parents=True, exist_ok=True)
+            try:
+                # A link is enough, as tasks replace files and never modify them.
+                (root / place).hardlink_to(folder / _STORE / digest)
+            except FileNotFoundError as error:
+                raise InvalidFile(f"{place}: expected it to be sent to the worker, got nothing") from error
+        result = carry_out(task, root, root / ".notice" / "task.json")
+        return result, {place: (root / place).read_bytes() for place in result.files}
+
+
+def bring_back(result: TaskResult, contents: Mapping[str, bytes], folder: Path) -> TaskResult:
+    """Write the files that came back from a worker into the folder."""
+    for place, content in contents.items():
+        write_whole(folder / place, content)
+    return result

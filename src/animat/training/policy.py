@@ -23,7 +23,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, s
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
-from animat.records import Flag, Number, read_record
+from animat.records import Flag, Number, in_file, json_data, read_record
 from animat.responses.condition import Condition, abbreviated
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
@@ -338,17 +338,15 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
         raise InvalidFile(
             f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one: {error}"
         ) from error
-    try:
-        description = json.loads(metadata["animat"])
-    except (ValueError, RecursionError) as error:
-        raise InvalidFile(f"{path}: metadata: expected JSON, got something else ({error})") from error
-    file_format = description.get("format") if isinstance(description, dict) else description
-    if file_format != FORMAT:
-        raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {shown(file_format)}")
-    # Older files lack this entry, and use this activation.
-    activation = description.get("hidden_activation", HIDDEN_ACTIVATION)
-    if activation != HIDDEN_ACTIVATION:
-        raise InvalidFile(f"{path}: expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
+    with in_file(path):
+        description = json_data(metadata["animat"], "metadata")
+        file_format = description.get("format") if isinstance(description, dict) else description
+        if file_format != FORMAT:
+            raise InvalidArgument(f"expected the format {FORMAT!r}, got {shown(file_format)}")
+        # Older files lack this entry, and use this activation.
+        activation = description.get("hidden_activation", HIDDEN_ACTIVATION)
+        if activation != HIDDEN_ACTIVATION:
+            raise InvalidArgument(f"expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
     return arrays, description
 
 
