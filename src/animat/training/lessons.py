@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import field
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from animat.errors import InvalidArgument, did_you_mean
 from animat.goals.robot import without_goal
@@ -26,7 +26,14 @@ MOST_VARIED = 10
 """Largest number of parameters that vary: a robot is built for every combination of their ends as a check."""
 _MOST_BYTES = 2**20
 
-Range = tuple[Number, Number]
+
+def _expect_low_first(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"expected the low end first, got [{ends[0]:g}, {ends[1]:g}]")
+    return ends
+
+
+Range = Annotated[tuple[Number, Number], AfterValidator(_expect_low_first)]
 """The lowest and the highest value; every value in between is equally likely."""
 
 
@@ -55,14 +62,6 @@ class Lesson:
     until_return: Number | None = None
 
     def __post_init__(self) -> None:
-        ranges = {
-            f"{table}.{name}": ends for table in ("parameters", "starts") for name, ends in vars(self)[table].items()
-        }
-        if self.recordings_min is not None:
-            ranges["recordings_min"] = self.recordings_min
-        for name, (low, high) in ranges.items():
-            if low > high:
-                raise InvalidArgument(f"{name}: expected the low end first, got [{low:g}, {high:g}]")
         if self.success is not None and self.until_return is not None:
             raise InvalidArgument("until_return: expected either success or until_return, got both")
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_type_hints
 
 import numpy as np
 from pydantic import BeforeValidator, Field, InstanceOf
-from typing_extensions import TypedDict
 
 from animat.coding.decoder import expect_one_command
 from animat.coding.electrode_pulses import expect_electrode_pulses
@@ -28,7 +27,7 @@ from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC, PulseC
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
 Percentiles = Literal["moving", "first"]
-Shadowing = bool | Literal["drawn"]
+Shadowing = Literal[True, False, "drawn"]
 
 CHUNKS = 60
 """Number of chunks in a training: the units of progress, refresh and checkpoint; a culture minute each by default."""
@@ -69,24 +68,6 @@ Commands = Annotated[
 ]
 
 
-class _Checked(TypedDict):
-    """The types expected of most fields."""
-
-    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)]
-    iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)]
-    seed: Seed
-    shadowing: Literal[True, False, "drawn"]
-    duration_min: Positive | None
-    percentiles: Percentiles
-    delivery: Delivery
-    neural_observation: Flag
-    commands: Commands | None
-    algorithm: InstanceOf[SAC]
-    lessons: tuple[InstanceOf[Lesson], ...]
-    assess: Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None
-    pulse_cost: PulseCost
-
-
 @dataclass(frozen=True)
 class Training:
     """Everything that determines the policies, except for the recordings.
@@ -121,27 +102,29 @@ class Training:
 
     robot: _Named[Robot[Any]] = _Named(robot_named)
     mapping: _Named[Mapping | None] = _Named(_mapping_named)
-    policies: int = 10
-    iterations: int = 800_000
-    seed: int = 1
+    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
+    iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] = 800_000
+    seed: Seed = 1
     shadowing: Shadowing = True
-    duration_min: float | None = None
+    duration_min: Positive | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
-    neural_observation: bool = False
-    commands: tuple[float, ...] | None = None
-    algorithm: SAC = field(default_factory=SAC)
-    lessons: tuple[Lesson, ...] = ()
-    assess: int | None = None
-    pulse_cost: float = 0.0
+    neural_observation: Flag = False
+    commands: Commands | None = None
+    algorithm: InstanceOf[SAC] = field(default_factory=SAC)
+    lessons: tuple[InstanceOf[Lesson], ...] = ()
+    assess: Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None = None
+    pulse_cost: PulseCost = 0.0
 
     def __post_init__(self) -> None:
         for what, kind in (("robot", Robot), ("mapping", Mapping)):
             value: Any = getattr(self, what)
             if not isinstance(value, kind) and (what, value) != ("mapping", None):
                 raise InvalidArgument(f"{what}: expected a {what} or the name of one, got {shown(value)}")
-        # The converted values: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
-        vars(self).update(read_record(_Checked, {name: getattr(self, name) for name in _Checked.__annotations__}))
+        for name, expected in get_type_hints(Training, include_extras=True).items():
+            if name not in ("robot", "mapping"):
+                # The converted value: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
+                vars(self)[name] = read_record(expected, getattr(self, name), name)
         if self.commands is not None:
             if not self.commands:
                 raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
