@@ -61,14 +61,9 @@ def write_whole(path: Path, content: str | bytes) -> Path:
 
 
 def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_bytes: float = 0) -> None:
-    """Refuse a folder, which may be missing, that could not be written to, before any work; nothing is left behind.
+    """Refuse a folder, which may be missing, that could not be written to or has no `room_bytes` left, before any work.
 
-    Args:
-        option: the command-line option that chooses the folder.
-        room_bytes: space that must be free.
-
-    Raises:
-        InvalidFile: naming the folder and the obstacle.
+    Nothing is left behind. `option` is the command-line option that chooses the folder.
     """
     existing = folder = Path(folder)
     try:

@@ -1,7 +1,6 @@
 """Dispatch of calls to the workers of a Dask cluster: assignment, batches of small calls, and retries.
 
-Dask only transports calls and answers. It neither chooses workers nor retries: it would blame the death of a worker on
-all calls that the worker had been given.
+Dask only transports calls and answers: it would blame a worker's death on all calls that the worker had been given.
 """
 
 from __future__ import annotations

@@ -29,12 +29,8 @@ runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler and workers until the block ends; a worker that dies is replaced.
 
-    The scheduler writes its address to the file, which is removed at the end. Yields the processes of the scheduler and
-    of the workers' nanny.
-
-    Raises:
-        AnimatError: if Dask is not installed, or the scheduler does not start.
-        InvalidFile: if the file already exists.
+    The scheduler writes its address to the file, which may not exist yet, and is removed at the end. Yields the
+    processes of the scheduler and of the workers' nanny.
     """
     expect_distributed()
     if file.exists():

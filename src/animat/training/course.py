@@ -33,8 +33,7 @@ def assess(
 ) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
     """The return of each episode of a policy's most probable actions, and whether it succeeded.
 
-    The episodes follow from `key`: the same in each assessment of a training, so that policies and minutes are
-    comparable. Their number is static.
+    With the same key in each assessment of a training, its policies and minutes are comparable.
     """
     limited = EpisodeLimit(environment)
     start_key, iteration_key = jax.random.split(key)

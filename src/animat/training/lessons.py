@@ -77,11 +77,7 @@ class _File:
 
 
 def read_lessons(path: str | os.PathLike[str]) -> tuple[Lesson, ...]:
-    """Read lessons from a TOML file, one table `[[lessons]]` each, whose keys are the attributes of `Lesson`.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
-    """
+    """Read lessons from a TOML file, one table `[[lessons]]` each, whose keys are the attributes of `Lesson`."""
     with in_file(path):
         lessons = read_record(_File, read_toml(path, _MOST_BYTES)).lessons
         if not lessons:

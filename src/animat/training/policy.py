@@ -351,12 +351,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
 
 
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
-    """The first of several policies, which represents all of them.
-
-    Raises:
-        InvalidArgument: if there are none.
-        Mismatch: if they differ in one of the attributes or in what they observe; ends with the advice.
-    """
+    """The first of several policies, which represents all of them; raises a Mismatch if an attribute differs."""
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))

@@ -130,11 +130,7 @@ def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
 
 
 def expect_varied(robot: Robot[Any], varying: Varying) -> None:
-    """Refuse what cannot vary in this robot, by tracing it.
-
-    Raises:
-        InvalidArgument: for a parameter that must be known at compile time, or a name that the state does not have.
-    """
+    """Refuse what cannot vary in this robot, by tracing it."""
     state = jax.eval_shape(without_goal(robot).reset, jax.random.key(0))
     known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
     for name in varying.starts:
