@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_type_hints
 
 import numpy as np
-from pydantic import BeforeValidator, Field, InstanceOf
+from pydantic import BeforeValidator, Field, InstanceOf, PlainValidator
 
 from animat.coding.decoder import expect_one_command
 from animat.coding.electrode_pulses import expect_electrode_pulses
@@ -27,7 +27,7 @@ from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC, PulseC
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
 Percentiles = Literal["moving", "first"]
-Shadowing = Literal[True, False, "drawn"]
+Shadowing = bool | Literal["drawn"]
 
 CHUNKS = 60
 """Number of chunks in a training: the units of progress, refresh and checkpoint; a culture minute each by default."""
@@ -60,6 +60,13 @@ def _mapping_named(name: str) -> Mapping:
     if name == "none":
         raise InvalidArgument("mapping: expected None without neurons, mapping=None in Python, got 'none'")
     return mapping_named(name)
+
+
+def _expect_shadowing(value: Any) -> Any:
+    # Not as a union, whose error would name one of the two types only.
+    if not isinstance(value, bool) and value != "drawn":
+        raise ValueError(f"expected True, False or 'drawn', got {shown(value)}")
+    return value
 
 
 Commands = Annotated[
@@ -105,7 +112,7 @@ class Training:
     policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
     iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] = 800_000
     seed: Seed = 1
-    shadowing: Shadowing = True
+    shadowing: Annotated[Shadowing, PlainValidator(_expect_shadowing)] = True
     duration_min: Positive | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
