@@ -99,7 +99,7 @@ class Cluster(Executor):
                 lambda worker_folder: pickle.dumps((carry_out_unshared, (task, dict(reads), worker_folder), {})),
                 cost_s,
                 reads={digest: folder / place for place, digest in reads.items()},
-                finish=lambda came_back: bring_back(*came_back, folder),
+                finish=lambda came_back: bring_back(folder, *came_back),
             )
         )
 

@@ -79,12 +79,13 @@ class Curves:
 
     def update(self, done: float, total: float, note: str = "") -> None:
         """Report the rows that are new in the files, and pass the update on."""
-        for members, n_reported in self._n_reported.items() if self._folder and self._callbacks else ():
-            file = _file(self._folder, members[0])
-            # The last line may be incomplete.
-            lines = file.read_text().split("\n")[:-1] if file.exists() else []
-            for line in lines[n_reported:]:
-                self.add(members, np.array(json.loads(line)))
+        if self._folder is not None and self._callbacks:
+            for members, n_reported in self._n_reported.items():
+                file = _file(self._folder, members[0])
+                # The last line may be incomplete.
+                lines = file.read_text().split("\n")[:-1] if file.exists() else []
+                for line in lines[n_reported:]:
+                    self.add(members, np.array(json.loads(line)))
         self._progress.update(done, total, note)
 
     def add(self, members: tuple[int, ...], chunk: Chunk) -> None:

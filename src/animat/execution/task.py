@@ -198,7 +198,7 @@ def carry_out_unshared(task: Task, reads: Mapping[str, str], folder: Path) -> tu
         return result, {place: (root / place).read_bytes() for place in result.files}
 
 
-def bring_back(result: TaskResult, contents: Mapping[str, bytes], folder: Path) -> TaskResult:
+def bring_back(folder: Path, result: TaskResult, contents: Mapping[str, bytes]) -> TaskResult:
     """Write the files that came back from a worker into the folder."""
     for place, content in contents.items():
         write_whole(folder / place, content)
