@@ -553,7 +553,7 @@ BAD = {
     "10^12 iterations": (
         nothing,
         ["train", "cartpole", "--recordings", "{recordings}", "--iterations", "1000000000000"],
-        ["iterations", "2000000000"],
+        ["iterations", "2,000,000,000"],
     ),
     "10^9 episodes": (
         nothing,
@@ -605,7 +605,7 @@ BAD = {
     "a training's description that somebody edited": (
         lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),
         ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
-        ["expected a folder of this training, got one of another (training: [1] there, {'"],
+        ["expected a folder of this training, got one of another (training: [1] there, {{'"],
     ),
     "zero sessions": (
         nothing,
