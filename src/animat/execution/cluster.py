@@ -9,10 +9,10 @@ import pickle
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from concurrent.futures import wait as wait_for
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, final
 
@@ -144,16 +144,13 @@ def _why_refused(address: str, worker: dict[str, Any]) -> str:
     return f"worker {address}: expected {_format_tag(versions_tag())}, got {got}; it gets no work"
 
 
-@contextmanager
-def on_cluster(where: str | None, shared_folder: bool) -> Iterator[Cluster | None]:
-    """A cluster for the duration of the block, or None; raises InvalidArgument for no shared folder without one."""
-    if where is None:
-        if not shared_folder:
-            raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
-        yield None
-        return
-    with Cluster(where, has_shared_folder=shared_folder) as cluster:
-        yield cluster
+def on_cluster(where: str | None, shared_folder: bool) -> AbstractContextManager[Cluster | None]:
+    """A cluster for the duration of a block, or None; raises InvalidArgument for no shared folder without one."""
+    if where is not None:
+        return Cluster(where, has_shared_folder=shared_folder)
+    if not shared_folder:
+        raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
+    return nullcontext()
 
 
 def _expect_listener(address: str) -> None:
