@@ -7,7 +7,6 @@ import pickle
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from types import TracebackType
 from typing import Any, ParamSpec, TypeVar, final
 
 from animat.process import Process
@@ -47,9 +46,7 @@ class PinnedProcesses(ThreadPoolExecutor):
                 process.kill()
         self.shutdown(cancel_futures=True)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.shutdown()
         else:
