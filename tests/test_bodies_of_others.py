@@ -35,7 +35,7 @@ from animat.robots.registry import REGISTRY
 from animat.studies.paths import record_paths
 from animat.training.folder import describe, expect_trainable
 from animat.training.group import Group, train_group
-from animat.training.host import programs_on_host
+from animat.training.host import OnHost
 from animat.training.policy import Policy
 from animat.training.settings import LEARNER, SAC
 from animat.training.specification import CHUNKS, Training
@@ -418,8 +418,8 @@ def test_a_body_that_cuts_itself_off_early_does_not_end_the_return(monkeypatch: 
     monkeypatch.setattr(bodies_of_others.Slider, "step", cut_off_at_five)
     robot = replace(named("Slider", gain=0.0), episode_limit=8)
     asked = training(robot, policies=1, iterations=480)
-    beginning, chunk = programs_on_host(asked.environment(0), SMALL)
-    learners, finished = chunk(beginning(jax.random.split(jax.random.key(1), 1)), None, 0, 12)
+    on_host = OnHost(asked.environment(0), SMALL)
+    learners, finished = on_host.train(on_host.begin(jax.random.split(jax.random.key(1), 1)), None, 0, 12)
     assert finished.episodes.sum() > 0
     # Of each transition the last number; no body ever ended by itself, nor came to the limit.
     assert not np.asarray(learners.replay)[0, : 12 * SMALL.environments, -1].any()

@@ -553,7 +553,7 @@ BAD = {
     "10^12 iterations": (
         nothing,
         ["train", "cartpole", "--recordings", "{recordings}", "--iterations", "1000000000000"],
-        ["iterations", "2000000000"],
+        ["iterations", "2,000,000,000"],
     ),
     "10^9 episodes": (
         nothing,
@@ -605,7 +605,7 @@ BAD = {
     "a training's description that somebody edited": (
         lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),
         ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
-        ["expected a folder of this training, got one of another (training.robot.name: None there, 'cartpole' now)"],
+        ["expected a folder of this training, got one of another (training: [1] there, {{'"],
     ),
     "zero sessions": (
         nothing,
@@ -726,7 +726,7 @@ def test_inspect_refuses_its_options_before_the_files(
 @pytest.mark.parametrize(
     ("arguments", "begins"),
     [
-        ("train --iterations -5", "--iterations: expected a whole number from 1 to 2000000000, got -5"),
+        ("train --iterations -5", "--iterations: expected at least 1, got -5"),
         ("train --duration-min -1", "--duration-min: expected more than 0, got -1"),
         ("train --pulse-cost -1", "--pulse-cost: expected at least 0, got -1"),
         ("train --pulse-cost 1 --mapping none", "--pulse-cost: expected 0 without neurons, got 1"),
@@ -742,7 +742,7 @@ def test_inspect_refuses_its_options_before_the_files(
         ("record --interval-min -1", "--interval-min: expected more than 0 minutes"),
         ("reproduce --workers 0", "--workers: expected at least 1, got 0"),
         ("reproduce --seed -1", "--seed: expected at least 0, got -1"),
-        ("live --policies 0", "--policies: expected a whole number from 1"),
+        ("live --policies 0", "--policies: expected at least 1, got 0"),
         ("train unicycle", "robot: expected one of arm"),  # No option: it has its place.
         (
             "train --out policies --mapping none",

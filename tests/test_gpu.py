@@ -23,11 +23,11 @@ from animat import devices
 from animat.errors import Mismatch, UnusableData
 from animat.execution import gpu, training_task
 from animat.execution import training as in_folders
-from animat.execution.gpu import WithGpu, find_gpu, group_by_program
+from animat.execution.gpu import find_gpu, group_by_program, submit_with_gpu
 from animat.execution.jobs import Jobs
 from animat.execution.task import TaskResult, reported
 from animat.execution.training import TrainGroup, train
-from animat.execution.training_task import TrainingTask, TrainingWork, train_together
+from animat.execution.training_task import TrainingTask, TrainingWork, parts_that_fit, train_together
 from animat.progress import Silent
 from animat.robots import Cartpole
 from animat.studies import run as studies
@@ -36,11 +36,9 @@ from animat.studies.plan import plan_study
 from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.studies.training import TrainGroup as TrainArm
-from animat.training import memory
 from animat.training.folder import describe
 from animat.training.group import Group, SideBySide, train_group, train_groups
 from animat.training.lessons import Lesson
-from animat.training.memory import parts_that_fit
 from animat.training.policy import Policy
 from animat.training.replay import remember
 from animat.training.specification import CHUNKS, Training
@@ -160,7 +158,7 @@ def test_tasks_of_one_program_are_done_at_once_and_the_others_on_cores(at_once: 
     tasks = [first, Join("a"), second]
     notices = [tmp_path / f"{number}.json" for number in range(3)]
     with ThreadPoolExecutor(1, "cores") as cores, ThreadPoolExecutor(1, "gpu") as process:
-        done = [future.result() for future in WithGpu(cores, process).submit_tasks(tasks, tmp_path, notices)]
+        done = [future.result() for future in submit_with_gpu(cores, process, tasks, tmp_path, notices)]
     assert [sorted(each.files) for each in done] == [
         ["moving/p0.safetensors", "moving/p1.safetensors"],
         ["a"],
@@ -182,7 +180,7 @@ def test_what_fails_at_once_fails_for_each(tmp_path: Path) -> None:
             return failing
 
     with ThreadPoolExecutor(1) as cores, Process(1) as process:
-        futures = WithGpu(cores, process).submit_tasks(tasks, tmp_path, [tmp_path / "a", tmp_path / "b"])
+        futures = submit_with_gpu(cores, process, tasks, tmp_path, [tmp_path / "a", tmp_path / "b"])
         assert not any(future.done() for future in futures)
         failing.set_exception(UnusableData("no number"))
     assert [str(future.exception()) for future in futures] == ["no number"] * 2
@@ -212,14 +210,14 @@ def test_arms_of_a_study_share_programs_and_those_that_are_not_trained_have_none
 def test_a_device_s_memory_decides_on_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     groups = [group_of(SHORTEST, i) for i in range(3)]
     assert parts_that_fit(groups) == [[0, 1, 2]]  # A processor tells no limit.
-    monkeypatch.setattr(memory, "bytes_at_once", lambda groups: 9 * len(groups))
+    monkeypatch.setattr(training_task, "bytes_at_once", lambda groups: 9 * len(groups))
     for available, parts in (
         (30.0, [[0, 1, 2]]),
         (29.9, [[0, 1], [2]]),
         (14.9, [[0], [1], [2]]),
         (1.0, [[0], [1], [2]]),
     ):
-        monkeypatch.setattr(memory, "device_memory_bytes", lambda available=available: float(available))
+        monkeypatch.setattr(training_task, "device_memory_bytes", lambda available=available: float(available))
         assert parts_that_fit(groups) == parts
 
 
@@ -267,7 +265,7 @@ def test_what_does_not_fit_into_memory_is_trained_in_parts(tmp_path: Path, monke
 MEMORY = """
 from dataclasses import replace
 from test_gpu import ARMS, group_of, SMALL
-from animat.training.memory import bytes_at_once
+from animat.execution.training_task import bytes_at_once
 one, other = (replace(arm, algorithm=replace(SMALL, replay=16_384)) for arm in ARMS)
 for groups in ([group_of(one, 0)], [group_of(one, 0, 1, 2)], [group_of(one, 0, 1), group_of(other, 0)]):
     print(bytes_at_once(groups))

@@ -498,7 +498,7 @@ def test_what_cannot_be_is_refused_before_the_first_pulse(tmp_path: Path) -> Non
         (["--trials", "0"], "--trials: expected at least 1"),
         (["--pulses", "0"], "--pulses: expected at least 1"),
         (["--episodes", "0"], "--episodes: expected at least 1"),
-        (["--policies", "0"], "--policies: expected a whole number from 1"),
+        (["--policies", "0"], "--policies: expected at least 1, got 0"),
         (["--seed", "-1"], "--seed: expected"),
         (["--culture-seed", "-1"], "--culture-seed: expected 0 or more, got -1"),
         (["--patience-s", "nan"], "--patience-s: expected"),

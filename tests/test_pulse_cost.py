@@ -37,7 +37,7 @@ from animat.robots import Navigation
 from animat.stimulation.places import NONE
 from animat.stimulation.protocol import Protocol
 from animat.training.group import programs
-from animat.training.host import programs_on_host
+from animat.training.host import OnHost
 from animat.training.networks import likeliest_action
 from animat.training.policy import Policy
 from animat.training.settings import SAC
@@ -235,9 +235,9 @@ def test_a_body_that_is_stepped_on_the_host_pays_too() -> None:
     plain = Animat(robot, Thresholds(1), 2)
     replays = []
     for environment in (plain, TrialCosts(plain, (0.0, 0.0)), TrialCosts(plain, (0.25, 0.25))):
-        beginning, chunk = programs_on_host(environment, SMALL)
-        learners, finished = chunk(beginning(jax.random.split(jax.random.key(1), 1)), simulator, 0, 1)
-        more, ended = chunk(learners, simulator, 1, 20)
+        on_host = OnHost(environment, SMALL)
+        learners, finished = on_host.train(on_host.begin(jax.random.split(jax.random.key(1), 1)), simulator, 0, 1)
+        more, ended = on_host.train(learners, simulator, 1, 20)
         replays.append((np.asarray(more.replay)[0], float((finished.returns + ended.returns)[0])))
         if environment is not plain:
             each = environment.costs[0] * np.asarray(more.episodes.iteration)

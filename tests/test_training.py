@@ -466,5 +466,5 @@ def test_commands_are_taken_from_whatever_yields_them() -> None:
 
 
 def test_an_unknown_shadowing_is_refused() -> None:
-    with pytest.raises(InvalidArgument, match="shadowing: expected one of True, False, drawn, got 'bogus'"):
+    with pytest.raises(InvalidArgument, match="shadowing: expected True, False or 'drawn', got 'bogus'"):
         Training(Cartpole(), None, shadowing="bogus")  # type: ignore[arg-type]

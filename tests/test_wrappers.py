@@ -212,7 +212,7 @@ def test_no_live_run_shows_what_neurons_remember(tmp_path: Path) -> None:
 def test_a_neural_observation_is_of_neurons() -> None:
     with pytest.raises(InvalidArgument, match="neural_observation: expected only with a mapping"):
         Training("cartpole", None, neural_observation=True)
-    with pytest.raises(InvalidArgument, match="neural_observation: expected True or False, got 'yes'"):
+    with pytest.raises(InvalidArgument, match="neural_observation: expected true or false, got 'yes'"):
         replace(SEEING, neural_observation="yes")  # type: ignore[arg-type]
 
 

@@ -60,7 +60,7 @@ from animat.wrappers import (
 )
 from animat.training.settings import SAC as SAC
 from animat.training.specification import Training as Training
-from animat.training.callbacks import CurveRow as CurveRow, TrainingCallback as TrainingCallback
+from animat.execution.curves import CurveRow as CurveRow, TrainingCallback as TrainingCallback
 from animat.execution.training import train as train
 from animat.training.policy import Policy as Policy, load_policies as load_policies
 from animat.evaluation.table import Evaluation as Evaluation, evaluate as evaluate

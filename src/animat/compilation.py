@@ -37,8 +37,6 @@ def cache_folder() -> Path:
 def keep_compilations() -> None:
     """Let JAX keep what it compiles in `cache_folder()`, if that is writable; for a process that will compile.
 
-    Otherwise each process compiles everything again, which takes a few seconds.
-
     It also hides everything imported so far from the garbage collector: scanning all of JAX again and again took a
     quarter of the tracing time.
     """

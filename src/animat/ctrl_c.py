@@ -1,7 +1,7 @@
 """Ctrl-C, SIGTERM and a closed terminal: each ends a command with an exception, whatever Python is executing.
 
-Signals that are ignored when the program starts stay ignored: with `nohup` it survives the end of the terminal, and a
-script's background jobs survive the Ctrl-C that ends its foreground job. SIGTERM always ends it.
+Signals that are ignored when the program starts stay ignored, as with `nohup` and in a script's background jobs, but
+SIGTERM always ends it.
 """
 
 from __future__ import annotations

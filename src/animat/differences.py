@@ -23,22 +23,21 @@ class _Nothing:
 _NOTHING = _Nothing()
 
 
-def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Collection[str] = ()) -> str:
-    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`.
+def first_difference(
+    found: Any, wanted: Any, name: str = "", *, ignoring: Collection[str] = (), first: Collection[str] = ()
+) -> str:
+    """The first difference between two pieces of plain data, such as `training.seed: 1 there, 2 now`; empty if none.
 
     Args:
-        found: the data in the folder: numbers, strings, and lists and dictionaries of these.
+        found: the data in the folder.
         wanted: the data requested now.
         name: of both, for the beginning of the message.
-        ignoring: keys that do not matter, at any depth.
-
-    Returns:
-        The place and both values, abbreviated if long; an empty string if there is no difference.
+        ignoring, first: keys that do not matter, and keys that come first, at any depth.
     """
     if isinstance(found, dict) and isinstance(wanted, dict):
         pairs = [
             (found.get(key, _NOTHING), wanted.get(key, _NOTHING), f"{name}.{key}" if name else str(key))
-            for key in sorted(set(found) | set(wanted))
+            for key in sorted(set(found) | set(wanted), key=lambda key: (key not in first, key))
             if key not in ignoring
         ]
     # Short lists of different lengths are shown as a whole.
@@ -52,8 +51,8 @@ def first_difference(found: Any, wanted: Any, name: str = "", *, ignoring: Colle
         pairs += [(len(found), len(wanted), f"{name}, how many")]
     else:
         return "" if found == wanted else f"{name}: {_short(found)} there, {_short(wanted)} now"
-    differences = (first_difference(one, other, place, ignoring=ignoring) for one, other, place in pairs)
-    return next(filter(None, differences), "")
+    keys: dict[str, Any] = {"ignoring": ignoring, "first": first}
+    return next(filter(None, (first_difference(*pair, **keys) for pair in pairs)), "")
 
 
 def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
@@ -71,10 +70,7 @@ def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_description(path: Path, what: str) -> dict[str, Any] | None:
-    """Read the JSON description of the folder that a file is in, with its fingerprint; None if there is no such file.
-
-    `what` names the folder's content, such as `study`, in the message of the InvalidFile raised if it cannot be read.
-    """
+    """Read the JSON description, with a fingerprint, of a folder that holds `what`; None if there is no such file."""
     if not path.exists():
         return None
     try:

@@ -1,8 +1,4 @@
-"""A process that executes calls: on one core, on the GPU, or as plain Python, such as the one that reads HDF5.
-
-It runs as `python -m animat.process CORE`, or with `gpu` or `plain` in place of the core. Calls arrive pickled on its
-standard input, from the process that started it; what they return or raise is pickled on its standard output.
-"""
+"""A process that executes pickled calls from its standard input: on one core, on the GPU, or as plain Python."""
 
 from __future__ import annotations
 
@@ -26,8 +22,7 @@ class Process:
     """A process that executes calls, with the same import path as this one.
 
     Args:
-        where: the core it is pinned to; `gpu`: not pinned, and may use the GPU; `plain`: neither, and its standard
-            error is discarded.
+        where: the core it is pinned to; `gpu`: not pinned, and may use the GPU; `plain`: neither, and silent.
     """
 
     def __init__(self, where: int | Literal["gpu", "plain"]) -> None:
@@ -50,12 +45,11 @@ class Process:
         self.kill = self._popen.kill
 
     def answer(self, call: bytes, within_s: float | None = None) -> Any:
-        """Execute a call, a pickled (function, arguments, named arguments), and return its result.
+        """Execute a call, a pickled (function, arguments, named arguments): returns its result, or raises its error.
 
         Raises:
             BrokenExecutor: if the process ends during the call.
             TimeoutError: if the answer does not come in time; the process is then killed.
-            Exception: what the call raised.
         """
         assert self._popen.stdin is not None and self._popen.stdout is not None
         try:
@@ -64,12 +58,10 @@ class Process:
             if within_s is not None and not select.select([self._popen.stdout], [], [], within_s)[0]:
                 raise TimeoutError(f"no answer within {within_s:g} s")
             answer = pickle.load(self._popen.stdout)
-        except (BrokenPipeError, EOFError) as error:
-            raise BrokenExecutor(f"its process ended with status {self._popen.wait()}") from error
         except BaseException as error:
             self.kill()  # It may still be running, with nobody to read its answer.
             status = self._popen.wait()
-            if isinstance(error, pickle.UnpicklingError):
+            if isinstance(error, BrokenPipeError | EOFError | pickle.UnpicklingError):
                 raise BrokenExecutor(f"its process ended with status {status}") from error
             raise
         value, raised = pickle.loads(answer)
@@ -128,10 +120,7 @@ def answer(work: bytes) -> bytes:
 
 
 def pin_worker(core: int | None) -> None:
-    """Make this process a worker on one core, or on the GPU (None), that ends with the process that started it.
-
-    Call it before JAX or BLAS is loaded.
-    """
+    """Make this process a worker on one core, or on the GPU (None); before JAX or BLAS is loaded."""
     if core is None:
         os.environ.pop("JAX_PLATFORMS", None)
         # Leave memory to other processes, and compute products of 32-bit numbers in 32 bits.

@@ -28,7 +28,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     process is killed. Missing parent folders are created.
 
     Raises:
-        InvalidFile: if the file cannot be written (no permission, a full disk); the old file is untouched.
+        InvalidFile: if the file cannot be written.
     """
     path = Path(path)
     try:
@@ -61,15 +61,9 @@ def write_whole(path: Path, content: str | bytes) -> Path:
 
 
 def expect_writable(folder: str | os.PathLike[str], option: str = "--out", room_bytes: float = 0) -> None:
-    """Refuse a folder that could not be created or written to, before any work; the check leaves nothing behind.
+    """Refuse a folder, which may be missing, that could not be written to or has no `room_bytes` left, before any work.
 
-    Args:
-        folder: may be missing.
-        option: the command-line option that chooses the folder.
-        room_bytes: space that must be free.
-
-    Raises:
-        InvalidFile: naming the folder and the obstacle.
+    Nothing is left behind. `option` is the command-line option that chooses the folder.
     """
     existing = folder = Path(folder)
     try:
@@ -137,11 +131,7 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _is_locked(folder: Path, descriptor: int) -> bool:
-    """Lock an open folder or file for as long as it is open; False if the file system cannot.
-
-    Raises:
-        Mismatch: if it is locked already.
-    """
+    """Lock an open folder or file for as long as it is open; False if the file system cannot."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

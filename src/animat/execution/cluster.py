@@ -9,10 +9,10 @@ import pickle
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from concurrent.futures import wait as wait_for
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, final
 
@@ -20,8 +20,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, f
 from animat.execution.dask_worker import VERSIONS_PREFIX, versions_tag, work
 from animat.execution.dispatch import LONGEST_S, Call, Dispatch
 from animat.execution.pinned import PinnedProcesses, own_cores
-from animat.execution.task import Task, TaskResult, carry_out_alone
-from animat.execution.unshared import bring_back, carry_out_unshared
+from animat.execution.task import Task, TaskResult, bring_back, carry_out_alone, carry_out_unshared
 from animat.extras import expect_extra
 
 P = ParamSpec("P")
@@ -38,9 +37,6 @@ def expect_distributed() -> Any:
 @final
 class Cluster(Executor):
     """The workers of a Dask cluster that have the same software versions as this process.
-
-    Work that fails, or whose process or worker ends, is tried three times in all
-    (`animat.execution.dispatch.Dispatch`).
 
     Args:
         where: the scheduler's address, or the file to which it wrote its address (`dask scheduler --scheduler-file`).
@@ -73,10 +69,14 @@ class Cluster(Executor):
         self._futures: set[Future[Any]] = set()
         self._has_shared_folder, self._local = has_shared_folder, PinnedProcesses(own_cores()[-1:])
         try:
-            self._expect_workers(self._client.scheduler_info()["workers"])
+            workers = self._client.scheduler_info()["workers"]
+            if workers and not self._usable(workers):
+                raise Mismatch(f"cluster: {_why_refused(*next(iter(workers.items())))}, and there is no other")
         except BaseException:
             self._client.close()
             raise
+        if not workers:
+            print("cluster: waiting for workers", file=sys.stderr)
         self._dispatch = Dispatch(self._client, self._usable, longest_s)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
@@ -87,16 +87,7 @@ class Cluster(Executor):
     def submit_task(
         self, task: Task, folder: Path, notice: Path, *, name: str, cost_s: float, reads: Mapping[str, str]
     ) -> Future[TaskResult]:
-        """Submit a task (`carry_out_alone`).
-
-        Args:
-            task, folder, notice: arguments of `carry_out_alone`.
-            name, cost_s: as in `Job`.
-            reads: the digest of each file in the folder that it reads, by its place.
-
-        Raises:
-            AnimatError: if the scheduler has ended.
-        """
+        """Submit a job's task (`carry_out_alone`); `reads` has the digests of the files in the folder that it reads."""
         if self._has_shared_folder:
             pickled = pickle.dumps((carry_out_alone, (task, folder, notice), {}))
             return self._submit(Call(name, lambda _: pickled, cost_s))
@@ -108,7 +99,7 @@ class Cluster(Executor):
                 lambda worker_folder: pickle.dumps((carry_out_unshared, (task, dict(reads), worker_folder), {})),
                 cost_s,
                 reads={digest: folder / place for place, digest in reads.items()},
-                finish=lambda unshared: bring_back(unshared, folder),
+                finish=lambda came_back: bring_back(folder, *came_back),
             )
         )
 
@@ -137,12 +128,6 @@ class Cluster(Executor):
         self._dispatch.submit(call)
         return call.future
 
-    def _expect_workers(self, workers: dict[str, Any]) -> None:
-        if workers and not self._usable(workers):
-            raise Mismatch(f"cluster: {_why_refused(*next(iter(workers.items())))}, and there is no other")
-        if not workers:
-            print("cluster: waiting for workers", file=sys.stderr)
-
     def _usable(self, workers: dict[str, Any]) -> dict[str, Any]:
         """The workers with the same versions; a warning names each of the others, once, if there are any of these."""
         usable = {address: worker for address, worker in workers.items() if versions_tag() in worker["resources"]}
@@ -159,16 +144,13 @@ def _why_refused(address: str, worker: dict[str, Any]) -> str:
     return f"worker {address}: expected {_format_tag(versions_tag())}, got {got}; it gets no work"
 
 
-@contextmanager
-def on_cluster(where: str | None, shared_folder: bool) -> Iterator[Cluster | None]:
-    """A cluster for the duration of the block, or None; raises InvalidArgument for no shared folder without one."""
-    if where is None:
-        if not shared_folder:
-            raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
-        yield None
-        return
-    with Cluster(where, has_shared_folder=shared_folder) as cluster:
-        yield cluster
+def on_cluster(where: str | None, shared_folder: bool) -> AbstractContextManager[Cluster | None]:
+    """A cluster for the duration of a block, or None; raises InvalidArgument for no shared folder without one."""
+    if where is not None:
+        return Cluster(where, has_shared_folder=shared_folder)
+    if not shared_folder:
+        raise InvalidArgument("--no-shared-folder: expected only with --cluster, got no cluster")
+    return nullcontext()
 
 
 def _expect_listener(address: str) -> None:

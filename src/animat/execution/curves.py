@@ -1,20 +1,53 @@
-"""Learning curves during training: training processes write the rows to files, which the waiting process reads."""
+"""Learning curves during training: processes write rows to files, which the waiting one reads for callbacks."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from jaxtyping import Float64
-from numpy import ndarray
+import numpy as np
 
 from animat.execution.task import UNFINISHED
 from animat.progress import Progress
-from animat.training.callbacks import CurveRow, TrainingCallback
+from animat.training.group import Chunk
 from animat.training.policy import Policy
 
-_FOLDER = "curves"
+
+@dataclass(frozen=True)
+class CurveRow:
+    """A row of a policy's learning curve, as in the policy's file: one chunk of the training.
+
+    Attributes:
+        policy: name of the policy, such as `p0`.
+        iterations: iterations done at the end of the chunk.
+        episodes: number of episodes that ended in the chunk.
+        mean_return: their mean return; NaN if none ended.
+        entropy: entropy of the actions at the end of the chunk, nats, over transitions drawn from the replay.
+        alpha: weight of the entropy bonus at that time.
+        critic_loss: critics' loss at that time, over the same transitions. Older files lack these three: NaN.
+    """
+
+    policy: str
+    iterations: int
+    episodes: int
+    mean_return: float
+    entropy: float
+    alpha: float
+    critic_loss: float
+
+
+class TrainingCallback(Protocol):
+    """A function that `train` calls with each row of each policy, in order, including those from before a continuation.
+
+    It is called in the process that called `train`, and changes nothing that is learned. An exception that it raises
+    ends the training, as Ctrl-C does; call `train` again to continue.
+    """
+
+    def __call__(self, row: CurveRow) -> None:
+        """Process a row."""
 
 
 class CurveFile:
@@ -25,80 +58,50 @@ class CurveFile:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._path.write_text("")
 
-    def add(self, chunk: Float64[ndarray, "policies columns"]) -> None:
-        """Add one chunk of the training, one row per policy."""
+    def add(self, chunk: Chunk) -> None:
         with self._path.open("a") as file:
             file.write(json.dumps(chunk.tolist()) + "\n")
 
 
 class Curves:
-    """Passes each row to the callbacks once; used as a progress, it looks for new rows at each update.
-
-    Args:
-        folder: the training's folder; None for a training in memory.
-        groups: numbers of the policies of each group.
-        callbacks: functions that are called with each row.
-        progress: the progress to which updates are passed on.
-    """
+    """Passes each row to the callbacks once; used as a progress, it looks for new rows in the folder at each update."""
 
     def __init__(
         self,
         folder: Path | None,
-        groups: Sequence[Sequence[int]],
+        groups: Sequence[tuple[int, ...]],
         callbacks: Sequence[TrainingCallback],
         progress: Progress,
     ) -> None:
-        self._folder, self._groups, self._callbacks, self._progress = folder, groups, callbacks, progress
-        self._n_reported = dict.fromkeys((member for members in groups for member in members), 0)
-        self._n_bytes: dict[int, int] = {}
-        """Size of each group's file when it was last read."""
+        self._folder, self._callbacks, self._progress = folder, callbacks, progress
+        self._n_reported = dict.fromkeys(groups, 0)
+        """The number of chunks of each group that the callbacks have."""
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Report new rows, and pass the update on."""
-        self.poll()
+        """Report the rows that are new in the files, and pass the update on."""
+        if self._folder is not None and self._callbacks:
+            for members, n_reported in self._n_reported.items():
+                file = _file(self._folder, members[0])
+                # The last line may be incomplete.
+                lines = file.read_text().split("\n")[:-1] if file.exists() else []
+                for line in lines[n_reported:]:
+                    self.add(members, np.array(json.loads(line)))
         self._progress.update(done, total, note)
 
-    def poll(self) -> None:
-        """Report the rows that are new in the files."""
-        if self._folder is None or not self._callbacks:
-            return
-        for members in self._groups:
-            text = _text_of(_file(self._folder, members[0]))
-            # The same file, or a new one of the same size: its rows have been reported.
-            if len(text) == self._n_bytes.get(members[0]):
-                continue
-            self._n_bytes[members[0]] = len(text)
-            # The last line may be incomplete.
-            chunks = [json.loads(line) for line in text.split("\n")[:-1]]
-            for column, member in enumerate(members):
-                for chunk in chunks[self._n_reported[member] :]:
-                    self._report(member, chunk[column])
-
-    def add(self, members: Sequence[int], chunk: Float64[ndarray, "policies columns"]) -> None:
-        """Report one chunk of a group that is trained in this process."""
-        for member, row in zip(members, chunk.tolist(), strict=True):
-            self._report(member, row)
-
-    def _report(self, member: int, numbers: Sequence[float]) -> None:
-        self._n_reported[member] += 1
-        iterations, episodes, *others = numbers
-        row = CurveRow(f"p{member}", int(iterations), int(episodes), *others)
-        for callback in self._callbacks:
-            callback(row)
+    def add(self, members: tuple[int, ...], chunk: Chunk) -> None:
+        self._n_reported[members] += 1
+        for member, (iterations, episodes, *others) in zip(members, chunk.tolist(), strict=True):
+            row = CurveRow(f"p{member}", int(iterations), int(episodes), *others)
+            for callback in self._callbacks:
+                callback(row)
 
     def finish(self, policies: dict[str, Policy]) -> None:
         """Report the remaining rows, including those of policies that were trained earlier."""
-        for member in self._n_reported if self._callbacks else ():
-            for row in policies[f"p{member}"].learning_curve[self._n_reported[member] :].tolist():
-                self._report(member, row)
+        for members, n_reported in self._n_reported.items() if self._callbacks else ():
+            curves = np.stack([policies[f"p{member}"].learning_curve for member in members], axis=1)
+            for chunk in curves[n_reported:]:
+                self.add(members, chunk)
 
 
 def _file(folder: Path, first: int) -> Path:
-    return folder / UNFINISHED / _FOLDER / f"from-p{first}.jsonl"
-
-
-def _text_of(file: Path) -> str:
-    try:
-        return file.read_text()
-    except OSError:
-        return ""
+    return folder / UNFINISHED / "curves" / f"from-p{first}.jsonl"

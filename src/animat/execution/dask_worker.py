@@ -1,9 +1,4 @@
-"""The extension of a Dask worker: `dask worker ADDRESS --preload animat.execution.dask_worker`.
-
-Each of its threads has its own core, with a pinned process (`PinnedProcesses`) that does the work. The process takes
-its compiled programs with it when it ends, its death is recognised as such, and meanwhile the worker keeps answering
-the scheduler.
-"""
+"""The extension of a Dask worker (`--preload animat.execution.dask_worker`): a pinned process for each thread."""
 
 from __future__ import annotations
 
@@ -26,7 +21,7 @@ from typing import Any, TextIO
 
 from animat.errors import AnimatError, InvalidFile
 from animat.execution.pinned import PinnedProcesses, own_cores
-from animat.execution.unshared import store
+from animat.execution.task import store
 
 VERSIONS_PREFIX, PLACE_PREFIX = "animat:", "animat-place:"
 """Prefixes of the resources whose names give a worker's software versions and its identity."""
@@ -90,19 +85,11 @@ def dask_setup(worker: Any) -> None:
 
 
 def work(calls: Sequence[bytes], client: str, longest_s: float, contents: Mapping[str, bytes]) -> list[bytes]:
-    """Do calls one after the other in a pinned process on one core; runs in a thread of a Dask worker.
+    """Do pickled calls one after the other on one core, in a thread of a Dask worker; returns the pickled answers.
 
-    Each answer is reported to the client immediately, unless it is large. If nobody is waiting any more, as the client
-    or the scheduler has gone, the process is ended.
-
-    Args:
-        calls: pickled tuples of a function, its positional and its keyword arguments.
-        client: ID of the client.
-        longest_s: time after which no further call is begun; the first one always is.
-        contents: files to store in the worker's folder beforehand (`animat.execution.unshared.store`).
-
-    Returns:
-        The pickled `Answer` to each call that was done, in order.
+    Each answer is also reported to the client immediately, unless it is large. If nobody is waiting any more, as the
+    client or the scheduler has gone, the process is ended. After `longest_s` no further call is begun. The `contents`
+    are files to store in the worker's folder beforehand.
     """
     from distributed import get_worker
 

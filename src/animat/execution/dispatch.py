@@ -1,20 +1,19 @@
 """Dispatch of calls to the workers of a Dask cluster: assignment, batches of small calls, and retries.
 
-Dask only transports calls and answers. It neither chooses workers nor retries: it would blame the death of a worker on
-all calls that the worker had been given.
+Dask only transports calls and answers: it would blame a worker's death on all calls that the worker had been given.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import pickle
 import sys
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future, InvalidStateError
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
@@ -38,12 +37,10 @@ class Call:
     """A call that waits or runs.
 
     Attributes:
-        name: its name in messages.
         pickled: returns the pickled function, arguments and keyword arguments for a worker with this folder.
         cost_s: approximate duration; None if unknown.
         reads: files that are sent along, by the digests under which they are stored.
         finish: function applied here to the returned value.
-        future: its result.
         failures, deaths: how often it failed, and how often its process or its worker ended.
     """
 
@@ -80,7 +77,7 @@ class _Place:
     resource: str
     threads: int
     folder: Path
-    lost: asyncio.Future[str]
+    lost: asyncio.Future[str] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
     batches: list[_Batch] = field(default_factory=list)
     stored: set[str] = field(default_factory=set)
     last_seen: float = 0.0
@@ -96,12 +93,7 @@ class Dispatch:
     """A client's calls, and where they run; everything but `submit` happens in the client's own thread.
 
     A call whose process or worker ended runs alone on a worker from then on, so that neither it nor another call is
-    blamed for the other's death.
-
-    Args:
-        client: Dask's client.
-        select_usable: takes the workers, as the scheduler describes them, and returns those that may get work.
-        longest_s: longest expected duration of a batch; 0: no batches.
+    blamed for the other's death. Of the workers, those that `select_usable` returns get work.
     """
 
     def __init__(
@@ -130,9 +122,8 @@ class Dispatch:
             try:
                 await self._poll_workers()
             except Exception as error:
-                return self._end(error)
+                self._end(error)
             await asyncio.sleep(_LOOK_EVERY_S)
-        return None
 
     def _enqueue(self, call: Call) -> None:
         if self._has_ended:
@@ -142,47 +133,43 @@ class Dispatch:
             self._assign()
 
     async def _poll_workers(self) -> None:
-        """Ask the scheduler which workers exist."""
+        info = None
+        with suppress(TimeoutError, OSError):
+            if self._client.status == "running":
+                info = await asyncio.wait_for(self._client.scheduler.identity(n_workers=-1), _SILENT_S)
         if self._client.status != "running":
-            return self._end()
-        try:
-            info = await asyncio.wait_for(self._client.scheduler.identity(n_workers=-1), _SILENT_S)
-        except (TimeoutError, OSError):
-            if self._client.status != "running":
-                return self._end()
-            if not self._is_silent:
-                _warn(f"the scheduler has not answered for {_SILENT_S:.0f} s; waiting for it")
+            self._end()
+        elif info is not None:
+            self._is_silent = False
+            self._update_places(self._select_usable(info["workers"]))
+        elif not self._is_silent:
             self._is_silent = True
-            return None
-        self._is_silent = False
+            _warn(f"the scheduler has not answered for {_SILENT_S:.0f} s; waiting for it")
+
+    def _update_places(self, usable: dict[str, Any]) -> None:
+        """Take note of the workers that came, ended, froze or continue."""
         workers = {}
-        for address, worker in self._select_usable(info["workers"]).items():
+        for address, worker in usable.items():
             resource = next(name for name in worker["resources"] if name.startswith(PLACE_PREFIX))
             workers[resource] = address, worker
         for resource in self._places.keys() - workers.keys():
             self._lose(self._places.pop(resource), "ended")
         for resource, (address, worker) in workers.items():
-            self._update_place(resource, address, worker)
+            if resource not in self._places:
+                folder = Path(worker["local_directory"])
+                self._places[resource] = _Place(address, resource, worker["nthreads"], folder)
+            place = self._places[resource]
+            if worker["last_seen"] != place.last_seen:
+                place.last_seen, place.heard_s = worker["last_seen"], time.monotonic()
+                if place.lost.done():
+                    # It was frozen, and continues.
+                    place.lost = asyncio.get_running_loop().create_future()
+            elif time.monotonic() - place.heard_s > _SILENT_S:
+                self._lose(place, f"has been silent for {_SILENT_S:.0f} s (frozen, or cut off)")
         if self._waiting and not self._places and not self._waits_for_workers:
             print("cluster: waiting for workers", file=sys.stderr)
         self._waits_for_workers = not self._places
         self._assign()
-        return None
-
-    def _update_place(self, resource: str, address: str, worker: dict[str, Any]) -> None:
-        place = self._places.get(resource)
-        if place is None:
-            lost = asyncio.get_running_loop().create_future()
-            place = self._places[resource] = _Place(
-                address, resource, worker["nthreads"], Path(worker["local_directory"]), lost
-            )
-        if worker["last_seen"] != place.last_seen:
-            place.last_seen, place.heard_s = worker["last_seen"], time.monotonic()
-            if place.lost.done():
-                # It was frozen, and continues.
-                place.lost = asyncio.get_running_loop().create_future()
-        elif time.monotonic() - place.heard_s > _SILENT_S and not place.lost.done():
-            self._lose(place, f"has been silent for {_SILENT_S:.0f} s (frozen, or cut off)")
 
     def _lose(self, place: _Place, reason: str) -> None:
         if not place.lost.done():
@@ -207,7 +194,9 @@ class Dispatch:
 
     def _next_calls(self) -> list[Call]:
         """The first waiting call; if it is small, further small ones, leaving enough for the other workers."""
-        most_s = self._share_s()
+        threads = sum(place.threads for place in self._places.values())
+        # If little is waiting, less is taken, so that all cores finish together.
+        most_s = min(self._longest_s, sum(map(self._expect_s, self._waiting)) / (2 * threads))
         calls: list[Call] = []
         total_s = 0.0
         while self._waiting:
@@ -216,30 +205,18 @@ class Dispatch:
             if calls and not (is_small and total_s + self._expect_s(call) <= most_s):
                 break
             self._waiting.popleft()
-            if call.future.cancelled():
-                continue
-            calls.append(call)
-            total_s += self._expect_s(call)
-            if not is_small:
-                break
+            if not call.future.done():
+                calls.append(call)
+                total_s += self._expect_s(call)
+                if not is_small:
+                    break
         return calls
-
-    def _share_s(self) -> float:
-        """The duration of the next batch: shorter if little is waiting, so that all cores finish together."""
-        threads = sum(place.threads for place in self._places.values())
-        waiting_s = 0.0
-        for call in self._waiting:
-            waiting_s += self._expect_s(call)
-            if waiting_s > 2 * threads * self._longest_s:
-                break
-        return min(self._longest_s, waiting_s / (2 * threads))
 
     def _expect_s(self, call: Call) -> float:
         """The expected duration of a call, by the ratio of actual to expected durations so far."""
         return _SMALL_S if call.cost_s is None else call.cost_s * self._took_s / self._expected_s
 
     async def _run(self, batch: _Batch) -> None:
-        """Run a batch at its place, and handle the outcome."""
         try:
             await self._send(batch)
         except Exception as error:
@@ -275,44 +252,36 @@ class Dispatch:
         answers = asyncio.ensure_future(future)
         await asyncio.wait({answers, place.lost}, return_when=asyncio.FIRST_COMPLETED)
         del self._batches[future.key]
-        left = deque(batch.calls[batch.answered :])
+        left = batch.calls[batch.answered :]
         if not answers.done():
             await future.cancel()
             answers.cancel()
             if batch.has_begun:
-                self._blame(left, f"worker {place.address} {place.lost.result()}", batch.done - batch.answered)
+                _blame(left[batch.done - batch.answered], f"worker {place.address} {place.lost.result()}")
         elif answers.cancelled() or answers.exception() is not None:
             self._handle_failure(left, answers)
         else:
             place.stored |= needed.keys()
-            for answer in answers.result()[batch.answered :]:
-                self._answer(left.popleft(), pickle.loads(answer))
-        self._waiting.extendleft(reversed(left))
+            # The last ones may not have been begun.
+            for call, answer in zip(left, answers.result()[batch.answered :], strict=False):
+                self._answer(call, pickle.loads(answer))
+        self._waiting.extendleft(call for call in reversed(left) if not call.future.done())
 
-    def _handle_failure(self, left: deque[Call], answers: asyncio.Future[Any]) -> None:
+    def _handle_failure(self, left: Sequence[Call], answers: asyncio.Future[Any]) -> None:
         """Handle a batch that was not done: the scheduler or the worker ended, or it could not be sent."""
         error = None if answers.cancelled() else answers.exception()
         if type(error).__name__ == "KilledWorker":
-            self._blame(left, "its worker ended")
-        elif error is None or "Cancelled" in type(error).__name__:
-            if self._client.status != "running":
-                self._end()
-            while left and (self._has_ended or left[0].future.cancelled()):
-                _cancel(left.popleft())
-        else:
-            while left:
-                _settle(left.popleft(), error=error)
-
-    def _blame(self, left: deque[Call], reason: str, running: int = 0) -> None:
-        """Retry or report the call that was running when its process or worker ended."""
-        call = left[running]
-        call.deaths += 1
-        if call.deaths == ATTEMPTS:
-            _settle(call, error=BrokenExecutor(f"its process or worker ended {ATTEMPTS} times, last: {reason}"))
-            del left[running]
+            _blame(left[0], "its worker ended")
+        elif error is not None and "Cancelled" not in type(error).__name__:
+            for call in left:
+                _settle(call, error=error)
+        elif self._client.status != "running":
+            self._end()
+        if self._has_ended:
+            for call in left:
+                _cancel(call)
 
     async def _on_call_done(self, event: tuple[float, dict[str, Any]]) -> None:
-        """Handle the event that a call of a batch is done."""
         _, message = event
         batch = self._batches.get(message["batch"])
         if batch is None:
@@ -322,27 +291,28 @@ class Dispatch:
         # A large answer arrives only with the whole batch.
         if message["number"] == batch.answered and message["answer"] is not None:
             batch.answered += 1
-            self._answer(batch.calls[message["number"]], pickle.loads(message["answer"]))
+            call = batch.calls[message["number"]]
+            self._answer(call, pickle.loads(message["answer"]))
+            if not call.future.done():
+                self._waiting.appendleft(call)
 
     def _answer(self, call: Call, answer: Answer) -> None:
+        """Set a call's result, unless it is to be tried again."""
         if call.cost_s is not None:
             self._expected_s += call.cost_s
             self._took_s += answer.took_s
-        left = deque([call])
         if answer.ended is not None:
-            self._blame(left, answer.ended)
-            if left:
+            _blame(call, answer.ended)
+            if not call.future.done():
                 _warn(f"{call.name}: {answer.ended}; trying again")
         elif answer.error is not None and call.failures + 1 < ATTEMPTS:
             call.failures += 1
         else:
-            left.clear()
             try:
                 value = answer.value if call.finish is None or answer.error is not None else call.finish(answer.value)
                 _settle(call, value, answer.error)
             except AnimatError as error:
                 _settle(call, error=error)
-        self._waiting.extendleft(left)
 
     def _end(self, error: Exception | None = None) -> None:
         """Give up all calls: the scheduler has ended, or an unexpected error occurred."""
@@ -361,9 +331,16 @@ def _cancel(call: Call) -> None:
         call.future.set_running_or_notify_cancel()
 
 
+def _blame(call: Call, reason: str) -> None:
+    """Count, and the last time report, that a call's process or worker ended while it was running."""
+    call.deaths += 1
+    if call.deaths == ATTEMPTS:
+        _settle(call, error=BrokenExecutor(f"its process or worker ended {ATTEMPTS} times, last: {reason}"))
+
+
 def _settle(call: Call, value: Any = None, error: BaseException | None = None) -> None:
     # It may have been cancelled in the meantime.
-    with contextlib.suppress(InvalidStateError):
+    with suppress(InvalidStateError):
         if error is None:
             call.future.set_result(value)
         else:

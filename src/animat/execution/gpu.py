@@ -33,10 +33,10 @@ def find_gpu() -> str | None:
 
 
 def group_by_program(tasks: Sequence[Task]) -> list[list[int]]:
-    """The indices of the tasks of each program; tasks in no program stay on cores.
+    """The indices of the tasks that one program can train together; other tasks stay on cores.
 
-    A program trains all policies with the same environment, settings and length; with lessons or a cost of pulses, only
-    those of the same training. Bodies that are stepped outside JAX stay on cores.
+    Their policies have the same environment, settings and length. Those of a training with lessons or a cost of pulses
+    are trained apart from others, and bodies that are stepped outside JAX stay on cores.
     """
     from animat.execution.training_task import TrainingTask
     from animat.robots.host import HostRobot
@@ -55,25 +55,21 @@ def group_by_program(tasks: Sequence[Task]) -> list[list[int]]:
     return [numbers for _, numbers in programs]
 
 
-class WithGpu:
-    """The cores of this machine, and a process with its GPU, which gets the tasks that train policies."""
+def submit_with_gpu(
+    cores: Executor, gpu: Executor, tasks: Sequence[Task], folder: Path, notices: Sequence[Path]
+) -> list[Future[TaskResult]]:
+    """Submit tasks (`carry_out_alone`) to cores; those of one program run at once in the process with the GPU."""
+    from animat.execution.training_task import TrainingTask, train_together
 
-    def __init__(self, cores: Executor, process: Executor) -> None:
-        self._cores, self._process = cores, process
-
-    def submit_tasks(self, tasks: Sequence[Task], folder: Path, notices: Sequence[Path]) -> list[Future[TaskResult]]:
-        """Submit tasks (`animat.execution.task.carry_out_alone`); those of one program run at once on the GPU."""
-        from animat.execution.training_task import TrainingTask, train_together
-
-        futures: dict[int, Future[TaskResult]] = {}
-        for numbers in group_by_program(tasks):
-            at_once = [task for number in numbers if isinstance(task := tasks[number], TrainingTask)]
-            together = self._process.submit(train_together, at_once, folder, [notices[number] for number in numbers])
-            futures |= dict(zip(numbers, _split(together, len(numbers)), strict=True))
-        for number in range(len(tasks)):
-            if number not in futures:
-                futures[number] = self._cores.submit(carry_out_alone, tasks[number], folder, notices[number])
-        return [futures[number] for number in range(len(tasks))]
+    futures: dict[int, Future[TaskResult]] = {}
+    for numbers in group_by_program(tasks):
+        at_once = [task for number in numbers if isinstance(task := tasks[number], TrainingTask)]
+        together = gpu.submit(train_together, at_once, folder, [notices[number] for number in numbers])
+        futures |= dict(zip(numbers, _split(together, len(numbers)), strict=True))
+    for number, task in enumerate(tasks):
+        if number not in futures:
+            futures[number] = cores.submit(carry_out_alone, task, folder, notices[number])
+    return [futures[number] for number in range(len(tasks))]
 
 
 def _split(together: Future[list[TaskResult]], n: int) -> list[Future[TaskResult]]:
@@ -81,12 +77,11 @@ def _split(together: Future[list[TaskResult]], n: int) -> list[Future[TaskResult
     futures: list[Future[TaskResult]] = [Future() for _ in range(n)]
 
     def settle(_: object) -> None:
-        error = None if together.cancelled() else together.exception()
         for i, future in enumerate(futures):
             if together.cancelled():
                 future.cancel()
                 future.set_running_or_notify_cancel()
-            elif error is not None:
+            elif (error := together.exception()) is not None:
                 future.set_exception(error)
             else:
                 future.set_result(together.result()[i])

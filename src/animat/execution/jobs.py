@@ -15,7 +15,7 @@ from pathlib import Path
 
 from animat.errors import AnimatError, InvalidArgument
 from animat.execution.cluster import Cluster
-from animat.execution.gpu import WithGpu
+from animat.execution.gpu import submit_with_gpu
 from animat.execution.pinned import PinnedProcesses, own_cores
 from animat.execution.receipts import Receipt, digest_of, receipt_path
 from animat.execution.task import NOTICES, PLANNED, UNFINISHED, Task, TaskResult, carry_out_alone, memory_of, reported
@@ -30,8 +30,6 @@ class Job:
     """A task with a name, dependencies and a cost.
 
     Attributes:
-        name: its name, such as `train/cartpole/1-threshold/p0`.
-        task: the task.
         needs: names of the jobs whose files it reads.
         cost_s: approximate seconds on one core, for the order of jobs and the remaining time.
         reads: places in the folder of other files that it reads, which no job writes.
@@ -64,17 +62,7 @@ def expect_workers(workers: int | None, executor: Executor | None) -> None:
 
 
 class Jobs:
-    """The jobs of a folder: finds which are done, by their receipts, and runs the others.
-
-    Args:
-        jobs: all jobs.
-        folder: the folder of their files.
-        receipts: the folder of their receipts.
-        fingerprint: fingerprint of the study or training; receipts with another one are ignored.
-
-    Raises:
-        InvalidFile: if a receipt cannot be read.
-    """
+    """The jobs of a folder: finds which are done, by their receipts with this fingerprint, and runs the others."""
 
     def __init__(self, jobs: Sequence[Job], folder: Path, receipts: Path, fingerprint: str) -> None:
         self._folder, self._receipts, self._fingerprint = folder, receipts, fingerprint
@@ -86,16 +74,15 @@ class Jobs:
     def run(
         self, *, workers: int | None, executor: Executor | None, progress: Progress, has_gpu: bool = False
     ) -> dict[str, float]:
-        """Run the jobs that are not done; the first failure ends the run, but on a cluster the other jobs finish first.
+        """Run the jobs that are not done, and return the CPU seconds of each.
+
+        The first failure ends the run, but on a cluster the other jobs finish first.
 
         Args:
             workers: processes, each on its own core; None: one per core. Not with an executor.
             executor: executor for the tasks, which must see the folder; it stays open. None: processes on this machine.
             progress: updated with the share done and the running jobs.
             has_gpu: whether this machine has a GPU for tasks that train policies; if not, they run on cores.
-
-        Returns:
-            The CPU seconds of each job that was run.
 
         Raises:
             AnimatError: if a job failed; its message names the job, or all that failed.
@@ -107,7 +94,7 @@ class Jobs:
         # Left by a run that was killed; the locks stay, as they may still be held.
         for stale in notices.glob("*.json"):
             stale.unlink(missing_ok=True)
-        total_s, ended_s = sum(job.cost_s for job in self.waiting), 0.0
+        total_s = sum(job.cost_s for job in self.waiting)
         running: dict[Future[TaskResult], Job] = {}
         failed: list[AnimatError] = []
         cpu_s: dict[str, float] = {}
@@ -116,10 +103,10 @@ class Jobs:
         def report() -> None:
             nonlocal reported_s
             reported_s = time.monotonic()
-            done_s, parts = ended_s, []
+            left_s, parts = sum(job.cost_s for job in self.waiting), []
             for job in running.values():
                 share, text = reported(receipt_path(notices, job.name)) or (0.0, None)
-                done_s += job.cost_s * share
+                left_s += job.cost_s * (1.0 - share)
                 if text is not None:
                     parts.append(f"{job.name} {100 * share:.0f} % {text}".strip())
             n_jobs = len(self._done) + len(running) + len(self.waiting) + len(failed)
@@ -127,37 +114,33 @@ class Jobs:
                 parts.append(f"{len(failed)} failed")
             jobs = "1 job" if n_jobs == 1 else f"{n_jobs} jobs"
             note = f"{len(self._done)} of {jobs}; {'; '.join(parts)}" if parts else ""
-            progress.update(done_s, total_s, note)
+            progress.update(total_s - left_s, total_s, note)
 
-        with _executor_for(executor, workers, running, has_gpu) as chosen:
+        with _executors_for(executor, workers, running, has_gpu) as (cores, gpu):
             # Jobs that need a failed one never become ready.
             while running or any(self._has_needs(job) for job in self.waiting):
                 ready = [job for job in self.waiting if self._has_needs(job)]
-                for job in ready:
-                    self.waiting.remove(job)
+                self.waiting = [job for job in self.waiting if not self._has_needs(job)]
                 # A job may be done after all if what it needs was made again with the same bytes.
                 left = [job for job in ready if not self._is_done(job)]
-                ended_s += sum(job.cost_s for job in ready) - sum(job.cost_s for job in left)
-                running |= zip(self._submit(left, chosen, notices), left, strict=True)
+                running |= zip(self._submit(left, cores, gpu, notices), left, strict=True)
                 if time.monotonic() - reported_s > _LOOK_EVERY_S:
                     report()
                 # Successful ones first, so that their receipts are kept whatever the others raise.
                 ended = wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done
                 for future in sorted(ended, key=lambda each: each.cancelled() or each.exception() is not None):
-                    ended_s += running[future].cost_s
+                    job = running[future]
                     try:
-                        result = _result_of(future, running[future])
+                        result = _result_of(future, job)
                     except AnimatError as error:
                         if not isinstance(executor, Cluster) or future.cancelled():
                             raise
                         failed.append(error)
-                        del running[future]
-                        continue
-                    job = running.pop(future)
-                    receipt = Receipt(job.name, self._fingerprint, self._inputs(job), result.files)
-                    receipt.save(self._receipts)
-                    self._done[job.name] = receipt
-                    cpu_s[job.name] = result.cpu_s
+                    else:
+                        self._done[job.name] = Receipt(job.name, self._fingerprint, self._inputs(job), result.files)
+                        self._done[job.name].save(self._receipts)
+                        cpu_s[job.name] = result.cpu_s
+                    del running[future]
         report()
         if failed:
             # Sorted, so that the message does not depend on the order in which they ended.
@@ -167,19 +150,21 @@ class Jobs:
             raise failed[0]
         return cpu_s
 
-    def _submit(self, jobs: Sequence[Job], executor: Executor | WithGpu, notices: Path) -> list[Future[TaskResult]]:
+    def _submit(
+        self, jobs: Sequence[Job], cores: Executor, gpu: Executor | None, notices: Path
+    ) -> list[Future[TaskResult]]:
         paths = [receipt_path(notices, job.name) for job in jobs]
-        if isinstance(executor, WithGpu):
-            return executor.submit_tasks([job.task for job in jobs], self._folder, paths)
-        if isinstance(executor, Cluster):
+        if gpu is not None:
+            return submit_with_gpu(cores, gpu, [job.task for job in jobs], self._folder, paths)
+        if isinstance(cores, Cluster):
             return [
-                executor.submit_task(
+                cores.submit_task(
                     job.task, self._folder, path, name=job.name, cost_s=job.cost_s, reads=self._files_read(job)
                 )
                 for job, path in zip(jobs, paths, strict=True)
             ]
         tasks = zip(jobs, paths, strict=True)
-        return [executor.submit(carry_out_alone, job.task, self._folder, path) for job, path in tasks]
+        return [cores.submit(carry_out_alone, job.task, self._folder, path) for job, path in tasks]
 
     def _files_read(self, job: Job) -> dict[str, str]:
         """The digests of the files that a job may read, by their places: those of all jobs before it."""
@@ -209,16 +194,16 @@ class Jobs:
 
 
 @contextmanager
-def _executor_for(
+def _executors_for(
     executor: Executor | None, workers: int | None, running: dict[Future[TaskResult], Job], has_gpu: bool
-) -> Iterator[Executor | WithGpu]:
-    """The given executor, or our own processes; if the block fails, nothing keeps running after it."""
+) -> Iterator[tuple[Executor, Executor | None]]:
+    """The given executor, or our own processes, with one for the GPU; if the block fails, nothing keeps running."""
     if executor is None:
         with PinnedProcesses(own_cores(workers)) as cores, PinnedProcesses([None]) as gpu:
-            yield WithGpu(cores, gpu) if has_gpu else cores
+            yield cores, gpu if has_gpu else None
         return
     try:
-        yield executor
+        yield executor, None
     except BaseException:
         # The folder must not be released while a task still writes to it.
         wait([future for future in running if not future.cancel()])

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from animat.errors import AnimatError, InvalidFile
@@ -29,33 +29,26 @@ runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler and workers until the block ends; a worker that dies is replaced.
 
-    The scheduler writes its address to the file, which is removed at the end. Yields the processes of the scheduler and
-    of the workers' nanny.
-
-    Raises:
-        AnimatError: if Dask is not installed, or the scheduler does not start.
-        InvalidFile: if the file already exists.
+    The scheduler writes its address to the file, which may not exist yet, and is removed at the end. Yields the
+    processes of the scheduler and of the workers' nanny.
     """
     expect_distributed()
     if file.exists():
         raise InvalidFile(
             f"{file}: expected no file, got one; another cluster may be running: stop it, or remove the file"
         )
-    scheduler = _start("scheduler", file, "--host", "127.0.0.1", "--port", "0")
-    nanny = None
-    try:
+    with ExitStack() as stack:
+        stack.callback(file.unlink, missing_ok=True)
+        scheduler = _start("scheduler", file, "--host", "127.0.0.1", "--port", "0")
+        stack.callback(_stop, scheduler)
         while not file.exists():
             if scheduler.poll() is not None:
                 raise AnimatError(f"{file}: the scheduler ended before it wrote its address there; see its output")
             time.sleep(0.1)
         counts = ("--nworkers", str(workers), "--nthreads", str(threads))
         nanny = _start("worker", file, *counts, "--preload", work.__module__)
+        stack.callback(_stop, nanny)
         yield [scheduler, nanny]
-    finally:
-        for process in (nanny, scheduler):
-            if process is not None:
-                _stop(process)
-        file.unlink(missing_ok=True)
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:

@@ -7,7 +7,6 @@ import pickle
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from types import TracebackType
 from typing import Any, ParamSpec, TypeVar, final
 
 from animat.process import Process
@@ -18,14 +17,10 @@ T = TypeVar("T")
 
 @final
 class PinnedProcesses(ThreadPoolExecutor):
-    """Threads that each pass their work to their own process, pinned to its own core.
+    """Threads that each pass their work to their own process, pinned to its own core (None: to none, with the GPU).
 
-    A process is reused until it has grown large, and ends with the process that started it. If a `with` block is left
-    by an error, running work is ended. Work whose process ends raises a `BrokenExecutor`.
-
-    Args:
-        cores: one process per entry, started when there is work for it; a core named twice gets two. None: a process
-            that is not pinned and may use the GPU.
+    A process is started when there is work for it, and reused until it has grown large. If a `with` block is left by an
+    error, running work is ended. Work whose process ends raises a `BrokenExecutor`.
     """
 
     def __init__(self, cores: Sequence[int | None]) -> None:
@@ -36,11 +31,9 @@ class PinnedProcesses(ThreadPoolExecutor):
         self._lock, self._is_killed = threading.Lock(), False
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Submit a call, which is pickled immediately."""
         return super().submit(self._run, pickle.dumps((fn, args, kwargs)))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut the executor down and end its processes."""
         super().shutdown(wait, cancel_futures=cancel_futures)
         for process in self._processes if wait else ():
             process.end()
@@ -53,9 +46,7 @@ class PinnedProcesses(ThreadPoolExecutor):
                 process.kill()
         self.shutdown(cancel_futures=True)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.shutdown()
         else:

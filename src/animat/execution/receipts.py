@@ -8,7 +8,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,6 @@ class Receipt:
     """The record that a job is done.
 
     Attributes:
-        job: name of the job.
         study: fingerprint of the study or training to which it belongs.
         inputs: digest of the receipt of each job it needed.
         outputs: `digest_of` each file that it wrote, by its place in the folder.
@@ -36,12 +34,10 @@ class Receipt:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the receipt."""
         return hashlib.sha256(self._text().encode()).hexdigest()
 
     def _text(self) -> str:
-        data: dict[str, Any] = {"job": self.job, "study": self.study, "inputs": self.inputs, "outputs": self.outputs}
-        return json.dumps(data, indent=1, sort_keys=True) + "\n"
+        return json.dumps(asdict(self), indent=1, sort_keys=True) + "\n"
 
     def save(self, receipts: Path) -> None:
         """Write it into a folder of receipts, once all files are written."""
@@ -65,23 +61,17 @@ class Receipt:
 
 
 def receipt_path(receipts: Path, job: str) -> Path:
-    """Path of a job's receipt."""
     # No job's name has a "+", so two jobs never share a path.
     return receipts / f"{job.replace('/', '+')}.json"
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's contents."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file's bytes; of an NWB file that of its recording, as its identifiers and date differ each time.
-
-    Raises:
-        OSError, InvalidFile: if it cannot be read.
-    """
+    """SHA-256 of a file's bytes; of an NWB file that of its recording, as its identifiers and date differ each time."""
     if path.suffix != ".nwb":
         return sha256(path)
     from animat.recordings.hdf5_subprocess import read_hdf5_in_subprocess

@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import platform
+import tempfile
 import threading
 import time
 import traceback
@@ -19,6 +20,7 @@ from typing import IO, Any
 from animat.errors import AnimatError, InvalidFile, first_line, out_of_memory
 from animat.execution.receipts import digest_of
 from animat.progress import Progress
+from animat.writing import write_whole
 
 SILENT_S = 60.0
 """Silence after which a process is considered frozen."""
@@ -28,6 +30,8 @@ PLANNED = ".planned.json"
 """File in it with the cost of each job by name, from which others compute the progress."""
 NOTICES = ".notices"
 """Folder in it with the last progress of each job."""
+_STORE = "animat-files"
+"""Folder of the files that a worker was sent, in its own folder."""
 
 
 class Task(abc.ABC):
@@ -45,13 +49,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        """Run the task, and return the files it wrote, each atomically and reproducibly
-        (`animat.execution.receipts.digest_of`).
-
-        Args:
-            folder: the folder of all its files.
-            progress: updated while it runs.
-        """
+        """Run the task in the folder of all its files, and return those it wrote, each atomically and reproducibly."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +61,7 @@ class TaskResult:
 
 
 def carry_out_alone(task: Task, folder: Path, notice: Path) -> TaskResult:
-    """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed.
-
-    Raises:
-        InvalidFile: if the folder of the notice, which is inside `folder`, is not visible here.
-        AnimatError: if the task fails.
-    """
+    """`carry_out` once no other process is doing so, as a worker may not notice that its client was killed."""
     if not notice.parent.is_dir():
         raise InvalidFile(
             f"{folder}: expected a folder that all workers see, at the same place; {platform.node()} does not see it"
@@ -117,11 +110,7 @@ def _has_locked(lock: IO[str]) -> bool:
 
 
 def carry_out(task: Task, folder: Path, notice: Path) -> TaskResult:
-    """Run a task, which reports its progress in the file `notice` (`reported`).
-
-    Raises:
-        AnimatError: if the task fails; in one line, even for unexpected errors.
-    """
+    """Run a task, which reports its progress in the file `notice`; every error is an AnimatError in one line."""
     return carry_out_together([task], folder, [notice], lambda progress: [task.run(folder, progress)])[0]
 
 
@@ -182,3 +171,35 @@ def memory_of(task: Task) -> str:
 def _unexpected(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{first_line(error)} (in {place.name}, {Path(place.filename).name}, line {place.lineno})"
+
+
+def store(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Store contents in a worker's folder, each under its digest."""
+    (folder / _STORE).mkdir(exist_ok=True)
+    for digest, content in contents.items():
+        write_whole(folder / _STORE / digest, content)
+
+
+def carry_out_unshared(task: Task, reads: Mapping[str, str], folder: Path) -> tuple[TaskResult, dict[str, bytes]]:
+    """`carry_out` in a temporary folder made of files in the worker's `folder` (`store`), their digests by place.
+
+    Returns the contents of the files that the task wrote, too.
+    """
+    with tempfile.TemporaryDirectory(dir=folder, prefix="animat-task-") as temporary:
+        root = Path(temporary)
+        for place, digest in reads.items():
+            (root / place).parent.mkdir(parents=True, exist_ok=True)
+            try:
+                # A link is enough, as tasks replace files and never modify them.
+                (root / place).hardlink_to(folder / _STORE / digest)
+            except FileNotFoundError as error:
+                raise InvalidFile(f"{place}: expected it to be sent to the worker, got nothing") from error
+        result = carry_out(task, root, root / ".notice" / "task.json")
+        return result, {place: (root / place).read_bytes() for place in result.files}
+
+
+def bring_back(folder: Path, result: TaskResult, contents: Mapping[str, bytes]) -> TaskResult:
+    """Write the files that came back from a worker into the folder."""
+    for place, content in contents.items():
+        write_whole(folder / place, content)
+    return result

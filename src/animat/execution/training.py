@@ -14,7 +14,7 @@ from typing import final
 from animat.coding.decoder import expect_fit
 from animat.devices import gpu_here
 from animat.errors import InvalidArgument, UnusableData, expect_kind, expect_several
-from animat.execution.curves import CurveFile, Curves
+from animat.execution.curves import CurveFile, Curves, TrainingCallback
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
@@ -22,7 +22,6 @@ from animat.execution.training_task import TrainingTask, TrainingWork
 from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Part, Progress, in_phase
 from animat.robots.host import HostRobot
-from animat.training.callbacks import TrainingCallback
 from animat.training.course import rows_of
 from animat.training.folder import (
     MANIFEST,
@@ -61,7 +60,7 @@ def train(
     it trains the others together again, and their last bits differ.
 
     Args:
-        training: the training.
+        training: what to train.
         timeline: the culture's simulators; None for a training without neurons.
         folder: folder for the policies, created if missing. None: train in this process and write nothing; if stopped,
             training starts again. This also allows robots and mappings that are not registered.
@@ -70,18 +69,16 @@ def train(
             this machine.
         progress: updated during training.
         checkpoint_s: seconds between checkpoints, which a kill may cost; never changes the result.
-        sources: names of the recordings, for the manifest.
-        random_return: mean return of random actions, for the manifest: a line in the live page's learning curves.
-        callbacks: functions called with every row of the learning curves as it is produced; no bit of what is learned
-            depends on them.
+        sources, random_return: for the manifest: names of the recordings, and the mean return of random actions, a line
+            in the live page's learning curves.
+        callbacks: called with every row of the learning curves as it is produced; they change no bit.
 
     Returns:
         The policies by name, `p0` first. Assessed policies carry their best version, which the folder has in `best/`,
         with all assessments in `assessments.csv`.
 
     Raises:
-        InvalidArgument: if neurons are missing for a mapping or given without one, if there are not as many readouts as
-            the robot has commands, for fewer than one worker or any with an executor, or as in `expect_trainable`.
+        InvalidArgument: for a training that cannot be trained, with these simulators, workers or executor.
         Mismatch: if the folder holds another training or other work, or another run is active in it.
         InvalidFile: if a file cannot be read or written.
         UnusableData: if what was learned is no longer finite; none of it is left in the folder.
@@ -118,16 +115,10 @@ def train(
         if not is_ours(folder, manifest):
             write_description(folder, manifest)
         missing = [group for group in groups if not _is_trained(group, folder)]
-        left = [
-            Job(
-                as_range(group.members),
-                TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)),
-                cost_s=CHUNKS * len(group.members),
-            )
-            for group in missing
-        ]
         curves = Curves(folder, [group.members for group in groups], callbacks, _phase_of(missing, progress))
-        if left:
+        if missing:
+            tasks = [TrainGroup(group, checkpoint_s, writes_rows=bool(callbacks)) for group in missing]
+            left = [Job(as_range(task.group.members), task, cost_s=CHUNKS * len(task.group.members)) for task in tasks]
             jobs = Jobs(left, folder, folder / UNFINISHED / "jobs", manifest["fingerprint"])
             try:
                 jobs.run(workers=workers, executor=executor, progress=curves, has_gpu=gpu is not None)
@@ -140,11 +131,10 @@ def train(
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
             clear_away(leftover)
-        policies = {}
-        for i in range(training.policies):
-            policies[f"p{i}"] = policy = Policy.load(folder / f"p{i}.safetensors")
+        policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
+        for name, policy in policies.items():
             if len(policy.assessments):
-                policies[f"p{i}"] = replace(policy, best=Policy.load(folder / BEST / f"p{i}.safetensors"))
+                policies[name] = replace(policy, best=Policy.load(folder / BEST / f"{name}.safetensors"))
         if training.episodes_assessed and not (folder / TABLE).exists():
             write_assessments(folder, policies)
         curves.finish(policies)
@@ -154,13 +144,7 @@ def train(
 @final
 @dataclass(frozen=True, eq=False)
 class TrainGroup(TrainingTask):
-    """Train a group of policies, resuming from its checkpoint.
-
-    Attributes:
-        group: the group.
-        checkpoint_s: seconds between checkpoints.
-        writes_rows: whether it writes the rows of the learning curves to a file for callbacks.
-    """
+    """Train a group of policies, resuming from its checkpoint; for callbacks it writes the rows to a file."""
 
     group: Group
     checkpoint_s: float
@@ -194,11 +178,8 @@ def as_range(members: Sequence[int]) -> str:
 
 
 def _is_trained(group: Group, folder: Path) -> bool:
-    for member in group.members:
-        path = folder / f"p{member}.safetensors"
-        if not path.exists() or Policy.load(path).provenance.get("fingerprint") != group.fingerprint:
-            return False
-    return True
+    files = [folder / f"p{member}.safetensors" for member in group.members]
+    return all(file.exists() and Policy.load(file).provenance.get("fingerprint") == group.fingerprint for file in files)
 
 
 def _train_in_memory(

@@ -4,31 +4,32 @@ from __future__ import annotations
 
 import abc
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from animat.execution.task import UNFINISHED, Task, TaskResult, carry_out_together
 from animat.progress import Part, Progress
 from animat.training.folder import write_description
-from animat.training.group import CHECKPOINT_S, AddChunk, Group, save_policies, train_groups
-from animat.training.memory import parts_that_fit
+from animat.training.group import CHECKPOINT_S, AddChunk, Group, programs, save_policies, train_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
+
+_SHARE = 0.9
+"""Share of a GPU's memory for arrays; programs and copies in progress take the rest."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingWork:
-    """A group of policies to train.
+    """A group of policies to train into the folder `place`, with a checkpoint if it is trained alone.
 
-    Attributes:
-        group: the group.
-        place: the folder of its policies.
-        checkpoint: the file of its checkpoint if it is trained alone.
-        checkpoint_s: seconds between checkpoints.
-        add_chunk: as in `animat.training.group.train_group`.
-        description: a description to write next to the policies; None: it already exists.
+    If there is a description, it is written next to the policies; `add_chunk` is that of `train_groups`.
     """
 
     group: Group
@@ -39,7 +40,6 @@ class TrainingWork:
     description: dict[str, Any] | None = None
 
     def save(self, policies: Sequence[Policy]) -> list[Path]:
-        """Write the trained policies; returns the files."""
         files = save_policies(self.group, policies, self.place)
         return files if self.description is None else [*files, write_description(self.place, self.description)]
 
@@ -69,10 +69,9 @@ def train_alone(work: TrainingWork, progress: Progress) -> list[Path]:
 
 
 def train_together(tasks: Sequence[TrainingTask], folder: Path, notices: Sequence[Path]) -> list[TaskResult]:
-    """Carry out tasks of one program: all of their policies at once, or as many as fit into memory.
+    """`carry_out_together` for tasks of one program: all of their policies at once, or as many as fit into memory.
 
-    If it is killed before it returns and called again with the same tasks, it writes the same bits. Arguments and
-    errors are those of `animat.execution.task.carry_out_together`.
+    If it is killed before it returns and called again with the same tasks, it writes the same bits.
     """
 
     def run(progress: Progress) -> list[list[Path]]:
@@ -108,3 +107,33 @@ def _train(
         keeps_last=keeps_last,
     )
     return [work.save(trained) for work, trained in zip(works, policies, strict=True)]
+
+
+def parts_that_fit(groups: Sequence[Group]) -> list[list[int]]:
+    """Divide groups into parts, as even as possible; a part of several groups fits into the device's memory."""
+    available = _SHARE * device_memory_bytes()
+    parts = 1 if math.isinf(available) else math.ceil(bytes_at_once(groups) / available)
+    return [part.tolist() for part in np.array_split(np.arange(len(groups)), min(parts, len(groups)))]
+
+
+def device_memory_bytes() -> float:
+    """The memory that JAX may use on its device; infinite for a CPU, which does not report it."""
+    stats = jax.devices()[0].memory_stats()
+    return math.inf if stats is None else float(stats["bytes_limit"])
+
+
+def bytes_at_once(groups: Sequence[Group]) -> int:
+    """The memory of the program that trains these groups at once: policies, replays, simulators, temporaries."""
+    training, timeline = groups[0].training, groups[0].timeline
+    environment = training.environment_on(timeline)
+    own_simulators = len({group.fingerprint for group in groups}) > 1
+    compiled: tuple[Any, Any] = programs(environment, training.algorithm, own_simulators)
+    beginning, chunk = compiled
+    policies = sum(len(group.members) for group in groups)
+    learners = jax.eval_shape(beginning, jax.eval_shape(lambda: jax.random.split(jax.random.key(0), policies)))
+    simulator = None if timeline is None else timeline.at(float(timeline.start_min[0]))
+    leading = (policies,) if own_simulators else ()
+    simulators = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leading, *leaf.shape)), simulator)
+    needed = chunk.lower(learners, simulators, jnp.int32(0), jnp.int32(1)).compile().memory_analysis()
+    held = needed.argument_size_in_bytes + needed.output_size_in_bytes - needed.alias_size_in_bytes
+    return int(held + needed.temp_size_in_bytes)

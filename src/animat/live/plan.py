@@ -39,9 +39,6 @@ class Timetable:
         interval_min: minutes of the culture's clock between the starts of two recordings.
         duration_min: minutes of the culture's clock from the first recording to the end of training.
         speed: minutes of the culture's clock per minute of real time: 1 for a living culture.
-
-    Raises:
-        InvalidArgument: for a number that is not above 0.
     """
 
     interval_min: Positive = 10.0
@@ -77,8 +74,7 @@ def check_plan(
     Arguments are those of `animat.live.shadowing.live`.
 
     Raises:
-        InvalidArgument: for a training without neurons or with neural observation, recordings that take longer than
-            an interval, no episodes, or an invalid setting of the closed loop.
+        InvalidArgument: for a training or a setting that a live run does not have.
         BudgetSpent: for a budget with fewer pulses than the first recording.
         InvalidFile: if the folder is a file.
         Mismatch: if the folder is not empty: a live run cannot be resumed, as its culture has changed since.

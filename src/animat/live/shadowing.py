@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-
-import jax
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
@@ -32,7 +29,7 @@ from animat.live.plan import (
     check_plan,
     for_the_first_recording,
 )
-from animat.live.trainers import Exchange, Trainers
+from animat.live.trainers import Trainers
 from animat.neurons.kinds import Kind
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Part, Progress, in_phase
@@ -54,8 +51,6 @@ class LiveRun:
     """The results of a live run.
 
     Attributes:
-        recordings: the files.
-        policies: by name.
         swaps: each time a group of policies switched to newer simulators, with the date.
         iterations: fewest training iterations of a policy.
         culture_min, wall_s: time from the first recording to the end of training.
@@ -71,7 +66,6 @@ class LiveRun:
     gap: RealityGap
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
         return {
             "recordings": [str(file) for file in self.recordings],
             "policies": list(self.policies),
@@ -139,9 +133,10 @@ def live(
         account.check([stimulus for block in schedule.blocks for stimulus in schedule.deliveries(block)])
     if report is not None:
         report(f"each pulse: {protocol.pulse}")
-    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account, progress)
+    training = replace(training, duration_min=timetable.duration_min, shadowing=True)
+    run = _Run(training, culture, protocol, Path(folder), timetable, kind, account)
     try:
-        policies = run.shadow()
+        policies = run.shadow(progress)
         first, at_min = next(iter(policies.values())), run.used[-1].start_min
         calibration = Calibration.of_series(run.used, first, at_min=at_min, adaptive=adaptive, kind=kind)
         # Its own lock, so that nobody recovers the session while it is running.
@@ -174,89 +169,82 @@ def live(
     return LiveRun(tuple(run.files), policies, tuple(run.swaps), run.iterations, run.culture_min, run.wall_s, gap)
 
 
+@dataclass(eq=False)
 class _Run:
-    def __init__(
-        self,
-        training: Training,
-        culture: Culture,
-        protocol: Protocol,
-        folder: Path,
-        timetable: Timetable,
-        kind: Kind | None,
-        account: Account,
-        progress: Progress | None,
-    ) -> None:
-        self.folder, self.account = folder, account
-        self.files: list[Path] = []
-        self.used: list[Responses] = []
-        self.swaps: list[dict[str, Any]] = []
-        self.iterations, self.culture_min, self.wall_s = 0, 0.0, 0.0
-        self._training = replace(training, duration_min=timetable.duration_min, shadowing=True)
-        self._culture, self._protocol, self._timetable, self._kind = culture, protocol, timetable, kind
-        self._progress = in_phase(progress, "recording")
-        self._zero_s, self._wall_zero_s = culture.now_s, time.monotonic()
-        self._known_s, self._ended_early = self._zero_s, False
+    """A live run in progress, and its log."""
+
+    training: Training
+    culture: Culture
+    protocol: Protocol
+    folder: Path
+    timetable: Timetable
+    kind: Kind | None
+    account: Account
+    files: list[Path] = field(default_factory=list)
+    used: list[Responses] = field(default_factory=list)
+    swaps: list[dict[str, Any]] = field(default_factory=list)
+    iterations: int = 0
+    culture_min: float = 0.0
+    wall_s: float = 0.0
+    has_ended_early: bool = False
+
+    def __post_init__(self) -> None:
+        self._zero_s, self._wall_zero_s = self.culture.now_s, time.monotonic()
+        self._known_s = self._zero_s
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InvalidFile(f"{folder}: cannot be made: {error.strerror or error}") from error
+            raise InvalidFile(f"{self.folder}: cannot be made: {error.strerror or error}") from error
+        training = self.training
         self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed)
 
-    def shadow(self) -> dict[str, Policy]:
+    def shadow(self, progress: Progress | None) -> dict[str, Policy]:
         """Record and train to the end; returns the policies."""
-        exchange = Exchange(self.folder / EXCHANGE)
-        try:
-            self._train(exchange)
-        finally:
-            shutil.rmtree(exchange.folder, ignore_errors=True)
-        policies = self.folder / POLICIES
-        return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self._training.policies)}
-
-    def _train(self, exchange: Exchange) -> None:
-        timeline = self._record(0, self._progress)
+        timeline = self._record(0, in_phase(progress, "recording"))
         if timeline is None:
             raise UnusableData("recording: expected the first one to be usable, got one that is not; see live.log")
-        _publish(exchange, 0, timeline)
-        groups = groups_of(self._training, timeline, describe(self._training, timeline))
-        minutes = self._timetable.duration_min
-        self._progress = in_phase(self._progress, "training", minutes, "min of the culture")
-        with Trainers(groups, exchange, self.folder / POLICIES) as trainers:
-            self.write("training", policies=self._training.policies, processes=len(groups))
+        groups = groups_of(self.training, timeline, describe(self.training, timeline))
+        minutes, policies = self.timetable.duration_min, self.folder / POLICIES
+        progress = in_phase(progress, "training", minutes, "min of the culture")
+        with Trainers(groups, self.folder / EXCHANGE, policies) as trainers:
+            self.write("training", policies=self.training.policies, processes=len(groups))
             try:
-                self._shadow(exchange, trainers)
+                self._follow(trainers, progress)
             except BaseException as error:
                 self.end_early(error)
                 # Unfinished policies are better than none.
                 with suppress(AnimatError):
                     trainers.finish()
                 raise
-            self._progress.update(minutes, minutes, "waiting for the last chunk of training")
+            progress.update(minutes, minutes, "waiting for the last chunk of training")
             self._note(trainers.finish())
             self.iterations = trainers.iterations
-        self.culture_min = (self._culture.now_s - self._zero_s) / 60
+        self.culture_min = (self.culture.now_s - self._zero_s) / 60
         self.wall_s = time.monotonic() - self._wall_zero_s
         self.write("trained", iterations=self.iterations, swaps=len(self.swaps), wall_s=round(self.wall_s, 1))
+        return {f"p{i}": Policy.load(policies / f"p{i}.safetensors") for i in range(self.training.policies)}
 
     def end_early(self, error: BaseException) -> None:
         """Stop the culture and log why, once."""
-        if self._ended_early:
+        if self.has_ended_early:
             return
-        self._ended_early = True
+        self.has_ended_early = True
         is_person = isinstance(error, KeyboardInterrupt)
         message = "stopped by a person" if is_person else " ".join(f"{type(error).__name__}: {error}".split())
         with suppress(Exception):
-            self._culture.stop(message)
+            self.culture.stop(message)
         with suppress(InvalidFile):
             self.write("interrupted" if is_person else "fault", message=message)
 
-    def _shadow(self, exchange: Exchange, trainers: Trainers) -> None:
-        duration_min, published, in_budget = self._timetable.duration_min, 0, True
-        for number in range(1, self._timetable.recordings):
-            minute = number * self._timetable.interval_min
-            self._wait(minute, trainers, published)
+    def _follow(self, trainers: Trainers, progress: Progress) -> None:
+        """Record on time, for the processes that train meanwhile."""
+        in_budget = True
+        for number in range(1, self.timetable.recordings):
+            minute = number * self.timetable.interval_min
+            self._wait(minute, trainers, progress)
             if not in_budget:
                 continue
-            part = Part(self._progress, minute, 0, duration_min, f"recording {number + 1}")
+            part = Part(progress, minute, 0, self.timetable.duration_min, f"recording {number + 1}")
             try:
                 timeline = self._record(number, part)
             except BudgetSpent as spent:
@@ -264,22 +252,21 @@ class _Run:
                 in_budget = False
                 continue
             if timeline is not None:
-                published = number
-                _publish(exchange, number, timeline)
-        self._wait(duration_min, trainers, published)
+                trainers.publish(number, timeline)
+        self._wait(self.timetable.duration_min, trainers, progress)
 
-    def _wait(self, minute: float, trainers: Trainers, number: int) -> None:
+    def _wait(self, minute: float, trainers: Trainers, progress: Progress) -> None:
         """Wait, while training continues, until the culture's clock is at a minute of the run."""
-        due_s = self._wall_zero_s + 60 * minute / self._timetable.speed
-        while time.monotonic() < due_s or not trainers.all_use(number):
+        due_s = self._wall_zero_s + 60 * minute / self.timetable.speed
+        while time.monotonic() < due_s or not trainers.use_the_newest:
             self._note(trainers.swaps(_POLL_S))
-            passed_min = (time.monotonic() - self._wall_zero_s) * self._timetable.speed / 60
+            passed_min = (time.monotonic() - self._wall_zero_s) * self.timetable.speed / 60
             mean = "" if math.isnan(trainers.mean_return) else f", return {trainers.mean_return:.1f}"
             note = f"{len(self.files)} recordings, {len(self.swaps)} swaps{mean}"
             if time.monotonic() >= due_s:
                 note += "; waiting for all policies to train on the last recording"
-            self._progress.update(min(passed_min, minute), self._timetable.duration_min, note)
-        self._culture.rest(max(0.0, self._zero_s + 60 * minute - self._culture.now_s))
+            progress.update(min(passed_min, minute), self.timetable.duration_min, note)
+        self.culture.rest(max(0.0, self._zero_s + 60 * minute - self.culture.now_s))
 
     def _record(self, number: int, progress: Progress) -> SimulatorTimeline | None:
         """Record and fit; returns None, and logs why, if the recording cannot be trained on."""
@@ -288,9 +275,9 @@ class _Run:
         # Locked as by `animat record`, so that viewers know that it is in progress.
         with exclusive_lock(folder), PartialRecording(folder) as follow:
             # Check the space before stimulating the culture.
-            expect_writable(folder, room_bytes=BYTES_PER_MIN * minutes_of(self._protocol))
-            seed = order_seed(self._training.seed, number)
-            recording = record_within(self.account, self._culture, self._protocol, seed, progress, follow)
+            expect_writable(folder, room_bytes=BYTES_PER_MIN * minutes_of(self.protocol))
+            seed = order_seed(self.training.seed, number)
+            recording = record_within(self.account, self.culture, self.protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))
             write_nwb(recording, file)
         self.files.append(file)
@@ -298,8 +285,8 @@ class _Run:
         try:
             series = [*self.used, *extract_series([recording])]
             # Fit all of them again, so that their shapes agree.
-            timeline = fit_timeline(series, kind=self._kind)
-            if self._training.percentiles == "first":
+            timeline = fit_timeline(series, kind=self.kind)
+            if self.training.percentiles == "first":
                 timeline = timeline.with_first_percentiles()
         except (UnusableData, Mismatch) as error:
             self.write("unusable", file=file.name, message=str(error))
@@ -316,8 +303,8 @@ class _Run:
 
     def keep_state(self) -> None:
         """Write the state of a virtual culture next to its recordings, where `animat run` looks for it."""
-        if isinstance(self._culture, VirtualCulture):
-            self._culture.save_state(self.folder / RECORDINGS / STATE_FILE)
+        if isinstance(self.culture, VirtualCulture):
+            self.culture.save_state(self.folder / RECORDINGS / STATE_FILE)
 
     def _note(self, swaps: Sequence[dict[str, Any]]) -> None:
         for swap in swaps:
@@ -327,7 +314,6 @@ class _Run:
                 self.write("training began", **swap)
 
     def write(self, what: str, **fields: Any) -> dict[str, Any]:
-        """Log an event, with the date and both clocks."""
         line = {
             "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "wall_s": round(time.monotonic() - self._wall_zero_s, 3),
@@ -345,11 +331,5 @@ class _Run:
     def _now_s(self) -> float:
         """The culture's clock; its last known time if the connection is lost."""
         with suppress(Exception):
-            self._known_s = self._culture.now_s
+            self._known_s = self.culture.now_s
         return self._known_s
-
-
-def _publish(exchange: Exchange, number: int, timeline: SimulatorTimeline) -> None:
-    """Publish the newest simulator of a timeline."""
-    start_min = float(timeline.start_min[-1])
-    exchange.publish(number, start_min, jax.device_get(timeline.at(start_min)))

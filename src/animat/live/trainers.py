@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
@@ -11,17 +12,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
+import jax
+
 from animat.errors import AnimatError
 from animat.execution.pinned import PinnedProcesses
 from animat.execution.task import Task, TaskResult, carry_out, report, reported
 from animat.neurons.simulator import NeuronSimulator
+from animat.neurons.timeline import SimulatorTimeline
 from animat.progress import Progress
 from animat.training.group import Group, SideBySide, save_policies
 from animat.writing import write_whole
 
-_FINISH = "finish"
 KEEP_S = 10.0
 """Seconds between saves of the unfinished policies: the most training that a killed run loses."""
+_PATIENCE_S = 120.0
 
 
 class Exchange:
@@ -43,33 +47,23 @@ class Exchange:
         read: tuple[int, float, NeuronSimulator] = pickle.loads((self.folder / f"{newest:06}.simulator").read_bytes())
         return read
 
-    def report(self, first: int, progress: dict[str, Any]) -> None:
-        """Report the progress of the group whose first policy is `first`, as plain data."""
-        report(self.folder / f"p{first}.json", progress)
-
-    def reported(self, first: int) -> dict[str, Any] | None:
-        """A group's last report; None if it has not begun."""
-        progress: dict[str, Any] | None = reported(self.folder / f"p{first}.json")
-        return progress
+    def report_of(self, group: Group) -> Path:
+        """The file of the last report on a group's training (`animat.execution.task.report`)."""
+        return self.folder / f"p{group.members[0]}.json"
 
     def finish(self) -> None:
         """Request the end of training at the next chunk."""
-        (self.folder / _FINISH).touch()
+        (self.folder / "finish").touch()
 
     @property
     def is_finished(self) -> bool:
-        """Whether training is to end."""
-        return (self.folder / _FINISH).exists()
+        return (self.folder / "finish").exists()
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class TrainAlongside(Task):
-    """Train a group of policies, each chunk on the newest simulator of the exchange.
-
-    It reports the simulator in use, its swaps and its progress through the exchange, which also says when to end.
-    Every `keep_s` seconds the unfinished policies are saved.
-    """
+    """Train a group of policies, each chunk on the newest simulator of the exchange, which also says when to end."""
 
     group: Group
     exchange: Exchange
@@ -80,7 +74,7 @@ class TrainAlongside(Task):
         return {"algorithm": self.group.training.algorithm}
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
-        training = self.group.training
+        training, reports = self.group.training, self.exchange.report_of(self.group)
         training.register()
         swaps: list[dict[str, Any]] = []
         # The policies' provenance lists their swaps, which are added below.
@@ -95,7 +89,7 @@ class TrainAlongside(Task):
                 swaps.append({"chunk": index, "iterations": state["iterations"], "recorded_at_min": start_min})
                 state["using"] = number
                 state["swaps"].append({"swap": number, **swaps[-1]})
-                self.exchange.report(group.members[0], state)
+                report(reports, state)
             if simulator is None:
                 raise AnimatError("live: expected a simulator in the exchange before training began, got none")
             state["mean_return"] = together.train(index, simulator)
@@ -104,35 +98,42 @@ class TrainAlongside(Task):
                 saved_s = time.monotonic()
             index += 1
             state["iterations"] = training.chunk(index)[0] * training.algorithm.environments
-            self.exchange.report(group.members[0], state)
+            report(reports, state)
         return save_policies(group, together.policies(), folder)
 
 
 class Trainers:
     """One process per group of policies, which are saved in a folder; leaving the context always ends the processes."""
 
-    def __init__(self, groups: Sequence[Group], exchange: Exchange, folder: Path) -> None:
-        self._exchange, self._folder = exchange, folder
-        self._groups = {group.members[0]: group for group in groups}
+    def __init__(self, groups: Sequence[Group], exchange: Path, folder: Path) -> None:
+        self._groups, self._exchange, self._folder = groups, Exchange(exchange), folder
         self._futures: dict[Future[TaskResult], Group] = {}
-        self._reports: dict[int, dict[str, Any]] = {}
+        self._reports: dict[Group, dict[str, Any]] = {}
+        self._published = 0
 
     def __enter__(self) -> Trainers:
+        self.publish(0, self._groups[0].timeline)
         # The last cores first, to leave one to the process that records. All groups train at once, on any number.
         cores = sorted(os.sched_getaffinity(0), reverse=True)
         self._executor = PinnedProcesses([cores[i % len(cores)] for i in range(len(self._groups))])
-        for first, group in self._groups.items():
+        for group in self._groups:
             task = TrainAlongside(group, self._exchange, KEEP_S)
-            notice = self._exchange.folder / f"progress-p{first}.json"
+            notice = self._exchange.folder / f"progress-p{group.members[0]}.json"
             self._futures[self._executor.submit(carry_out, task, self._folder, notice)] = group
         return self
 
     def __exit__(self, *_: object) -> None:
         self._executor.kill_workers()
+        shutil.rmtree(self._exchange.folder, ignore_errors=True)
+
+    def publish(self, number: int, timeline: SimulatorTimeline | None) -> None:
+        """Let all groups train on the newest simulator of a timeline, which has this number."""
+        assert timeline is not None
+        self._published, start_min = number, float(timeline.start_min[-1])
+        self._exchange.publish(number, start_min, jax.device_get(timeline.at(start_min)))
 
     @property
     def iterations(self) -> int:
-        """Fewest iterations of a group."""
         fewest: int = min(report["iterations"] for report in self._reports.values())
         return fewest
 
@@ -141,12 +142,14 @@ class Trainers:
         """Mean return of the episodes that ended in the last chunk of a group; NaN if there were none."""
         return next((report["mean_return"] for report in self._reports.values()), float("nan"))
 
-    def swaps(self, wait_s: float) -> list[dict[str, Any]]:
-        """Wait, and return the swaps made meanwhile.
+    @property
+    def use_the_newest(self) -> bool:
+        """Whether every group trains on the simulator that was published last."""
+        reports = self._reports.values()
+        return len(reports) == len(self._groups) and all(report["using"] >= self._published for report in reports)
 
-        Raises:
-            AnimatError: if a training failed, or its process ended.
-        """
+    def swaps(self, wait_s: float) -> list[dict[str, Any]]:
+        """Wait, and return the swaps made meanwhile; raises AnimatError if a training failed."""
         for future in wait(self._futures, wait_s, FIRST_COMPLETED).done:
             try:
                 future.result()
@@ -156,26 +159,17 @@ class Trainers:
                     f"training {names}: {error} while the culture was recorded; the recordings are kept"
                 ) from error
         swaps: list[dict[str, Any]] = []
-        for first, group in self._groups.items():
-            latest = self._exchange.reported(first)
+        for group in self._groups:
+            latest = reported(self._exchange.report_of(group))
             if latest is not None:
-                before = self._reports.get(first, {"swaps": []})
-                swaps += [{"members": list(group.members), **swap} for swap in latest["swaps"][len(before["swaps"]) :]]
-                self._reports[first] = latest
+                known = len(self._reports[group]["swaps"]) if group in self._reports else 0
+                swaps += [{"members": list(group.members), **swap} for swap in latest["swaps"][known:]]
+                self._reports[group] = latest
         return swaps
 
-    def all_use(self, number: int) -> bool:
-        """Whether every group trains on the simulator of this number or a newer one."""
-        reports = self._reports.values()
-        return len(reports) == len(self._groups) and all(report["using"] >= number for report in reports)
-
-    def finish(self, patience_s: float = 120.0) -> list[dict[str, Any]]:
-        """Request the end of training, wait until all policies are saved, and return the last swaps.
-
-        Raises:
-            AnimatError: if a process does not end, or fails.
-        """
+    def finish(self) -> list[dict[str, Any]]:
+        """Request the end of training, wait until all policies are saved, and return the last swaps."""
         self._exchange.finish()
-        if wait(self._futures, patience_s).not_done:
-            raise AnimatError(f"training: expected it to end within {patience_s:g} s, but it continues")
+        if wait(self._futures, _PATIENCE_S).not_done:
+            raise AnimatError(f"training: expected it to end within {_PATIENCE_S:g} s, but it continues")
         return self.swaps(0.0)

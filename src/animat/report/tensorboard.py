@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from animat.errors import InvalidFile
+from animat.execution.curves import CurveRow
 from animat.extras import expect_extra
-from animat.training.callbacks import CurveRow
 
 
 class TensorBoard:

@@ -31,17 +31,9 @@ ASSESSED = ("iterations", "minute", "lesson", "success", "mean_return")
 def assess(
     environment: Varied[Any], episodes: int, actor: Network, simulator: NeuronSimulator | None, key: PRNGKeyArray
 ) -> tuple[Float[Array, " episodes"], Bool[Array, " episodes"]]:
-    """Run a policy's most probable actions in the episodes that `key` determines.
+    """The return of each episode of a policy's most probable actions, and whether it succeeded.
 
-    Args:
-        environment: an environment with what varies in it, and the ranges.
-        episodes: number of episodes (static).
-        actor: the policy's network.
-        simulator: the neurons; None for a policy without neurons.
-        key: the same in each assessment of a training, so that policies and minutes are comparable.
-
-    Returns:
-        The return of each episode, and whether it succeeded.
+    With the same key in each assessment of a training, its policies and minutes are comparable.
     """
     limited = EpisodeLimit(environment)
     start_key, iteration_key = jax.random.split(key)
@@ -63,13 +55,12 @@ def assess(
 
 
 class CourseState(NamedTuple):
-    """The progress of a group's policies. Its shapes are fixed from the start, as it is part of a checkpoint.
+    """The progress of a group's policies, as part of a checkpoint, whose shapes are fixed from the start.
 
     Attributes:
         lesson: each policy's lesson, counted from 0.
-        table: assessments, one row per chunk, NaN for those still to come; columns as `ASSESSED`.
-        best: each policy's network at its best assessment.
-        best_at: row of that assessment.
+        table: assessments, NaN for those still to come; columns as `ASSESSED`.
+        best: each policy's network at its best assessment, which is row `best_at`.
         score: share of successes and mean return of `best`, on the simulator in use.
     """
 
@@ -81,11 +72,7 @@ class CourseState(NamedTuple):
 
 
 def rows_of(training: Training, timeline: SimulatorTimeline | None) -> list[tuple[int, int]]:
-    """The first and the last recording that each lesson's episodes draw from, among those that shadowing would use.
-
-    Raises:
-        InvalidArgument: for a lesson without any recording.
-    """
+    """The first and the last recording that each lesson's episodes draw from, among those that shadowing would use."""
     stages = stages_of(training.lessons)
     if timeline is None or training.shadowing != "drawn":
         return [(0, 0)] * len(stages)
@@ -130,14 +117,7 @@ def programs_with_ranges(
 
 
 class Course:
-    """The lessons of a group's policies during training.
-
-    Args:
-        training: the training.
-        environment: the environment that its policies act in.
-        timeline: the culture's simulators; None without neurons.
-        policies: number of policies.
-    """
+    """The lessons of a group's policies during training."""
 
     def __init__(
         self, training: Training, environment: Environment[Any], timeline: SimulatorTimeline | None, policies: int
@@ -159,13 +139,11 @@ class Course:
         return jax.tree.map(lambda stages: stages[self.state.lesson], self._ranges)  # type: ignore[no-any-return]
 
     def begin(self, keys: Any) -> Learner:
-        """As `animat.training.sac.begin`, for all policies."""
         learners: Learner = self._programs[0](self.ranges, keys)
         self.state = self.state._replace(best=jax.tree.map(np.zeros_like, jax.device_get(learners.deployed)))
         return learners
 
     def train(self, learners: Learner, *arguments: Any) -> Any:
-        """As `animat.training.sac.train_chunk`, for all policies."""
         return self._programs[1](self.ranges, learners, *arguments)
 
     def assess(self, index: int, deployed: Network, simulator: NeuronSimulator | None) -> None:

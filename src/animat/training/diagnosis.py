@@ -1,7 +1,4 @@
-"""Diagnostics of a learner between two chunks, which help to explain its learning curve.
-
-They are computed after the chunk: no bit of what is learned depends on them, and no gradient step is slower.
-"""
+"""Diagnostics of a learner between two chunks, to explain its learning curve; they do not affect what is learned."""
 
 from __future__ import annotations
 
@@ -30,8 +27,6 @@ class Diagnosis(NamedTuple):
 
     Attributes:
         entropy: mean of H(pi(.|o)), nats; for continuous actions the mean of -log pi(a|o), one action drawn per state.
-        alpha: weight of the entropy bonus.
-        critic_loss: the critics' loss, as in `animat.training.sac.discrete_losses`.
     """
 
     entropy: Float[Array, ""]
@@ -40,13 +35,7 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, available: Int[Array, ""]) -> Diagnosis:
-    """Diagnose a learner, always with the same random numbers.
-
-    Args:
-        environment, settings: those of its training (static).
-        learner: the learner after a chunk.
-        available: number of transitions in its replay; 0 gives NaN.
-    """
+    """Diagnose a learner, always with the same random numbers; NaN if its replay has no transitions available."""
     n_drawn = environment.n_drawn
     uniforms = jax.random.uniform(jax.random.key(0), (1 + 2 * n_drawn, _TRANSITIONS))
     batch = draw_batch(environment, learner.replay, available, uniforms[0])

@@ -30,8 +30,7 @@ class Exploration(NamedTuple):
         action: the action that is held, or was held last.
         left: iterations for which it is still held; 0 or less: none is held.
         was_held: whether any action of the current episode was held.
-        episodes: number of episodes of the policy alone and with held actions; older ones count less.
-        returns: sums of their returns, weighted likewise.
+        episodes, returns: of the policy alone and with held actions, their number and sum; older ones count less.
     """
 
     action: Float[Array, "environments drawn"]
@@ -62,12 +61,6 @@ def explore(
 
     A held action is drawn uniformly. It is held for k iterations or more with probability 1 - ln k / ln L, for k up to
     L, a quarter of the episode limit. Only the second half of the environments hold actions; a single one never does.
-
-    Args:
-        environment: the environment that the policy acts in.
-        exploration: the exploration so far.
-        action: the actions that the policy drew (`animat.training.networks.draw_action`).
-        uniforms: uniforms in [0, 1), `n_uniforms` for each environment.
     """
     n, n_drawn = exploration.action.shape
     longest = max(environment.robot.episode_limit * LONGEST_SHARE, 1.0)
@@ -100,10 +93,7 @@ def count_ended(
 
 
 def is_useful(exploration: Exploration) -> Bool[Array, ""]:
-    """Whether holding actions is still useful: not once the policy alone is known to do better.
-
-    Always False for a single environment, which never holds actions.
-    """
+    """Whether holding actions is still useful: not once the policy alone does better, nor for a single environment."""
     if len(exploration.left) < 2:
         return jnp.array(False)
     alone, with_held = exploration.returns / exploration.episodes

@@ -38,35 +38,15 @@ _INFORMATIVE = ("sources", "random_return")
 """Entries of a description that do not determine the policies."""
 _NOT_REPORTED = ("fingerprint", *_INFORMATIVE, "burst_thresholds")
 """Entries not reported as the difference between two trainings: they differ with the responses."""
+_FIRST = ("training", "robot")
+"""Entries reported first: what follows from the robot, such as the default iterations, is not the cause."""
 
 
 def expect_trainable(training: Training, *, is_saved: bool) -> None:
-    """Refuse, before the first iteration, what cannot be trained, or could not be loaded afterwards.
-
-    Args:
-        training: the training.
-        is_saved: whether its policies are written to files.
-
-    Raises:
-        InvalidArgument: naming what was expected of the robot or the mapping, what came, and what to do.
-    """
-    check_robot(training.robot)
-    _expect_whole_episodes(training)
-    if training.mapping is not None:
-        check_mapping(training.mapping)
-    else:
-        training.environment(0)
-    if training.is_varied:
-        expect_varied(training.robot, varying_in(training.lessons, recordings=False))
-    if is_saved:
-        ROBOTS.expect_loadable(without_goal(training.robot), in_workers=True)
-        if training.mapping is not None:
-            MAPPINGS.expect_loadable(training.mapping, in_workers=True)
-
-
-def _expect_whole_episodes(training: Training) -> None:
-    """Refuse a body whose episodes restart at each chunk, and are too long to end within one."""
-    robot, rounds = training.robot, training.iterations // (CHUNKS * training.algorithm.environments)
+    """Refuse, before the first iteration, what cannot be trained, or if it is saved could not be loaded afterwards."""
+    robot, mapping = training.robot, training.mapping
+    check_robot(robot)
+    rounds = training.iterations // (CHUNKS * training.algorithm.environments)
     if isinstance(robot, HostRobot) and not robot.keeps_episodes and robot.episode_limit > rounds:
         needed = robot.episode_limit * CHUNKS * training.algorithm.environments
         raise InvalidArgument(
@@ -74,6 +54,16 @@ def _expect_whole_episodes(training: Training) -> None:
             f"{robot.name} cannot be kept in a checkpoint and restart at each sixtieth of the training, got "
             f"{training.iterations:,} iterations and episodes of {robot.episode_limit:,}"
         )
+    if mapping is None:
+        training.environment(0)
+    else:
+        check_mapping(mapping)
+    if training.is_varied:
+        expect_varied(robot, varying_in(training.lessons, recordings=False))
+    if is_saved:
+        ROBOTS.expect_loadable(without_goal(robot), in_workers=True)
+        if mapping is not None:
+            MAPPINGS.expect_loadable(mapping, in_workers=True)
 
 
 def describe(
@@ -86,11 +76,8 @@ def describe(
 ) -> dict[str, Any]:
     """Everything that determines the policies, as plain data, with its fingerprint; and what is informative only.
 
-    Args:
-        training, timeline: the training, and the simulators it uses.
-        sources: names of the recordings; informative only.
-        random_return: mean return of random actions, if known; informative only.
-        device: the kind of GPU used, which affects rounding; None for cores, which are not recorded.
+    `sources`, the names of the recordings, and the mean return of random actions are informative only. `device` is the
+    kind of GPU used, which affects rounding; None for cores, which are not recorded.
     """
     versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
     if isinstance(training.robot, HostRobot):
@@ -112,7 +99,6 @@ def describe(
 
 
 def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
-    """How the simulators were made, without the responses themselves."""
     return {
         **timeline.fitted,
         "conditions": [condition.label for condition in timeline.conditions],
@@ -124,15 +110,11 @@ def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
 
 
 def expect_folder_for(training: Training, folder: Path) -> None:
-    """Refuse a folder of another training by its settings, before any recording is read.
-
-    Raises:
-        Mismatch, InvalidFile: as `train` does.
-    """
+    """Refuse a folder of another training by its settings, as `train` does, before any recording is read."""
     if (stored := _stored_description(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
         unknown = ("simulators", *_INFORMATIVE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
-        if difference := _first_difference(stored, describe(training, None), unknown):
+        if difference := first_difference(stored, describe(training, None), ignoring=unknown, first=_FIRST):
             raise folder_mismatch(folder, "training", difference)
 
 
@@ -161,16 +143,11 @@ def write_assessments(folder: Path, policies: Mapping[str, Policy]) -> Path:
 
 
 def is_ours(folder: Path, manifest: dict[str, Any]) -> bool:
-    """Whether the folder already holds this training; False if it is free.
-
-    Raises:
-        Mismatch: if it holds another training, policies without a description, or work of another kind.
-        InvalidFile: if its description cannot be read, or it is a file.
-    """
+    """Whether the folder already holds this training; False if it is free; raises Mismatch or InvalidFile otherwise."""
     stored = _stored_description(folder)
     if stored is not None and stored["fingerprint"] != manifest["fingerprint"]:
-        difference = _first_difference(stored, manifest, _NOT_REPORTED) or "other responses"
-        raise folder_mismatch(folder, "training", difference)
+        difference = first_difference(stored, manifest, ignoring=_NOT_REPORTED, first=_FIRST)
+        raise folder_mismatch(folder, "training", difference or "other responses")
     return stored is not None
 
 
@@ -183,22 +160,6 @@ def _stored_description(folder: Path) -> dict[str, Any] | None:
         raise Mismatch(f"{folder}: expected a folder of this training, got policies without a {MANIFEST}")
     expect_no_other(folder, "training")
     return None
-
-
-def _first_difference(stored: dict[str, Any], manifest: dict[str, Any], ignoring: Sequence[str]) -> str:
-    # The robot first: differences that follow from it, such as the default iterations, are not the cause.
-    theirs, ours = _robot_in(stored), _robot_in(manifest)
-    return first_difference(theirs, ours, "training.robot.name") or first_difference(
-        stored, manifest, ignoring=ignoring
-    )
-
-
-def _robot_in(manifest: dict[str, Any]) -> Any:
-    """The robot's name; None if an edited description lacks it."""
-    try:
-        return manifest["training"]["robot"]["name"]
-    except (KeyError, TypeError):
-        return None
 
 
 def provenance_of(manifest: dict[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from animat.responses.readouts import ALL
 from animat.robots.host import HostRobot
 from animat.training.course import Course
 from animat.training.diagnosis import Diagnosis, diagnosis_program
-from animat.training.host import programs_on_host
+from animat.training.host import OnHost
 from animat.training.networks import Network
 from animat.training.policy import CURVE, Policy
 from animat.training.sac import begin, train_chunk
@@ -41,20 +41,16 @@ CHECKPOINT_S = 2.0
 
 
 Rows = TypeVar("Rows", list[Policy], np.ndarray)
-AddChunk: TypeAlias = Callable[[Float64[np.ndarray, "policies columns"]], None]
-"""A function that takes one chunk of the learning curves, one row per policy; columns as `CURVE`."""
+Chunk: TypeAlias = Float64[np.ndarray, "policies columns"]
+"""One chunk of the learning curves, one row per policy; columns as `CURVE`."""
+AddChunk: TypeAlias = Callable[[Chunk], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Some of a training's policies, and the simulators they are trained on.
+    """Some of a training's policies, by their numbers, and the simulators they are trained on.
 
-    Attributes:
-        training: the training.
-        members: numbers of its policies in this group.
-        timeline: the culture's simulators; None without neurons.
-        fingerprint: of training and timeline together; a checkpoint with another fingerprint is refused.
-        provenance: stored in the policies.
+    A checkpoint with another fingerprint is refused. The provenance is stored in the policies.
     """
 
     training: Training
@@ -72,21 +68,7 @@ def train_group(
     checkpoint_s: float = CHECKPOINT_S,
     add_chunk: AddChunk | None = None,
 ) -> list[Policy]:
-    """Train a group of policies, resuming from its checkpoint if there is one.
-
-    The result is the same, bit for bit, however often the training was stopped and started again.
-
-    Args:
-        group: the policies to train.
-        checkpoint: file written atomically from time to time; the caller removes it when it is no longer needed. None:
-            no checkpoint is written.
-        progress: updated after each chunk with the number done and the mean return of the episodes that ended in it.
-        checkpoint_s: seconds between checkpoints; they change how much is repeated, never the result.
-        add_chunk: called with each chunk of the learning curves, one row per policy, those from the checkpoint first.
-
-    Raises:
-        InvalidFile: if the checkpoint cannot be read or written, or is of another training.
-    """
+    """Train a group of policies: `train_groups` for a single one."""
     return train_groups([group], checkpoint, progress, checkpoint_s=checkpoint_s, add_chunks=[add_chunk])[0]
 
 
@@ -99,21 +81,27 @@ def train_groups(
     add_chunks: Sequence[AddChunk | None],
     keeps_last: bool = False,
 ) -> list[list[Policy]]:
-    """Train several groups of policies at once, as `train_group` does with one; returns the policies of each.
+    """Train groups of policies at once, resuming from their checkpoint if there is one; returns the policies of each.
 
-    How many are trained at once changes the last bits.
+    The result is the same, bit for bit, however often the training was stopped and started again. How many are trained
+    at once changes the last bits.
 
     Args:
         groups: groups that one program can train (`animat.execution.gpu.group_by_program`).
-        checkpoint, progress, checkpoint_s: as in `train_group`.
-        add_chunks: `add_chunk` of each group, or None.
+        checkpoint: file written atomically from time to time; the caller removes it when it is no longer needed.
+        progress: updated after each chunk with the number done and the mean return of the episodes that ended in it.
+        checkpoint_s: seconds between checkpoints; they change how much is repeated, never the result.
+        add_chunks: of each group, called with each chunk of its learning curves, those from the checkpoint first.
         keeps_last: whether a checkpoint is also written at the end, from which the same policies can be restored.
+
+    Raises:
+        InvalidFile: if the checkpoint cannot be read or written, or is of another training.
     """
     together = SideBySide(*groups)
     done = together.resume(checkpoint) if checkpoint is not None and checkpoint.exists() else 0
     simulators = [_simulators_of(group) for group in groups]
 
-    def pass_on(chunk: Float64[np.ndarray, "policies columns"]) -> None:
+    def pass_on(chunk: Chunk) -> None:
         for rows, add_chunk in zip(together.split(chunk), add_chunks, strict=True):
             if add_chunk is not None:
                 add_chunk(rows)
@@ -134,7 +122,7 @@ def train_groups(
 
 
 def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
-    """The simulator of a group in each chunk; all simulators where each episode draws one."""
+    """The simulator of a group in each chunk, by its number; all simulators where each episode draws one."""
     training, timeline = group.training, group.timeline
     if timeline is None:
         return lambda _: None
@@ -146,7 +134,7 @@ def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
 
 
 def untrained_policies(group: Group) -> list[Policy]:
-    """A group's policies before their first iteration, for comparison with trained ones."""
+    """A group's policies before their first iteration."""
     return SideBySide(group).policies()
 
 
@@ -166,15 +154,7 @@ def save_policies(group: Group, policies: Sequence[Policy], folder: Path) -> lis
 def programs(
     environment: Environment[Any], algorithm: SAC, own_simulators: bool = False
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """`begin` and `train_chunk` for several policies, compiled when they are first called.
-
-    They are cached, so a process that trains one group after another traces them once.
-
-    Args:
-        environment: the environment that the policies act in.
-        algorithm: settings of all policies.
-        own_simulators: whether each policy has its own simulator, rather than all sharing one.
-    """
+    """`begin` and `train_chunk` for several policies, traced once per process; each may have its own simulator."""
     limited = EpisodeLimit(environment)
     beginning = jax.vmap(partial(begin, limited, algorithm))
     chunk = jax.vmap(partial(train_chunk, limited, algorithm), in_axes=(0, 0 if own_simulators else None, None, None))
@@ -185,26 +165,22 @@ def programs(
 
 
 class SideBySide:
-    """The policies of one or more groups during training, chunk by chunk, with the simulators passed in.
+    """The policies of groups of one program during training, chunk by chunk, with the simulators passed in.
+
+    If the groups belong to several trainings, none has lessons or is stepped outside JAX. Of their timelines only what
+    all simulators share is used.
 
     Args:
-        group: the policies; only what all simulators of its timeline share is used of the timeline.
-        others: groups trained by the same program, for the same number of rounds. If any belongs to another training,
-            none has lessons or is stepped outside JAX.
         own_programs: `begin` and `train_chunk` for all of them, instead of `programs`.
         is_diagnosed: whether they are diagnosed after each chunk and must be finite. If not, the learning curves have
             NaN instead of the diagnosis.
     """
 
     def __init__(
-        self,
-        group: Group,
-        *others: Group,
-        own_programs: Sequence[Callable[..., Any]] = (),
-        is_diagnosed: bool = True,
+        self, *groups: Group, own_programs: Sequence[Callable[..., Any]] = (), is_diagnosed: bool = True
     ) -> None:
-        training = group.training
-        self._groups = groups = (group, *others)
+        group, training = groups[0], groups[0].training
+        self._groups = groups
         self._places = [(each, member) for each in groups for member in each.members]
         self._own_simulators = len({each.fingerprint for each in groups}) > 1
         self._environment = training.environment_on(group.timeline)
@@ -215,14 +191,15 @@ class SideBySide:
             self._course = Course(training, self._environment, group.timeline, len(self._places))
             beginning, self._chunk = self._course.begin, self._course.train
         elif isinstance(training.robot, HostRobot):
-            beginning, self._chunk = programs_on_host(self._environment, training.algorithm)
+            on_host = OnHost(self._environment, training.algorithm)
+            beginning, self._chunk = on_host.begin, on_host.train
         else:
             beginning, self._chunk = programs(self._environment, training.algorithm, self._own_simulators)
         keys = [jax.random.fold_in(jax.random.key(each.training.seed), member) for each, member in self._places]
         self._diagnose = diagnosis_program(self._environment, training.algorithm) if is_diagnosed else None
         self._learners = beginning(jnp.stack(keys))
-        self.curve: list[Float64[np.ndarray, "policies columns"]] = []
-        """The learning curves so far: for each chunk, one row per policy."""
+        self.curve: list[Chunk] = []
+        """The learning curves so far."""
 
     def split(self, rows: Rows) -> list[Rows]:
         """Split rows of all policies into those of each group."""
@@ -230,11 +207,9 @@ class SideBySide:
         return [rows[end - len(group.members) : end] for group, end in zip(self._groups, ends, strict=True)]
 
     def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
-        """Train one chunk; returns the mean return of the episodes that ended in it, NaN if none ended.
+        """Train one chunk, counted from 0, with the simulator of each group; there may be more than a training has.
 
-        Args:
-            index: number of the chunk, from 0; it may go beyond the chunks of the training.
-            simulators: the simulator of each group; None without neurons.
+        Returns the mean return of the episodes that ended in it, NaN if none ended.
 
         Raises:
             UnusableData: if policies that are diagnosed are no longer finite.
@@ -251,7 +226,11 @@ class SideBySide:
         diagnosis: Sequence[Any] = [np.full(len(episodes), np.nan)] * len(Diagnosis._fields)
         if self._diagnose is not None:
             # Before a checkpoint is written, which training could never recover from.
-            self._expect_finite(within=iterations[0])
+            if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(self._learners.deployed)):
+                raise UnusableData(
+                    f"{training.robot.name}: expected finite rewards and observations, got NaN or infinite ones "
+                    f"within {iterations[0]:,} iterations"
+                )
             available = jnp.int32(min(last * algorithm.environments, algorithm.replay))
             diagnosis = self._diagnose(self._learners, available)
         with np.errstate(invalid="ignore"):
@@ -259,14 +238,6 @@ class SideBySide:
         if self._course is not None:
             self._course.assess(index, self._learners.deployed, simulator)
         return float(returns.sum() / episodes.sum()) if episodes.sum() else float("nan")
-
-    def _expect_finite(self, within: int) -> None:
-        robot, deployed = self._groups[0].training.robot, jax.tree.leaves(self._learners.deployed)
-        if not all(np.isfinite(leaf).all() for leaf in deployed):
-            raise UnusableData(
-                f"{robot.name}: expected finite rewards and observations, got NaN or infinite ones "
-                f"within {within:,} iterations"
-            )
 
     def note(self) -> str:
         """The policies' lessons, for the progress line; empty without lessons."""
@@ -278,7 +249,7 @@ class SideBySide:
 
     def _policy(self, i: int) -> Policy:
         done = len(self.curve)
-        curve = np.stack(self.curve)[:, i] if done else np.zeros((0, len(CURVE)))
+        curve = np.array([chunk[i] for chunk in self.curve]).reshape(-1, len(CURVE))
         now = self._as_policy(i, self._learners.deployed, curve)
         if self._course is None or not done or not self._groups[0].training.episodes_assessed:
             return now
@@ -384,13 +355,9 @@ def _read_checkpoint(path: Path, fingerprint: str, like: Any) -> tuple[int, Any,
 
 
 def split_groups(policies: int, *, fewest: int = 1) -> list[tuple[int, ...]]:
-    """Divide the numbers of the policies into groups as even as possible, none larger than five.
+    """Divide the numbers of the policies into at least `fewest` groups, as even as possible, none larger than five.
 
     The division does not depend on the machine: how many are trained side by side could change the last bits.
-
-    Args:
-        policies: number of policies.
-        fewest: smallest number of groups, if there are as many policies: two keep two cores busy.
     """
     n_groups = max(-(-policies // 5), min(fewest, policies))
     return [tuple(part.tolist()) for part in np.array_split(np.arange(policies), n_groups)]

@@ -1,7 +1,6 @@
 """Soft Actor-Critic for bodies that are stepped on the host: acting and learning are compiled, the bodies are not.
 
-A round is that of `animat.training.sac`: every body does one iteration, which is stored, then come the gradient steps.
-It is divided where the bodies move: one compiled program takes what they did, learns, and acts for the next round.
+A round is divided where the bodies move: one compiled program takes what they did, learns, and acts for the next one.
 """
 
 from __future__ import annotations
@@ -14,54 +13,26 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
 from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.host import Bodies, HostRobot, Snapshot
-from animat.training.exploration import count_ended
-from animat.training.replay import pack_transitions, remember
-from animat.training.sac import (
-    Finished,
-    Learner,
-    average,
-    begin,
-    choose_actions,
-    count_finished,
-    critic_state,
-    learn,
-    uniform_shapes,
-)
+from animat.training.replay import pack_transitions
+from animat.training.sac import Finished, Learner, begin, choose_actions, critic_state, end_round, learn, uniform_shapes
 from animat.training.settings import SAC
-from animat.wrappers import EpisodeLimit, TrialCosts, add_cost, net_return
+from animat.wrappers import EpisodeLimit, TrialCosts, add_cost
 
 
 class Actions(NamedTuple):
-    """A policy's actions in a round, one per environment.
-
-    Attributes:
-        action: the action drawn.
-        command: the command for the body.
-        neurons: history state of the neurons after their response.
-        cost: cost of the trial; None if trials are free.
-    """
+    """A policy's actions in a round, with the history state of the neurons after them; trials may be free of cost."""
 
     action: Array
     command: Float[Array, "environments *commands"]
     neurons: Float[Array, "environments 2"]
     cost: Float[Array, " environments"] | None = None
-
-
-class Movement(NamedTuple):
-    """The bodies' steps (`animat.robots.host.StepResult`); `begun` has the first observation of a new episode."""
-
-    observation: Float[Array, "environments observations"]
-    reward: Float[Array, " environments"]
-    terminated: Bool[Array, " environments"]
-    ended: Bool[Array, " environments"]
-    begun: Float[Array, "environments observations"]
 
 
 def act(
@@ -78,25 +49,23 @@ def learn_and_act(
     settings: SAC,
     learner: Learner,
     acted: Actions,
-    moved: Movement,
+    moved: tuple[Any, Array],
     simulator: NeuronSimulator | None,
     index: Int[Array, ""],
 ) -> tuple[Learner, Actions, Finished]:
     """Store a round, learn from the replay, and act in the next round.
 
-    Args:
-        environment, settings, learner, simulator: as in `animat.training.sac.train_chunk`.
-        acted, moved: the round.
-        index: number of the round.
+    The round is its actions, and what the bodies did: their steps (`animat.robots.host.StepResult`), and what is
+    observed once ended episodes have restarted.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
     key, use = jax.random.split(learner.key)
     uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
-    written = index * settings.environments
 
-    before, (observation, reward, terminated, ended, begun) = learner.episodes, moved
-    after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons)
+    before, ((observation, reward, terminated, truncated), begun) = learner.episodes, moved
+    ended = terminated | truncated
+    after = before._replace(robot=observation, iteration=before.iteration + 1, neurons=acted.neurons, reward=reward)
     net = reward
     if acted.cost is not None:
         after, net = add_cost(after, acted.cost), reward - acted.cost
@@ -104,23 +73,14 @@ def learn_and_act(
     # Critics see the time left: the return ends at the limit. Where the body truncates an episode earlier, it does not.
     is_last = terminated | (after.iteration >= environment.robot.episode_limit)
     rows = pack_transitions(settings, state, next_state, acted.action, net, is_last)
-    returns = learner.returns + reward
-    finished = count_finished(learner.exploration, ended, returns)
-    learner = learner._replace(
-        replay=remember(learner.replay, rows, written % settings.replay),
-        episodes=after._replace(
-            robot=begun,
-            iteration=jnp.where(ended, 0, after.iteration),
-            neurons=jnp.where(ended[:, None], jnp.array(INITIAL_HISTORY, jnp.float32), after.neurons),
-            info=jax.tree.map(lambda cost: jnp.where(ended, 0.0, cost), after.info),
-        ),
-        returns=jnp.where(ended, 0.0, returns),
-        exploration=count_ended(learner.exploration, ended, net_return(returns, after)),
-        key=key,
+    episodes = before._replace(
+        robot=begun,
+        iteration=jnp.where(ended, 0, after.iteration),
+        neurons=jnp.where(ended[:, None], jnp.array(INITIAL_HISTORY, jnp.float32), after.neurons),
+        info=jax.tree.map(lambda cost: jnp.where(ended, 0.0, cost), after.info),
     )
-    available = jnp.minimum(written + settings.environments, settings.replay)
-    learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
-    learner = learner._replace(deployed=average(settings, learner.deployed, learner.trained.actor, index))
+    learner, finished = end_round(settings, learner._replace(key=key), index, rows, after, ended, episodes)
+    learner = learn(environment, settings, learner, index, uniforms[n_acting:].reshape(learning))
     return *_act(environment, learner, simulator, uniforms[:n_acting].reshape(acting)), finished
 
 
@@ -128,9 +88,9 @@ def _act(
     environment: Environment[Any], learner: Learner, simulator: NeuronSimulator | None, uniforms: Array
 ) -> tuple[Learner, Actions]:
     observation = jax.vmap(environment.observe)(learner.episodes) / environment.scales
-    action, exploration, noise = choose_actions(environment, learner, observation, uniforms)
+    learner, action, noise = choose_actions(environment, learner, observation, uniforms)
     responded = jax.vmap(environment.respond, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
-    return learner._replace(exploration=exploration), Actions(
+    return learner, Actions(
         action,
         responded.command,
         jnp.broadcast_to(responded.answer.history, (len(observation), 2)),
@@ -151,17 +111,12 @@ def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[.
     )
 
 
-def programs_on_host(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The counterpart of `animat.training.group.programs` for a robot that is stepped on the host.
+class OnHost:
+    """`begin` and `train_chunk` of `animat.training.sac` for policies of a robot that is stepped on the host.
 
-    Between chunks the learners hold the bodies as data (`Snapshot`), so checkpoints are like those of other robots. The
-    bodies themselves are created when the first chunk is trained.
+    Between chunks the learners hold the bodies as data (`Snapshot`), so checkpoints are like those of other robots.
     """
-    chunks = _Chunks(environment, algorithm)
-    return chunks.begin, chunks
 
-
-class _Chunks:
     def __init__(self, environment: Environment[Any], algorithm: SAC) -> None:
         assert isinstance(environment.robot, HostRobot)
         self._robot, self._n = environment.robot, algorithm.environments
@@ -169,7 +124,6 @@ class _Chunks:
         self._bodies: Bodies | None = None
 
     def begin(self, keys: PRNGKeyArray) -> Learner:
-        """Untrained policies."""
         # Seeds follow from each policy's key, like its other draws.
         policy_seeds = np.asarray(jax.random.key_data(keys)).astype(int).tolist()
         self._seeds = [(*seed, body) for seed in policy_seeds for body in range(self._n)]
@@ -177,10 +131,9 @@ class _Chunks:
         none = Snapshot.initial(self._robot, len(keys) * self._n)
         return learners._replace(episodes=learners.episodes._replace(robot=self._by_policy(none)))
 
-    def __call__(
+    def train(
         self, learners: Learner, simulator: NeuronSimulator | None, first_round: Array, last_round: Array
     ) -> tuple[Learner, Finished]:
-        """As `animat.training.sac.train_chunk`."""
         members = len(learners.returns)
         finished = Finished(np.zeros(members), np.zeros(members))  # type: ignore[arg-type]
         if int(last_round) == int(first_round):
@@ -192,34 +145,29 @@ class _Chunks:
             stepped = bodies.step(commands)
             ended = np.flatnonzero(stepped.ended)
             begun = bodies.begin(ended.tolist()) if len(ended) else stepped.observation
-            reward = stepped.reward.astype(np.float32)
-            moved = Movement(stepped.observation, reward, stepped.terminated, stepped.ended, begun)  # type: ignore[arg-type]
-            learners, acted, of_round = self._learn_and_act(
-                learners, acted, self._by_policy(moved), simulator, np.int32(index)
-            )
+            moved = self._by_policy((stepped._replace(reward=stepped.reward.astype(np.float32)), begun))
+            learners, acted, of_round = self._learn_and_act(learners, acted, moved, simulator, np.int32(index))
             if len(ended):
                 finished = Finished(*(a + np.asarray(b) for a, b in zip(finished, of_round, strict=True)))
         snapshot = self._by_policy(bodies.snapshot)
         return learners._replace(episodes=learners.episodes._replace(robot=snapshot)), finished
 
     def _restore(self, learners: Learner) -> tuple[Learner, Bodies]:
-        """The bodies, placed as the learners have them, and learners that hold only their observations."""
-        flat = Snapshot(
-            *(np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
-        )
+        """The bodies, created for the first chunk as the learners have them, and learners with their observations."""
         is_restored = True
-        if self._bodies is None or not flat.commands.shape[1]:
+        if self._bodies is None or not learners.episodes.robot.commands.shape[2]:
+            flat = (np.asarray(part).reshape(len(self._seeds), *part.shape[2:]) for part in learners.episodes.robot)
             self._bodies = Bodies(self._robot, self._seeds)
-            is_restored = self._bodies.restore(flat)
+            is_restored = self._bodies.restore(Snapshot(*flat))
         episodes = learners.episodes._replace(robot=self._by_policy(self._bodies.observation))
-        if is_restored:
-            return learners._replace(episodes=episodes), self._bodies
-        restarted = episodes._replace(
-            iteration=jnp.zeros_like(episodes.iteration),
-            info=jax.tree.map(jnp.zeros_like, episodes.info),
-            neurons=jnp.broadcast_to(jnp.array(INITIAL_HISTORY, jnp.float32), episodes.neurons.shape),
-        )
-        return learners._replace(episodes=restarted, returns=jnp.zeros_like(learners.returns)), self._bodies
+        if not is_restored:
+            learners = learners._replace(returns=jnp.zeros_like(learners.returns))
+            episodes = episodes._replace(
+                iteration=jnp.zeros_like(episodes.iteration),
+                info=jax.tree.map(jnp.zeros_like, episodes.info),
+                neurons=jnp.broadcast_to(jnp.array(INITIAL_HISTORY, jnp.float32), episodes.neurons.shape),
+            )
+        return learners._replace(episodes=episodes), self._bodies
 
     def _by_policy(self, flat: Any) -> Any:
         """Arrays of all bodies with a leading axis of policies."""

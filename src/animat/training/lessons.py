@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import field
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from animat.errors import InvalidArgument, InvalidFile, did_you_mean
+from animat.errors import InvalidArgument, did_you_mean
 from animat.goals.robot import without_goal
 from animat.plain_file import read_toml
-from animat.records import Number, read_record, record
+from animat.records import Number, in_file, read_record, record
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 
@@ -26,7 +26,14 @@ MOST_VARIED = 10
 """Largest number of parameters that vary: a robot is built for every combination of their ends as a check."""
 _MOST_BYTES = 2**20
 
-Range = tuple[Number, Number]
+
+def _expect_low_first(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"expected the low end first, got [{ends[0]:g}, {ends[1]:g}]")
+    return ends
+
+
+Range = Annotated[tuple[Number, Number], AfterValidator(_expect_low_first)]
 """The lowest and the highest value; every value in between is equally likely."""
 
 
@@ -38,15 +45,13 @@ class Lesson:
         name: for people.
         parameters: ranges of the robot's parameters, by name.
         starts: ranges of numbers of the robot's state at the start of an episode, by name.
-        recordings_min: the recordings from which an episode's simulator is drawn, by the minutes on the culture's clock
-            between which they started, inclusive; None: all. Only if simulators are drawn at all
-            (`Training.shadowing`).
+        recordings_min: minutes of the culture's clock, inclusive, between which the recordings started from which an
+            episode's simulator is drawn, if it is (`Training.shadowing`); None: all.
         success: the share of an assessment's episodes that must succeed for the policy to move on.
         until_return: alternatively, the mean return that they must reach, in the task's units.
 
     Raises:
-        InvalidArgument: for a range whose low end is above its high end, or if both `success` and `until_return` are
-            set.
+        InvalidArgument: for a range with the high end first, or if both `success` and `until_return` are set.
     """
 
     name: Annotated[str, Field(max_length=200)] = ""
@@ -57,14 +62,6 @@ class Lesson:
     until_return: Number | None = None
 
     def __post_init__(self) -> None:
-        ranges = {
-            f"{table}.{name}": ends for table in ("parameters", "starts") for name, ends in vars(self)[table].items()
-        }
-        if self.recordings_min is not None:
-            ranges["recordings_min"] = self.recordings_min
-        for name, (low, high) in ranges.items():
-            if low > high:
-                raise InvalidArgument(f"{name}: expected the low end first, got [{low:g}, {high:g}]")
         if self.success is not None and self.until_return is not None:
             raise InvalidArgument("until_return: expected either success or until_return, got both")
 
@@ -80,18 +77,11 @@ class _File:
 
 
 def read_lessons(path: str | os.PathLike[str]) -> tuple[Lesson, ...]:
-    """Read lessons from a TOML file, one table `[[lessons]]` each, whose keys are the attributes of `Lesson`.
-
-    Raises:
-        InvalidFile: naming the file, the key, what was expected and what came.
-    """
-    data = read_toml(path, _MOST_BYTES)
-    try:
-        lessons = read_record(_File, data).lessons
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error
-    if not lessons:
-        raise InvalidFile(f"{path}: expected a table [[lessons]] for each lesson, got none")
+    """Read lessons from a TOML file, one table `[[lessons]]` each, whose keys are the attributes of `Lesson`."""
+    with in_file(path):
+        lessons = read_record(_File, read_toml(path, _MOST_BYTES)).lessons
+        if not lessons:
+            raise InvalidArgument("expected a table [[lessons]] for each lesson, got none")
     return lessons
 
 
@@ -101,38 +91,34 @@ def stages_of(lessons: Sequence[Lesson]) -> tuple[Lesson, ...]:
 
 
 def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_recordings: bool) -> None:
-    """Refuse lessons that do not fit this robot.
-
-    Raises:
-        InvalidArgument: naming the lesson, what was expected and what came.
-    """
+    """Refuse lessons that do not fit this robot."""
     if lessons and isinstance(robot, HostRobot):
         raise InvalidArgument(
             f"lessons: expected a robot that is stepped by JAX, got {robot.name}, which its own library steps"
         )
     for number, lesson in enumerate(lessons, 1):
-        where = f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"
-        if number < len(lessons) and not lesson.has_threshold:
-            raise InvalidArgument(
-                f"{where}: expected success or until_return, which say when to move on to the next lesson, got neither"
-            )
-        if lesson.success is not None and not hasattr(robot, "succeeded"):
-            raise InvalidArgument(
-                f"{where}: success: expected a robot that reports whether an episode succeeded, got {robot.name}, "
-                "which has no method `succeeded`; use until_return"
-            )
-        if lesson.recordings_min is not None and not draws_recordings:
-            raise InvalidArgument(
-                f"{where}: recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it with all "
-                "episodes on the same recordings"
-            )
         try:
-            _expect_parameters(lesson, robot)
+            if number < len(lessons) and not lesson.has_threshold:
+                raise InvalidArgument(
+                    "expected success or until_return, which say when to move on to the next lesson, got neither"
+                )
+            _expect_lesson(lesson, robot, draws_recordings)
         except InvalidArgument as error:
+            where = f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"
             raise InvalidArgument(f"{where}: {error}") from error
 
 
-def _expect_parameters(lesson: Lesson, robot: Robot[Any]) -> None:
+def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) -> None:
+    if lesson.success is not None and not hasattr(robot, "succeeded"):
+        raise InvalidArgument(
+            f"success: expected a robot that reports whether an episode succeeded, got {robot.name}, which has no "
+            "method `succeeded`; use until_return"
+        )
+    if lesson.recordings_min is not None and not draws_recordings:
+        raise InvalidArgument(
+            "recordings_min: expected only with shadowing 'drawn' (--shadowing drawn), got it with all episodes on the "
+            "same recordings"
+        )
     body: Any = without_goal(robot)
     numbers = {f.name: getattr(body, f.name) for f in dataclasses.fields(body)}
     if len(lesson.parameters) > MOST_VARIED:

@@ -23,7 +23,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, s
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
-from animat.records import Number, read_record
+from animat.records import Flag, Number, in_file, json_data, read_record
 from animat.responses.condition import Condition, abbreviated
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
@@ -100,6 +100,9 @@ class Policy:
 
     def __post_init__(self) -> None:
         read_record(PulseCost, self.pulse_cost, "pulse_cost")
+        read_record(Flag, self.neural_observation, "neural_observation")
+        if self.neural_observation and self.mapping is None:
+            raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
         self._expect_network()
         if self.window_ms is not None:
             check_window(read_record(tuple[Number, Number], self.window_ms, "window_ms"))
@@ -116,10 +119,6 @@ class Policy:
 
     def _expect_network(self) -> None:
         """Refuse weights from which no meaningful action can be computed."""
-        if not isinstance(self.neural_observation, bool):
-            raise InvalidArgument(f"neural_observation: expected True or False, got {shown(self.neural_observation)}")
-        if self.neural_observation and self.mapping is None:
-            raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
         n_outputs = 2 * self.robot.n_commands if self.n_actions is None else self.n_actions
         n_inputs = len(self.robot.observation_spec) + len(INITIAL_HISTORY) * self.neural_observation
         widths = [n_inputs, *(bias.size for bias in self.biases)]
@@ -135,14 +134,13 @@ class Policy:
                 f"shapes {self.scales.shape} and {[bias.shape for bias in self.biases]}"
             )
         for name, arrays in (("weights", self.weights), ("biases", self.biases), ("scales", (self.scales,))):
-            for array in arrays:
-                if array.dtype != np.float32:
-                    raise InvalidArgument(f"{name}: expected float32, got {array.dtype}")
-                # Also false for NaN.
-                if name != "scales" and not np.all(np.abs(array) <= _LARGEST):
-                    raise InvalidArgument(
-                        f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN, infinite or larger ones"
-                    )
+            if kinds := {str(array.dtype) for array in arrays} - {"float32"}:
+                raise InvalidArgument(f"{name}: expected float32, got {', '.join(kinds)}")
+            # Also false for NaN.
+            if name != "scales" and not all(np.all(np.abs(array) <= _LARGEST) for array in arrays):
+                raise InvalidArgument(
+                    f"{name}: expected finite numbers up to {_LARGEST:g}, got NaN, infinite or larger ones"
+                )
         if not np.all((self.scales >= LEAST_SCALE) & (self.scales <= LARGEST_SCALE)):
             raise InvalidArgument(
                 f"scales: expected numbers from {LEAST_SCALE:g} to {LARGEST_SCALE:g}, got {self.scales.tolist()}"
@@ -340,27 +338,20 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
         raise InvalidFile(
             f"{path}: expected a policy, as animat train writes it, got a file that cannot be read as one: {error}"
         ) from error
-    try:
-        description = json.loads(metadata["animat"])
-    except (ValueError, RecursionError) as error:
-        raise InvalidFile(f"{path}: metadata: expected JSON, got something else ({error})") from error
-    file_format = description.get("format") if isinstance(description, dict) else description
-    if file_format != FORMAT:
-        raise InvalidFile(f"{path}: expected the format {FORMAT!r}, got {shown(file_format)}")
-    # Older files lack this entry, and use this activation.
-    activation = description.get("hidden_activation", HIDDEN_ACTIVATION)
-    if activation != HIDDEN_ACTIVATION:
-        raise InvalidFile(f"{path}: expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
+    with in_file(path):
+        description = json_data(metadata["animat"], "metadata")
+        file_format = description.get("format") if isinstance(description, dict) else description
+        if file_format != FORMAT:
+            raise InvalidArgument(f"expected the format {FORMAT!r}, got {shown(file_format)}")
+        # Older files lack this entry, and use this activation.
+        activation = description.get("hidden_activation", HIDDEN_ACTIVATION)
+        if activation != HIDDEN_ACTIVATION:
+            raise InvalidArgument(f"expected hidden layers of {HIDDEN_ACTIVATION!r}, got {shown(activation)}")
     return arrays, description
 
 
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
-    """The first of several policies, which represents all of them.
-
-    Raises:
-        InvalidArgument: if there are none.
-        Mismatch: if they differ in one of the attributes or in what they observe; ends with the advice.
-    """
+    """The first of several policies, which represents all of them; raises a Mismatch if an attribute differs."""
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))

@@ -1,7 +1,4 @@
-"""The entries of a policy's provenance that code reads: how it was trained, and on which simulators.
-
-The other entries are for people and are kept unchanged. JAX is not imported here: policies are loaded without it.
-"""
+"""The entries of a policy's provenance that code reads, without JAX; the others are for people, and kept unchanged."""
 
 from __future__ import annotations
 
@@ -45,11 +42,7 @@ class Provenance(TypedDict, total=False):
 
 
 def expect_provenance(provenance: Any) -> None:
-    """Refuse a provenance with an invalid entry among those that are read.
-
-    Raises:
-        InvalidArgument: naming the entry, what was expected and what came.
-    """
+    """Refuse a provenance with an invalid entry among those that are read."""
     trained = read_record(Provenance, provenance, "provenance").get("training") or {}
     # `Policy.trained_until_min` needs both.
     if trained.get("duration_min") is not None and "chunks" not in trained:

@@ -28,12 +28,10 @@ class Batch(NamedTuple):
 
     @property
     def observation(self) -> Float[Array, "batch _"]:
-        """What the actor saw."""
         return self.state[:, :-1]
 
     @property
     def next_observation(self) -> Float[Array, "batch _"]:
-        """What the actor saw next."""
         return self.next_state[:, :-1]
 
 

@@ -27,14 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
 from animat.robots.base import Robot
-from animat.training.exploration import (
-    Exploration,
-    count_ended,
-    entropy_factor,
-    explore,
-    n_uniforms,
-    nothing_held,
-)
+from animat.training.exploration import Exploration, count_ended, entropy_factor, explore, n_uniforms, nothing_held
 from animat.training.networks import Network, draw_action, forward, initial_networks, squashed_normal
 from animat.training.replay import Batch, draw_batch, pack_transitions, remember
 from animat.training.settings import SAC
@@ -188,25 +181,28 @@ def train_chunk(
         simulator: the simulator of the neurons during this chunk; None without neurons.
         first_round, last_round: the rounds of the chunk, from the first up to but excluding the last; the same for all
             policies that are trained side by side.
-
-    Returns:
-        The learner after the chunk, and the episodes that ended in it.
     """
     acting, learning = uniform_shapes(environment, settings)
     n_acting = math.prod(acting)
 
     def one_round(index: Int[Array, ""], carry: tuple[Learner, Finished]) -> tuple[Learner, Finished]:
-        learner, before = carry
+        learner, finished = carry
         key, use, reset_key = jax.random.split(learner.key, 3)
         uniforms = jax.random.uniform(use, (n_acting + math.prod(learning),))
-        written = index * settings.environments
-        learner, finished = _act(
-            environment, settings, learner, simulator, written, uniforms[:n_acting].reshape(acting), reset_key
+        before = learner.episodes
+        state = critic_state(environment, before)
+        learner, action, noise = choose_actions(
+            environment, learner._replace(key=key), state[:, :-1], uniforms[:n_acting].reshape(acting)
         )
-        available = jnp.minimum(written + settings.environments, settings.replay)
-        learner = learn(environment, settings, learner, available, uniforms[n_acting:].reshape(learning))
-        learner = learner._replace(key=key, deployed=average(settings, learner.deployed, learner.trained.actor, index))
-        return learner, jax.tree.map(jnp.add, before, finished)
+        after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, before, action, simulator)
+        ended = jnp.logical_or(*after.ended)
+        reward = shaped(environment.robot, settings, before.robot, after.robot, net_reward(before, after), ended)
+        rows = pack_transitions(settings, state, critic_state(environment, after), action, reward, ended)
+        started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
+        episodes = jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried)
+        learner, of_round = end_round(settings, learner, index, rows, after, ended, episodes)
+        learner = learn(environment, settings, learner, index, uniforms[n_acting:].reshape(learning))
+        return learner, jax.tree.map(jnp.add, finished, of_round)
 
     nothing = Finished(jnp.float32(0.0), jnp.float32(0.0))
     trained: tuple[Learner, Finished] = jax.lax.fori_loop(first_round, last_round, one_round, (learner, nothing))
@@ -218,35 +214,6 @@ def uniform_shapes(environment: Environment[Any], settings: SAC) -> tuple[tuple[
     blocks = 1 if environment.n_actions is not None else 1 + 2 * environment.n_drawn
     acting = (settings.environments, environment.n_drawn + n_uniforms(environment) + environment.noise_size)
     return acting, (settings.gradient_steps, blocks, settings.batch)
-
-
-def _act(
-    environment: EpisodeLimit[Any],
-    settings: SAC,
-    learner: Learner,
-    simulator: NeuronSimulator | None,
-    written: Int[Array, ""],
-    uniforms: Float[Array, "environments noise"],
-    reset_key: PRNGKeyArray,
-) -> tuple[Learner, Finished]:
-    """One iteration of every environment, stored in the replay; ended episodes restart."""
-    state = critic_state(environment, learner.episodes)
-    action, exploration, noise = choose_actions(environment, learner, state[:, :-1], uniforms)
-    after = jax.vmap(environment.advance, (0, 0, 0, None))(noise, learner.episodes, action, simulator)
-    ended = jnp.logical_or(*after.ended)
-    reward = net_reward(learner.episodes, after)
-    reward = shaped(environment.robot, settings, learner.episodes.robot, after.robot, reward, ended)
-    rows = pack_transitions(settings, state, critic_state(environment, after), action, reward, ended)
-
-    returns = learner.returns + after.reward
-    started = jax.vmap(environment.reset)(jax.random.split(reset_key, settings.environments))
-    learner = learner._replace(
-        replay=remember(learner.replay, rows, written % settings.replay),
-        episodes=jax.tree.map(lambda new, old: jax.vmap(jnp.where)(ended, new, old), started.carried, after.carried),
-        returns=jnp.where(ended, 0.0, returns),
-        exploration=count_ended(exploration, ended, net_return(returns, after)),
-    )
-    return learner, count_finished(exploration, ended, returns)
 
 
 def shaped(
@@ -279,21 +246,13 @@ def choose_actions(
     learner: Learner,
     observation: Float[Array, "environments observations"],
     uniforms: Float[Array, "environments uniforms"],
-) -> tuple[Array, Exploration, Float[Array, "environments noise"]]:
-    """The actions of an iteration, the exploration after them, and the remaining uniforms for the environments."""
+) -> tuple[Learner, Array, Float[Array, "environments noise"]]:
+    """The learner after exploring, the actions of a round, and the remaining uniforms for the environments."""
     n_drawn = environment.n_drawn
     n_before = n_drawn + n_uniforms(environment)
     action = draw_action(environment, learner.trained.actor, observation, uniforms[:, :n_drawn])
     action, exploration = explore(environment, learner.exploration, action, uniforms[:, n_drawn:n_before])
-    return action, exploration, uniforms[:, n_before:]
-
-
-def count_finished(
-    exploration: Exploration, ended: Bool[Array, " environments"], returns: Float[Array, " environments"]
-) -> Finished:
-    """The episodes that ended in an iteration, without those in which actions were held."""
-    alone = ended & ~exploration.was_held
-    return Finished(jnp.sum(alone, dtype=jnp.float32), jnp.sum(jnp.where(alone, returns, 0.0)))
+    return learner._replace(exploration=exploration), action, uniforms[:, n_before:]
 
 
 def critic_state(environment: Environment[Any], episodes: State) -> Float[Array, "environments state"]:
@@ -302,17 +261,45 @@ def critic_state(environment: Environment[Any], episodes: State) -> Float[Array,
     return jnp.concatenate([jax.vmap(environment.observe)(episodes) / environment.scales, left], axis=1)
 
 
+def end_round(
+    settings: SAC,
+    learner: Learner,
+    index: Int[Array, ""],
+    rows: Float[Array, "environments row"],
+    after: State,
+    ended: Bool[Array, " environments"],
+    episodes: State,
+) -> tuple[Learner, Finished]:
+    """Store a round's transitions (`rows`), and count the episodes that ended in it; all go on from `episodes`."""
+    returns = learner.returns + after.reward
+    alone = ended & ~learner.exploration.was_held
+    learner = learner._replace(
+        replay=remember(learner.replay, rows, index * settings.environments % settings.replay),
+        episodes=episodes,
+        returns=jnp.where(ended, 0.0, returns),
+        exploration=count_ended(learner.exploration, ended, net_return(returns, after)),
+    )
+    return learner, Finished(jnp.sum(alone, dtype=jnp.float32), jnp.sum(jnp.where(alone, returns, 0.0)))
+
+
 def learn(
     environment: Environment[Any],
     settings: SAC,
     learner: Learner,
-    available: Int[Array, ""],
+    index: Int[Array, ""],
     uniforms: Float[Array, "gradient_steps blocks batch"],
 ) -> Learner:
-    """Take `settings.gradient_steps` gradient steps on transitions drawn from the replay."""
+    """Take `settings.gradient_steps` gradient steps after round `index`, and average the deployed actor.
+
+    Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824), whose window grows with the training: the
+    quality of the last actor depends on luck in its last few updates; that of the average does not. With k the
+    averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average); the first actor is taken
+    whole.
+    """
     adam = _adam(settings)
     n_drawn, is_continuous = environment.n_drawn, environment.n_actions is None
     paid = entropy_factor(learner.exploration)
+    available = jnp.minimum(index * settings.environments + settings.environments, settings.replay)
 
     def losses(trained: Parameters, targets: Network, batch: Batch, noise: Array) -> Float[Array, ""]:
         if is_continuous:
@@ -332,19 +319,9 @@ def learn(
     (trained, targets, optimiser), _ = jax.lax.scan(
         update, (learner.trained, learner.targets, learner.optimiser), uniforms
     )
-    return learner._replace(trained=trained, targets=targets, optimiser=optimiser)
-
-
-def average(settings: SAC, deployed: Network, actor: Network, index: Int[Array, ""]) -> Network:
-    """Polynomial-decay averaging (Shamir and Zhang 2013, arXiv:1212.1824), whose window grows with the training.
-
-    The quality of the last actor depends on luck in its last few updates; that of the average does not. With k the
-    averaging exponent and t the rounds done: average += (k + 1) / (t + k) (actor - average); the first actor is taken
-    whole.
-    """
     rate = (settings.averaging_exponent + 1.0) / (index + 1.0 + settings.averaging_exponent)
-    moved: Network = jax.tree.map(lambda average, new: average + rate * (new - average), deployed, actor)
-    return moved
+    deployed = jax.tree.map(lambda average, new: average + rate * (new - average), learner.deployed, trained.actor)
+    return learner._replace(trained=trained, deployed=deployed, targets=targets, optimiser=optimiser)
 
 
 def _adam(settings: SAC) -> optax.GradientTransformation:

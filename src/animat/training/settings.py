@@ -32,10 +32,9 @@ class SAC:
 
     Attributes:
         environments: episodes that one policy runs in parallel.
-        gradient_steps: gradient steps per iteration of all environments; gradient_steps / environments is the replay
-            ratio.
+        gradient_steps: per iteration of all environments; gradient_steps / environments is the replay ratio.
         batch: transitions per gradient step.
-        replay: number of transitions stored; the oldest are overwritten first.
+        replay: number of transitions stored, a multiple of environments; the oldest are overwritten first.
         hidden: width of each of the two hidden layers of actor and critics.
         learning_rate: Adam's learning rate, for actor, critics and alpha.
         discount: gamma.
@@ -48,8 +47,7 @@ class SAC:
         entropy_nats: target entropy of a continuous action, per command.
 
     Raises:
-        InvalidArgument: for a count below 1 or above its limit, a rate or share outside its range, or a replay that is
-            not a multiple of the environments.
+        InvalidArgument: for a number outside its range.
     """
 
     # At these limits a group of five policies takes some gigabytes.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_type_hints
 
 import numpy as np
-from pydantic import BeforeValidator, Field, InstanceOf
+from pydantic import BeforeValidator, Field, InstanceOf, PlainValidator
 
 from animat.coding.decoder import expect_one_command
 from animat.coding.electrode_pulses import expect_electrode_pulses
@@ -17,7 +17,7 @@ from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument, shown
 from animat.goals.robot import body_and_goal, without_goal
 from animat.neurons.timeline import SimulatorTimeline
-from animat.records import Number, Positive, Whole, read_record
+from animat.records import Flag, Number, Positive, Seed, Whole, read_record
 from animat.registry import is_ours
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
@@ -62,19 +62,17 @@ def _mapping_named(name: str) -> Mapping:
     return mapping_named(name)
 
 
-_EXPECTED: dict[str, Any] = {
-    "duration_min": Positive | None,
-    "commands": Annotated[
-        tuple[Annotated[Number, Field(ge=-1, le=1)], ...],
-        BeforeValidator(lambda commands: commands.tolist() if isinstance(commands, np.ndarray) else commands),
-    ]
-    | None,
-    "algorithm": InstanceOf[SAC],
-    "lessons": tuple[InstanceOf[Lesson], ...],
-    "assess": Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None,
-    "pulse_cost": PulseCost,
-}
-"""The types expected of some fields."""
+def _expect_shadowing(value: Any) -> Any:
+    # Not as a union, whose error would name one of the two types only.
+    if not isinstance(value, bool) and value != "drawn":
+        raise ValueError(f"expected True, False or 'drawn', got {shown(value)}")
+    return value
+
+
+Commands = Annotated[
+    tuple[Annotated[Number, Field(ge=-1, le=1)], ...],
+    BeforeValidator(lambda commands: commands.tolist() if isinstance(commands, np.ndarray) else commands),
+]
 
 
 @dataclass(frozen=True)
@@ -111,40 +109,33 @@ class Training:
 
     robot: _Named[Robot[Any]] = _Named(robot_named)
     mapping: _Named[Mapping | None] = _Named(_mapping_named)
-    policies: int = 10
-    iterations: int = 800_000
-    seed: int = 1
-    shadowing: Shadowing = True
-    duration_min: float | None = None
+    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
+    iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] = 800_000
+    seed: Seed = 1
+    shadowing: Annotated[Shadowing, PlainValidator(_expect_shadowing)] = True
+    duration_min: Positive | None = None
     percentiles: Percentiles = "moving"
     delivery: Delivery = "chosen"
-    neural_observation: bool = False
-    commands: tuple[float, ...] | None = None
-    algorithm: SAC = field(default_factory=SAC)
-    lessons: tuple[Lesson, ...] = ()
-    assess: int | None = None
-    pulse_cost: float = 0.0
+    neural_observation: Flag = False
+    commands: Commands | None = None
+    algorithm: InstanceOf[SAC] = field(default_factory=SAC)
+    lessons: tuple[InstanceOf[Lesson], ...] = ()
+    assess: Annotated[Whole, Field(ge=1, le=MOST_EPISODES)] | None = None
+    pulse_cost: PulseCost = 0.0
 
     def __post_init__(self) -> None:
         for what, kind in (("robot", Robot), ("mapping", Mapping)):
             value: Any = getattr(self, what)
             if not isinstance(value, kind) and (what, value) != ("mapping", None):
                 raise InvalidArgument(f"{what}: expected a {what} or the name of one, got {shown(value)}")
-        for name, most in (("policies", MOST_POLICIES), ("iterations", MOST_ITERATIONS), ("seed", 2**32 - 1)):
-            number: Any = getattr(self, name)
-            least = 0 if name == "seed" else 1
-            if not isinstance(number, int | np.integer) or isinstance(number, bool) or not least <= number <= most:
-                raise InvalidArgument(f"{name}: expected a whole number from {least} to {most}, got {shown(number)}")
-            object.__setattr__(self, name, int(number))
-        for name, expected in _EXPECTED.items():
-            # The converted value: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
-            object.__setattr__(self, name, read_record(expected, getattr(self, name), name))
+        for name, expected in get_type_hints(Training, include_extras=True).items():
+            if name not in ("robot", "mapping"):
+                # The converted value: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
+                vars(self)[name] = read_record(expected, getattr(self, name), name)
         if self.commands is not None:
             if not self.commands:
                 raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
             expect_one_command(self.robot.name, self.robot.n_commands)
-        if not isinstance(self.neural_observation, bool):
-            raise InvalidArgument(f"neural_observation: expected True or False, got {shown(self.neural_observation)}")
         if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
         expect_lessons(self.lessons, self.robot, draws_recordings=self.shadowing == "drawn")
@@ -158,15 +149,6 @@ class Training:
             raise InvalidArgument("shadowing: expected a mapping with 'drawn', got none")
         if self.is_varied and isinstance(self.robot, HostRobot):
             raise InvalidArgument(f"robot: expected one stepped by JAX for assessments, got {self.robot.name}")
-        for name, allowed in (
-            ("shadowing", (True, False, "drawn")),
-            ("percentiles", get_args(Percentiles)),
-            ("delivery", get_args(Delivery)),
-        ):
-            if getattr(self, name) not in allowed or not isinstance(getattr(self, name), bool | str):
-                raise InvalidArgument(
-                    f"{name}: expected one of {', '.join(map(str, allowed))}, got {getattr(self, name)!r}"
-                )
 
     def register(self) -> None:
         """Register its robot and its mapping in this process, so that policies can be loaded here."""
@@ -218,11 +200,7 @@ class Training:
         return NeuralObservation(environment) if self.neural_observation else environment
 
     def environment_on(self, timeline: SimulatorTimeline | None) -> Environment[Any]:
-        """The environment for a culture's simulators, including the costs of trials, if any.
-
-        Raises:
-            UnusableData: for a pulse cost with conditions whose electrodes are unknown.
-        """
+        """The environment for a culture's simulators, including the costs of trials, if any."""
         environment = self.environment(0 if timeline is None else len(timeline.conditions))
         if timeline is None or not self.pulse_cost:
             return environment

@@ -1,7 +1,6 @@
 """An environment whose episodes are drawn from ranges of the robot's parameters, its starts, and the recordings.
 
-The ranges are arrays, traced like the simulator. A new lesson changes data, not code: nothing is recompiled, and
-policies that are trained side by side can be at different lessons.
+The ranges are arrays, traced like the simulator: for another lesson nothing is recompiled.
 """
 
 from __future__ import annotations
@@ -31,13 +30,7 @@ Kind = TypeVar("Kind", bound=Robot[Any])
 
 @dataclass(frozen=True)
 class Varying:
-    """What varies in any lesson of a training; static, as the compiled program depends on it.
-
-    Attributes:
-        parameters: names of the robot's parameters.
-        starts: names of numbers of its state.
-        recordings: whether each episode draws its simulator.
-    """
+    """What varies in any lesson of a training; static, as the compiled program depends on it."""
 
     parameters: tuple[str, ...]
     starts: tuple[str, ...]
@@ -45,13 +38,7 @@ class Varying:
 
 
 class Ranges(NamedTuple):
-    """The low and the high end of whatever varies, in the order of `Varying`.
-
-    Attributes:
-        parameters: ranges of the robot's parameters.
-        starts: ranges of numbers of its state; NaN: as the robot's reset sets them.
-        recordings: the first and the last row of the simulators.
-    """
+    """The low and the high end of whatever varies, in the order of `Varying`; a start of NaN is as `reset` sets it."""
 
     parameters: Float[Stored, "*policies 2 parameters"]
     starts: Float[Stored, "*policies 2 starts"]
@@ -80,11 +67,7 @@ class Varied(Wrapper[RobotState]):
     """Draws what varies at each reset; the episode keeps it until its end, even if the ranges change.
 
     Where recordings vary, `simulator` is a stack of simulators, one per recording. `State.info` holds the `parameters`
-    drawn, and the row of the `recording`.
-
-    Attributes:
-        varying: what varies.
-        ranges: the ranges; may be traced.
+    drawn, and the row of the `recording`. The ranges may be traced.
     """
 
     varying: Varying
@@ -135,10 +118,7 @@ class Varied(Wrapper[RobotState]):
 
 
 def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
-    """The robot with changed parameters, which may be traced: created without its checks, which need numbers.
-
-    A goal stays unchanged, in the units and scales of the original robot.
-    """
+    """The robot with changed parameters, which may be traced: created without its checks; a goal stays unchanged."""
     if isinstance(robot, RobotWithGoal):
         with_goal = copy(robot)
         object.__setattr__(with_goal, "robot", with_parameters(robot.robot, values))
@@ -150,11 +130,7 @@ def with_parameters(robot: Kind, values: Mapping[str, Any]) -> Kind:
 
 
 def expect_varied(robot: Robot[Any], varying: Varying) -> None:
-    """Refuse what cannot vary in this robot, by tracing it.
-
-    Raises:
-        InvalidArgument: for a parameter that must be known at compile time, or a name that the state does not have.
-    """
+    """Refuse what cannot vary in this robot, by tracing it."""
     state = jax.eval_shape(without_goal(robot).reset, jax.random.key(0))
     known = [name for name in getattr(state, "_fields", ()) if _is_number(getattr(state, name))]
     for name in varying.starts:
