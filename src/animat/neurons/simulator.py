@@ -25,8 +25,7 @@ LARGEST_BINS = 10_000
 """Most bins of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
 
 PERCENTILES = tuple(range(0, 101, 10))
-"""The percentiles of the pooled non-burst responses that a simulator carries: P0 (smallest), P10, ..., P100 (largest).
-"""
+"""The percentiles of the pooled non-burst responses that a simulator carries."""
 
 
 class Answer(NamedTuple):
@@ -163,11 +162,7 @@ class EmpiricalSimulator(NeuronSimulator):
 
 
 def check_binning(bins: int, range_hz: float | None) -> None:
-    """Check the bins of a histogram before there is anything to fit it to.
-
-    Raises:
-        InvalidArgument: for fewer than one or more than `LARGEST_BINS` bins, or a range that is not positive.
-    """
+    """Raise InvalidArgument for a number of bins or a range that no histogram can have."""
     if not 1 <= bins <= LARGEST_BINS:
         raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS:,}, got {bins}; only histogram simulators have bins")
     if range_hz is not None and not 0 < range_hz < np.inf:
