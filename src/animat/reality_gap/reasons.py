@@ -33,14 +33,7 @@ LEAST_COMMAND = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Data on policies whose measured return differs from the predicted one.
-
-    Attributes:
-        session: responses to the policies.
-        calibration: of the predicting recording.
-        predicted: of all policies together.
-        gap: the sign of their gap: -1 if less was measured.
-    """
+    """Data on policies, all together, whose measured return differs from the predicted one; `gap`: -1 if it is less."""
 
     session: SessionResponses
     calibration: Calibration
@@ -137,8 +130,8 @@ def trend(evidence: Evidence) -> Finding | None:
     if not changes:
         return None
     message = (
-        f"the culture changed over the session's {session.span_min:.0f} min: responses {', '.join(changes)} (of their "
-        f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
+        f"the culture changed over the session's {np.ptp(time_s) / 60:.0f} min: responses {', '.join(changes)} (of "
+        f"their mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
     return Finding("trend", "note", message, most)
 

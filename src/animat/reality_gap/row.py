@@ -20,7 +20,6 @@ class Row:
     """A row of the table.
 
     Attributes:
-        name, meaning: of the agent.
         predicted: returns on the simulator, shape (episodes,).
         bootstrap_means: mean return on each bootstrap simulator, shape (bootstraps,).
         measured: returns of complete episodes on the culture, shape (episodes,).

@@ -47,12 +47,11 @@ class SessionResponses:
 
     Attributes:
         responses: in order of time, on the session's clock, with everything that was presented between them.
-        episode: index in `returns` of each response's episode, shape (responses,).
-        late_s: lateness of its pulses, shape (responses,).
-        moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
-        command: with which it moved the robot, shape (responses,); several commands separately, shape (responses,
-            commands). NaN if it did not move the robot.
-        returns: of the episodes, in order of time, shape (episodes,).
+        episode: index in `returns` of each response's episode.
+        late_s: lateness of its pulses.
+        moved: whether it moved the robot, and was not repeated or skipped as a burst.
+        command: with which it moved the robot; NaN if it did not.
+        returns: of the episodes, in order of time.
     """
 
     responses: Responses
@@ -72,19 +71,9 @@ class SessionResponses:
         np.add.at(total, at, self.command[moved])
         return CommandSums(presented, total)
 
-    @property
-    def span_min(self) -> float:
-        """Minutes from the first response to the last."""
-        time_s = self.responses.time_s
-        return 0.0 if time_s is None or not len(time_s) else float(time_s[-1] - time_s[0]) / 60
-
 
 def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> SessionResponses:
-    """Read the responses to policies from the log of a session that has ended.
-
-    Args:
-        policies: their names among the agents.
-    """
+    """Read the responses to policies, by their names, from the log of a session that has ended."""
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
     place = {each.number: row for row, each in enumerate(whole)}
     presented: list[tuple[int, float, bool, float, float]] = []
