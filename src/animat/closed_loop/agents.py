@@ -31,7 +31,6 @@ class AnyCondition:
     n_conditions: int
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """A random condition."""
         return int(rng.integers(self.n_conditions))
 
 
@@ -42,7 +41,6 @@ class OneCondition:
     condition: int
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The condition."""
         return self.condition
 
 
@@ -53,7 +51,6 @@ class Greedy:
     policy: Any
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The most probable condition."""
         return self.policy.act_greedily(observation)
 
 
@@ -72,7 +69,6 @@ class ActorController:
         self.act(np.zeros(len(environment.observation_spec)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The condition, chosen as on the simulator."""
         # From a generator of its own, so that the loop's other draws do not depend on the actor.
         uniforms = rng.spawn(1)[0].random(self._environment.n_drawn, np.float32)
         return int(_decided(self._environment, self._actor, np.asarray(observation, np.float32), uniforms))
@@ -98,15 +94,6 @@ class InTurn:
 
     by_name: Mapping[str, Controller]
 
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The choice of the first; the loop calls each controller in its turn (`Agent.acting`)."""
-        return self.acting(0).act(observation, rng)
-
-    def acting(self, turn: int) -> Controller:
-        """The controller whose turn it is."""
-        controllers = tuple(self.by_name.values())
-        return controllers[turn % len(controllers)]
-
 
 @dataclass(frozen=True, eq=False)
 class Agent:
@@ -128,7 +115,7 @@ class Agent:
 
     name: str
     meaning: str
-    controller: Controller
+    controller: Controller | InTurn
     delivery: Delivered = "chosen"
     calibrates: bool = True
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
@@ -143,7 +130,10 @@ class Agent:
 
     def acting(self, turn: int) -> Controller:
         """The controller of the agent's episode number `turn`, counted from 0."""
-        return self.controller.acting(turn) if isinstance(self.controller, InTurn) else self.controller
+        if not isinstance(self.controller, InTurn):
+            return self.controller
+        controllers = tuple(self.controller.by_name.values())
+        return controllers[turn % len(controllers)]
 
 
 def random_control(n_conditions: int) -> Agent:
@@ -159,11 +149,7 @@ def agent_of(
 ) -> Agent:
     """A control of the simulator as an agent of a closed loop, in which policies take turns.
 
-    Args:
-        control: of the simulator.
-        environment: robot and mapping.
-        policies: by name.
-        responses_hz: non-burst responses of all conditions, for random spikes.
+    Random spikes are drawn from `responses_hz`, the non-burst responses of all conditions.
 
     Raises:
         InvalidArgument: for a control whose commands do not come from responses, which no loop can run.
@@ -173,7 +159,7 @@ def agent_of(
             f"control: expected one whose commands come from responses, got {control.name}, which only a simulator runs"
         )
     actor = control.actor
-    controller: Controller
+    controller: Controller | InTurn
     if isinstance(actor, Networks):
         controller = InTurn(dict(policies))
     elif isinstance(actor, Uniform):
@@ -200,10 +186,6 @@ def interleave(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
 
     For each agent the session is divided into as many equal parts as it has episodes, with one episode in each part. If
     all have equally many, they act in rounds.
-
-    Args:
-        episodes: of each agent.
-        rng: draws the places within the parts.
     """
     places = [(part + rng.random()) / n for n in episodes for part in range(n)]
     agents = np.repeat(np.arange(len(episodes)), episodes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, 
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -20,13 +22,14 @@ import numpy as np
 from animat.closed_loop.agents import Agent, InTurn, interleave
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
-from animat.closed_loop.interrupts import stop_on_signals
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.outline import Outline
 from animat.closed_loop.session import Session, expect_no_session
 from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.closed_loop.tick import Ending
-from animat.closed_loop.timing import Clock, WallClock, drop_real_time_priority, real_time_priority
+from animat.closed_loop.timing import Clock, drop_real_time_priority, real_time_priority
+from animat.ctrl_c import KILLS, handled
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
@@ -74,8 +77,6 @@ def run_session(
 
     Args:
         culture: open; it stays open.
-        loop: the settings.
-        agents: of the session.
         folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line per tick.
         episodes: of each agent; one number, or one for each.
         seed: decides every random draw, except what the culture does.
@@ -100,15 +101,14 @@ def run_session(
     stop_file = Path(folder) / STOP_FILE
     if stop_file.exists():
         raise InvalidArgument(f"{stop_file}: expected none yet, as it ends a session: remove it first")
-    account, progress = account or Account(), progress or Silent()
     turns = _put_sources_first(interleave(planned, np.random.default_rng([seed, 20])), agents)
-    driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed, stop_file)
+    driver = Driver(culture, loop, agents, turns, account or Account(), clock or Clock(), seed, stop_file)
     file = Path(folder) / LOG_FILE
     # As it is read back from the log.
-    header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed, predicted or {})))
+    header = json.loads(json.dumps(_header(driver, predicted or {})))
     read_header(file, header)
     with closing(LogWriter(file, header)) as log:
-        ending = _Supervisor(culture, loop, driver, log, progress, len(turns)).run()
+        ending = _Supervisor(driver, log, progress or Silent()).run()
         session = Session(file.parent, log.written(), ending)
         try:
             session.write()
@@ -122,28 +122,21 @@ def run_session(
 
 
 class _Supervisor:
-    def __init__(
-        self,
-        culture: Culture,
-        loop: Loop,
-        driver: Driver,
-        log: LogWriter,
-        progress: Progress,
-        episodes: int,
-    ) -> None:
-        self._culture, self._loop, self._driver = culture, loop, driver
-        self._log, self._progress, self._episodes = log, progress, episodes
-        self._synced = time.monotonic()
+    def __init__(self, driver: Driver, log: LogWriter, progress: Progress) -> None:
+        self._driver, self._culture, self._loop = driver, driver.culture, driver.loop
+        self._log, self._progress, self._synced = log, progress, time.monotonic()
+        self._outline = Outline()
         self._ending: Ending | None = None
-        self._logged_request = self._logged_answer = -1
+        self._logged_request = -1
         self._not_halted: str | None = None
-        self._left_out = culture.left_out
+        self._left_out = driver.culture.left_out
 
     def run(self) -> Ending:
         """Start the loop and supervise it until its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
         with ExitStack() as stack:
-            stack.enter_context(stop_on_signals(self._stop_for_person))
+            # They request an end instead of interrupting the loop.
+            stack.enter_context(handled((signal.SIGINT, *KILLS), lambda *_: self._stop_for_person()))
             if gc.isenabled():
                 # A collection can take 50 ms, and the loop makes no cycles.
                 stack.callback(gc.enable)
@@ -207,8 +200,20 @@ class _Supervisor:
                 return Ending(
                     "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: abandoned"
                 )
-            self._progress.update(driver.standing.episodes, self._episodes, driver.standing.note())
+            self._report()
         return None
+
+    def _report(self) -> None:
+        """Report how many episodes are over, the last return, and the agents' means; `"warm-up"` before any."""
+        episode, returns = self._outline.moving, self._outline.returns
+        done: float = sum(map(len, returns.values()))
+        note = "warm-up"
+        if episode is not None:
+            done += 0 if episode.is_whole else min(1.0, episode.iterations / self._loop.robot.episode_limit)
+            note = f"{episode.agent}: return {episode.total:.1f}{'' if episode.is_whole else ' so far'}"
+        if returns:
+            note += f"; means: {', '.join(f'{name} {fmean(of):.1f}' for name, of in returns.items())}"
+        self._progress.update(done, len(self._driver.turns), note)
 
     def _write(self) -> None:
         records = self._driver.records
@@ -216,8 +221,7 @@ class _Supervisor:
         for number in range(len(records)):
             self._log.append(records[0])
             # Removed only once written, so that a full disk loses no record that could be written later.
-            written = records.popleft().fields
-            self._logged_answer = written["stretch"] if written["kind"] == "seen" else self._logged_answer
+            self._outline.add(records.popleft().fields)
             if number % _BATCH == _BATCH - 1:
                 # A pause of 0 would not yield the processor to the loop's thread on a single core.
                 time.sleep(_PAUSE_S)
@@ -239,7 +243,7 @@ class _Supervisor:
             # Read before writing: if the robot answers just now, its finished tick is among the written records.
             unfinished = self._driver.unfinished
             self._write()
-            if unfinished is not None and unfinished.fields["stretch"] > self._logged_answer:
+            if unfinished is not None and unfinished.fields["stretch"] > self._outline.answered:
                 self._log.append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
             fields = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
@@ -274,16 +278,8 @@ class _Supervisor:
             self._not_halted = None
 
 
-def _header(
-    culture: Culture,
-    loop: Loop,
-    agents: Sequence[Agent],
-    turns: Sequence[int],
-    account: Account,
-    seed: int,
-    predicted: Mapping[str, Interval],
-) -> dict[str, Any]:
-    channels = culture.channels
+def _header(driver: Driver, predicted: Mapping[str, Interval]) -> dict[str, Any]:
+    culture, loop, agents, channels = driver.culture, driver.loop, driver.agents, driver.culture.channels
     predictions = {name: {"mean": r.value, "low": r.low, "high": r.high} for name, r in predicted.items()}
     return {
         "kind": "header",
@@ -296,12 +292,12 @@ def _header(
         "provenance": culture.provenance,
         "limits": asdict(culture.limits),
         # Including what was spent before the session.
-        "account": account.to_dict(),
+        "account": driver.account.to_dict(),
         "loop": loop.to_dict(),
         "observed": observed_columns(loop.robot),
         "agents": [_agent_to_dict(agent) for agent in agents],
-        "turns": [agents[turn].name for turn in turns],
-        "seed": seed,
+        "turns": [agents[turn].name for turn in driver.turns],
+        "seed": driver.seed,
         **({"predicted": predictions} if predictions else {}),
     }
 
@@ -334,11 +330,7 @@ def _agent_to_dict(agent: Agent) -> dict[str, Any]:
 
 
 def check_episodes(name: str, episodes: int) -> None:
-    """Refuse no episodes, or more than a session can plan: all turns are drawn before the first episode.
-
-    Raises:
-        InvalidArgument: under the name of the argument or option.
-    """
+    """Raise InvalidArgument for no episodes, or more than a session can plan: all turns are drawn before the first."""
     if not 1 <= episodes <= MOST_EPISODES:
         expected = "at least 1" if episodes < 1 else f"at most {MOST_EPISODES:,}"
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(episodes)}")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.header import Header, read_header
-from animat.closed_loop.log import Log, Records, read_log
+from animat.closed_loop.log import Log, Records, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
 from animat.closed_loop.tick import Ending, Tick, TickTable
@@ -39,13 +39,7 @@ class Ticks(Iterable[Tick]):
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A session as its log describes it; long parts are read on demand.
-
-    Attributes:
-        folder: of the session.
-        log: everything that was written.
-        ending: how it ended.
-    """
+    """A session as its log describes it; long parts are read on demand."""
 
     folder: Path
     log: Log
@@ -96,16 +90,12 @@ class Session:
     def write(self, progress: Progress | None = None) -> None:
         """Write the ticks as a table, and then the recording: if the recording exists, both do.
 
-        Args:
-            progress: updated with the number of records read.
-
         Raises:
             InvalidFile: for an inconsistent log, or if a file cannot be written.
         """
-        header = self._header
         with expect_session_log(self.folder / LOG_FILE):
             with atomic_write(self.ticks_file) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-                table = TickTable(file, header.conditions, header.observed, header.readouts)
+                table = TickTable(file, self._header)
                 # Keep what was read, for `outline` and `recording`.
                 vars(self)["_data"] = data = self._collect(table, progress)
             recording = data.recording_without_spikes(self.ending)
@@ -172,11 +162,10 @@ def read_session(path: str | os.PathLike[str]) -> Session:
 
 
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
-    """Make the folder of a new session; the error for an existing session says what to do with it.
+    """Make the folder of a new session.
 
     Raises:
-        InvalidArgument: if the folder holds a session.
-        Mismatch: if it holds work of another kind, such as recordings.
+        InvalidArgument, Mismatch: if it holds a session, saying what to do with it, or other work.
         InvalidFile: if it is a file, or cannot be made or written to.
     """
     folder = Path(folder)
@@ -195,11 +184,7 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
 
 
 def recover_session(path: str | os.PathLike[str], progress: Progress | None = None) -> Session:
-    """Read a session whose program was killed, and write its missing recording and table.
-
-    Args:
-        path: of its folder or its log.
-        progress: updated with the number of records read.
+    """Read a session, from its folder or its log, whose program was killed, and write its missing recording and table.
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
@@ -221,11 +206,8 @@ def _expect_no_loss(session: Session) -> None:
     """Raise if the existing table has more ticks than a damaged log: overwriting it would lose ticks."""
     if not session.log.lost_bytes or not session.ticks_file.exists():
         return
-    try:
-        with session.ticks_file.open("rb") as table:
-            written = sum(1 for _ in table) - 1
-    except OSError as error:
-        raise InvalidFile(f"{session.ticks_file}: cannot be read: {error.strerror or error}") from error
+    with open_file(session.ticks_file) as table:
+        written = sum(1 for _ in table) - 1
     if written > session.outline.ticks:
         raise Mismatch(
             f"{session.ticks_file}: expected no more ticks than the log has, which is damaged after "

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self, TextIO
 
+from animat.closed_loop.header import Header
+
 Handled = Literal["used", "repeated", "skipped", "warm-up", "unfinished"]
 EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
 
@@ -74,10 +76,9 @@ class Tick:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """A tick from its `vars`, read back from JSON."""
-        # Older logs have neither readouts nor neurons.
-        known: dict[str, Any] = {"readout_hz": (), "neurons": (), **data}
-        known = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
-        return cls(**{each.name: known[each.name] for each in fields(cls)})
+        # Older logs have neither readouts nor neurons, which are empty then.
+        known = {each.name: data[each.name] for each in fields(cls) if each.name in data}
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in known.items()})
 
 
 @dataclass(frozen=True)
@@ -112,47 +113,37 @@ TAIL |= {name: name for name in ("late_s", "decided_s", "wall_s")}
 
 
 class TickTable:
-    """Writes ticks to a CSV file, for users of a spreadsheet or pandas without this package.
+    """Writes ticks to a CSV file, one line each, for users of a spreadsheet or pandas without this package.
 
-    One line per tick, with all digits; `Tick` describes the columns.
+    All digits are written; `Tick` describes the columns. Unknown values are empty cells: the command and the
+    observation if the response did not move the robot. Flags are 0 or 1; patterns and times of several pulses are
+    separated by spaces.
 
-    Unknown values are empty cells: the command and the observation if the response did not move the robot. Flags are 0
-    or 1; patterns and times of several pulses are separated by spaces.
+    Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`.
 
     Args:
         file: open for text, without translation of line ends.
-        conditions: their names, for `chosen` and `delivered`.
-        observed: the columns of the robot's observation.
-        readouts: names of groups of channels, each with a column of its `rate_hz` and, if there are several, of its
-            `command`; none where all channels are read as one.
     """
 
-    def __init__(
-        self, file: TextIO, conditions: Sequence[str], observed: Sequence[str], readouts: Sequence[str] = ()
-    ) -> None:
-        self._writer = csv.writer(file, lineterminator="\n")
-        self._conditions, self._n_observed, self._n_readouts = conditions, len(observed), len(readouts)
-        names = [name.replace(" ", "_") for name in readouts]
-        names = list(readouts) if len(set(names)) < len(names) else names
+    def __init__(self, file: TextIO, header: Header) -> None:
+        self._writer, self._header = csv.writer(file, lineterminator="\n"), header
+        names = [name.replace(" ", "_") for name in header.readouts]
+        names = list(header.readouts) if len(set(names)) < len(names) else names
         commands = [f"command_{name}" for name in names] if len(names) > 1 else ["command"]
         head = [name for column in HEAD for name in (commands if column == "command" else [column])]
-        self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))
+        self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *header.observed, *TAIL))
 
     def add(self, tick: Mapping[str, Any]) -> None:
-        """Write a tick, as in the fields of its record, with its `electrode_pulses`.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
-        command = tick["command"]
+        """Write a tick, as in the fields of its record, with its `electrode_pulses`."""
+        command, n_readouts = tick["command"], len(self._header.readouts)
         texts = {name: " ".join(map(str, tick[name])) for name in ("patterns", "pulse_time_s")}
-        texts |= {name: self._conditions[tick[name]] for name in ("chosen", "delivered")}
+        texts |= {name: self._header.conditions[tick[name]] for name in ("chosen", "delivered")}
         flags = {name: int(tick[name]) for name in ("is_burst", "terminated", "truncated")}
         cells = {**tick, **texts, **flags}
         row = [cells[name] for name in HEAD.values()]
-        row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, self._n_readouts)
-        row += tick["readout_hz"] if self._n_readouts else ()
-        row += tick["observation"] or (None,) * self._n_observed
+        row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, n_readouts)
+        row += tick["readout_hz"] if n_readouts else ()
+        row += tick["observation"] or (None,) * len(self._header.observed)
         row += (cells[name] for name in TAIL.values())
         # NaN is not equal to itself.
         self._writer.writerow([value if value == value else None for value in row])
