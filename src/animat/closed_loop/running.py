@@ -185,9 +185,11 @@ class _Supervisor:
 
     def _watch(self, thread: threading.Thread) -> Ending | None:
         """Log and watch while the loop runs; returns why it must be ended from outside, or None if it ended."""
-        driver = self._driver
-        while thread.is_alive():
+        driver, is_running = self._driver, True
+        while is_running:
             thread.join(_POLL_S)
+            # Looked at before writing, so that the last records are written and reported too.
+            is_running = thread.is_alive()
             try:
                 self._write()
             except OSError as error:

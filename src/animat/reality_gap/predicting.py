@@ -106,10 +106,11 @@ def predict(
             progress.update(number, len(acting), control.name)
             episodes = list(side_by_side(run, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
-            commanded = _stacked([CommandSums(each.presented, each.commanded) for each in episodes])
+            presented = np.array([each.presented for each in episodes])
+            total = np.array([each.commanded for each in episodes]).reshape(*presented.shape, -1)
             rows = {control.name: [*range(control.n_actors)]} if number else {name: [i] for i, name in enumerate(names)}
             for name, of in rows.items():
-                each = CommandSums(*(sums[:, of] for sums in commanded)).summed(1)
+                each = CommandSums(presented[:, of], total[:, of]).summed(1)
                 predictions[name] = Prediction(
                     returns[:ROLL_OUTS, of].ravel(),
                     returns[ROLL_OUTS:, of].mean(axis=(1, 2)),
