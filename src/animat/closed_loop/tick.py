@@ -77,8 +77,9 @@ class Tick:
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """A tick from its `vars`, read back from JSON."""
         # Older logs have neither readouts nor neurons, which are empty then.
-        known = {each.name: data[each.name] for each in fields(cls) if each.name in data}
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in known.items()})
+        known: dict[str, Any] = {each.name: data[each.name] for each in fields(cls) if each.name in data}
+        known |= {name: tuple(value) for name, value in known.items() if isinstance(value, list)}
+        return cls(**known)
 
 
 @dataclass(frozen=True)

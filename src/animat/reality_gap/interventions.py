@@ -67,13 +67,16 @@ def intervention_table(
     usual_returns = rows[0].measured
     if not len(usual_returns):
         return ()
-    compared = [("ideal actuator", meaning_of_ideal, False, with_ideal)]
     measured = {row.name: row for row in rows if len(row.measured)}
-    compared += [(name, measured[name].meaning, True, measured[name].measured) for name in MEASURED if name in measured]
-    return (
+    lost = _lost(usual_returns, with_ideal)
+    table = [
         Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
-        *(Intervention(*which, float(returns.mean()), _lost(usual_returns, returns)) for *which, returns in compared),
-    )
+        Intervention("ideal actuator", meaning_of_ideal, False, float(with_ideal.mean()), lost),
+    ]
+    for row in (measured[name] for name in MEASURED if name in measured):
+        lost = _lost(usual_returns, row.measured)
+        table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
+    return tuple(table)
 
 
 def intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str]:
