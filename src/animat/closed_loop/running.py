@@ -69,11 +69,10 @@ def run_session(
     """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
     Whatever happens, `session.log` has every tick except those of the last 0.2 s before a SIGKILL, and the stimuli
-    that were requested and not yet answered. Once this or `recover_session` returns, `session.nwb` is a recording like
-    any other. Unless the plan was completed or the budget spent, the culture is then stopped: it delivers nothing until
-    it is closed and opened again. `ending` says what happened; nothing is raised for it, not even for Ctrl-C and
-    SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An exception of `progress` is raised
-    again, once the culture is stopped and the log is written.
+    that were requested and not yet answered. Unless the plan was completed or the budget spent, the culture is then
+    stopped: it delivers nothing until it is closed and opened again. `ending` says what happened; nothing is raised for
+    it, not even for Ctrl-C and SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An
+    exception of `progress` is raised again, once the culture is stopped and the log is written.
 
     Args:
         culture: open; it stays open.
@@ -86,10 +85,9 @@ def run_session(
         predicted: mean return expected of each agent, with its interval; stored in the log for viewers.
 
     Raises:
-        InvalidArgument: for a culture that is closed or stopped, no agents, an agent that sees the history state in a
-            loop without one, a prediction for an unknown agent, or a folder with a session or a file `STOP`.
-        Mismatch: for conditions on electrodes that the culture cannot stimulate, readouts of electrodes that it does
-            not record, or a folder of other work.
+        InvalidArgument: for a culture, agents, a prediction or a loop that cannot be run, or a folder with a session or
+            a file `STOP`.
+        Mismatch: for electrodes that the culture does not stimulate or record, or a folder of other work.
         InvalidFile: if the folder is a file, or the log cannot be begun.
         UnsafeStimulus: for a pulse beyond the culture's limits.
     """

@@ -1,7 +1,4 @@
-"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response.
-
-The closed loop checks every answer of a backend before using it.
-"""
+"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response."""
 
 from __future__ import annotations
 

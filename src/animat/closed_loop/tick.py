@@ -18,29 +18,22 @@ class Tick:
     """One presentation, its response, and the result. Times are in seconds on the session's clock.
 
     Attributes:
-        number: of the presentation in the session, from 0.
-        agent: whose episode it is.
-        episode: number of the episode in the session, from 0.
+        number, episode: in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
             and the warm-up has -1.
         chosen: the condition that was chosen, by the agent or, in a warm-up, at random.
         delivered: the condition that the culture received; of a silent agent the chosen one, without its pulses.
-        frequency_hz: frequency of the delivered condition.
+        frequency_hz: of the delivered condition.
         patterns: of each pulse, -1 where its electrodes are not one of the culture's patterns; none of a silent agent.
         pulse_time_s: when each pulse really began.
         read_after_s: time of the pulse after which the response was read, or when it would have come.
-        spikes: in the response window.
+        spikes, active_ratio: in the response window, and the share of channels that had any.
         rate_hz: x of all channels; of an agent whose responses are drawn, the drawn one.
         readout_hz: x of each readout, where these are groups of channels; else empty.
-        active_ratio: share of channels that spiked in the window.
-        is_burst: whether `active_ratio` is above the threshold.
         handled: what was done with the response; `"warm-up"` before the robot of an episode moves; `"unfinished"` if
             something went wrong before the robot had moved.
         command: that moved the robot, one for each readout where there are several; None where it was not moved.
-        reward: of the step.
-        observation: after the step.
-        terminated: the task ended by itself.
-        truncated: the episode limit ended it.
+        reward, observation: of the step, and after it.
         late_s: largest lateness of its pulses; 0 within a step of the grid.
         decided_s: from when the data of the previous response window had arrived until this presentation was requested.
         wall_s: the machine's clock at the end, from the start of the session.

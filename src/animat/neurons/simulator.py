@@ -172,10 +172,9 @@ def check_binning(bins: int, range_hz: float | None) -> None:
 def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
     """Fit a histogram per condition to the non-burst responses.
 
-    The paper's bins are equally wide, over a range chosen for its culture. For another culture a bin can hold several
-    percentiles, and the differences between conditions that the mapping uses are lost; if responses fall over hours,
-    they are lost later. So by default the edges are percentiles of the responses: with 20 bins P0, P5, ..., P100 of all
-    conditions together, which keeps the shares on either side of P10, P20, ..., P90.
+    The paper's bins are equally wide, over a range chosen for its culture; for another one, or later, a bin can hold
+    several percentiles, and the differences between conditions that the mapping uses are lost. So by default the edges
+    are percentiles of the responses: with 20 bins P0, P5, ..., P100 of all conditions together.
 
     Args:
         responses: of one recording, every condition with at least one non-burst response.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
 from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
@@ -240,7 +240,6 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         transforms = prediction.transforms()
         distance = distance_from_uniform(transforms)
         series = free_runs(simulator, prediction, FREE_RUNS, rng)
-        lengths = [run_lengths(one, median_hz) for one in series]
         passing = prediction.probability @ (halves.values_hz >= median_hz)
         scores.append(
             Scores(
@@ -250,15 +249,12 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
                 transforms,
                 distance,
                 None if each in (MARGINAL, "memory") else (1 + int(np.sum(distances >= distance))) / (1 + _CHANCES),
-                _band(autocorrelation(series)),
-                _band(np.array([_mean(runs) for runs in lengths])),
-                _band(np.array([shares_lasting(runs) for runs in lengths])),
+                *map(_band, _in_time(series, median_hz)),
                 _by_condition(passing, halves),
             )
         )
-    recorded = recorded_series(halves)
     # At its own median, as a loop's thresholds adapt: drift is reported separately.
-    lasted = run_lengths(recorded, float(np.median(halves.x_hz)))
+    recorded = _in_time(recorded_series(halves)[None], float(np.median(halves.x_hz)))
     conditions = range(len(responses.conditions))
     first = [halves.first_of(c) for c in conditions]
     second = [halves.x_hz[halves.condition == c] for c in conditions]
@@ -268,9 +264,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         tuple(map(len, second)),
         np.array([[np.median(x) for x in half] for half in (first, second)], np.float64),
         _by_condition(halves.x_hz >= median_hz, halves),
-        autocorrelation(recorded),
-        _mean(lasted),
-        shares_lasting(lasted),
+        *(of_one[0] for of_one in recorded),
         tuple(scores),
         kind or default_kind(responses),
         responses.is_blocked,
@@ -341,8 +335,11 @@ def _by_condition(x: Any, halves: Halves) -> Float64[np.ndarray, " conditions"]:
     return np.array([x[halves.condition == c].mean() for c in range(len(halves.whole.conditions))], np.float64)
 
 
-def _mean(runs: Int64[np.ndarray, " runs"]) -> float:
-    return float(runs.mean()) if len(runs) else float("nan")
+def _in_time(series: Float64[np.ndarray, "n trials"], threshold_hz: float) -> tuple[Any, Any, Any]:
+    """The autocorrelation of each series, the mean length of its runs, and the shares that last."""
+    lengths = [run_lengths(one, threshold_hz) for one in series]
+    means = [runs.mean() if len(runs) else np.nan for runs in lengths]
+    return autocorrelation(series), np.array(means), np.array([shares_lasting(runs) for runs in lengths])
 
 
 def _band(x: Float64[np.ndarray, "n *some"]) -> Band:
