@@ -20,8 +20,8 @@ def synthetic_simulator(means_hz: Sequence[float] = MEANS_HZ, *, shape: float = 
         x | condition c  ~  Gamma(shape, means_hz[c] / shape)
 
     With the defaults, a response passes the pooled median (38.7 Hz) with probability 0.22, 0.38, 0.53, 0.64 and 0.74.
-    The histogram has the paper's bins: 20 from 0 to 120 Hz, and responses above it are counted in the last. P0 and P100
-    are not those of the distribution, 0 and infinity, but of the paper's n = 500 responses: 1/(n + 1) and n/(n + 1).
+    The histogram has the paper's 20 bins from 0 to 120 Hz, the last with all above. P0 and P100 are not those of the
+    distribution, 0 and infinity, but of the paper's n = 500 responses: 1/(n + 1) and n/(n + 1).
 
     Args:
         means_hz: mean response to each condition, Hz per channel.

@@ -20,7 +20,6 @@ class Outlook:
     """What is known beforehand of a session's length; minutes are from its start.
 
     Attributes:
-        planned_min: duration of all episodes, as on the simulator.
         drifted_min: time until the recordings' drift has changed P50 by a quarter since the last of them, and a lower
             bound of it; None if the recordings do not determine the drift.
         budget_min: time until the budget of pulses is spent; infinite without one.
