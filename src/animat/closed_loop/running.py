@@ -153,21 +153,18 @@ class _Supervisor:
                 with suppress(Exception):
                     self._end(thread, ending)
                 raise
-            if ending is not None:
-                return self._end(thread, ending)
-            ending = self._ending or Ending("crash", "the loop's thread ended without giving a reason")
-            if ending.by not in ("plan", "budget"):
-                self._halt(ending)
-            return self._finish(ending)
+            return self._end(thread, ending)
 
     def _end(self, thread: threading.Thread, ending: Ending) -> Ending:
-        """Ask a loop that did not end by itself to end, and abandon it if it does not."""
-        self._driver.is_stopped = True
-        self._halt(ending)
-        thread.join(_GRACE_S)
+        """Stop the culture; ask a loop that did not end by itself to end, and abandon it if it does not."""
+        if ending.by not in ("plan", "budget"):
+            self._driver.is_stopped = True
+            self._halt(ending)
         if thread.is_alive():
-            drop_real_time_priority(thread)
-        self._halt(ending)
+            thread.join(_GRACE_S)
+            if thread.is_alive():
+                drop_real_time_priority(thread)
+            self._halt(ending)
         return self._finish(ending)
 
     def _drive(self) -> None:
@@ -181,8 +178,8 @@ class _Supervisor:
             return nullcontext()
         return real_time_priority(inherited=inherited)
 
-    def _watch(self, thread: threading.Thread) -> Ending | None:
-        """Log and watch while the loop runs; returns why it must be ended from outside, or None if it ended."""
+    def _watch(self, thread: threading.Thread) -> Ending:
+        """Log and watch while the loop runs; returns why it ended, or must be ended from outside."""
         driver, is_running = self._driver, True
         while is_running:
             thread.join(_POLL_S)
@@ -201,7 +198,7 @@ class _Supervisor:
                     "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: abandoned"
                 )
             self._report()
-        return None
+        return self._ending or Ending("crash", "the loop's thread ended without giving a reason")
 
     def _report(self) -> None:
         """Report how many episodes are over, the last return, and the agents' means; `"warm-up"` before any."""
