@@ -25,7 +25,6 @@ from animat.closed_loop.agents import (
     ActorController,
     Agent,
     AnyCondition,
-    InTurn,
     OneCondition,
     interleave,
 )
@@ -650,7 +649,7 @@ def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
 
 
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
-    who = InTurn({f"p{i}": OneCondition(i) for i in range(3)})
+    who = {f"p{i}": OneCondition(i) for i in range(3)}
     agents = [RANDOM, Agent("silent", "", who, "silent"), Agent("shuffled", "", who, "shuffled")]
     with FakeCulture() as culture:
         session = run_session(culture, loop_of(), agents, tmp_path, episodes=5)

@@ -84,17 +84,6 @@ def _decided(
     return actor.act(environment, (observation / environment.scales)[None], uniforms[None])[0]
 
 
-@dataclass(frozen=True)
-class InTurn:
-    """Several controllers that take turns, one episode each: a control then represents all policies, not one of them.
-
-    Attributes:
-        by_name: the controllers, in order.
-    """
-
-    by_name: Mapping[str, Controller]
-
-
 @dataclass(frozen=True, eq=False)
 class Agent:
     """An agent, which acts in some of a session's episodes.
@@ -102,7 +91,8 @@ class Agent:
     Attributes:
         name: unique in its session.
         meaning: a short description.
-        controller: chooses the conditions.
+        controller: chooses the conditions; several, by name, take turns, one episode each: a control then represents
+            all policies, not one of them.
         delivery: as for a control (`animat.evaluation.controls.Control`). `"silent"`: spontaneous activity is read in
             place of the response; `"yoked"`: the stimuli of the last whole episode of one of its controllers are
             repeated.
@@ -115,7 +105,7 @@ class Agent:
 
     name: str
     meaning: str
-    controller: Controller | InTurn
+    controller: Controller | Mapping[str, Controller]
     delivery: Delivered = "chosen"
     calibrates: bool = True
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
@@ -130,9 +120,9 @@ class Agent:
 
     def acting(self, turn: int) -> Controller:
         """The controller of the agent's episode number `turn`, counted from 0."""
-        if not isinstance(self.controller, InTurn):
+        if not isinstance(self.controller, Mapping):
             return self.controller
-        controllers = tuple(self.controller.by_name.values())
+        controllers = tuple(self.controller.values())
         return controllers[turn % len(controllers)]
 
 
@@ -159,9 +149,9 @@ def agent_of(
             f"control: expected one whose commands come from responses, got {control.name}, which only a simulator runs"
         )
     actor = control.actor
-    controller: Controller | InTurn
+    controller: Controller | Mapping[str, Controller]
     if isinstance(actor, Networks):
-        controller = InTurn(dict(policies))
+        controller = policies
     elif isinstance(actor, Uniform):
         controller = AnyCondition(environment.n_conditions)
     elif isinstance(actor, Constant):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import Agent, Controller, InTurn
+from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
@@ -145,8 +145,8 @@ class Driver:
         """The conditions that a yoked agent repeats: those of its controllers' newest episode."""
         if agent.delivery != "yoked":
             return []
-        assert isinstance(agent.controller, InTurn)
-        sources = [conditions for name, conditions in self._last_delivered.items() if name in agent.controller.by_name]
+        assert isinstance(agent.controller, Mapping)
+        sources = [conditions for name, conditions in self._last_delivered.items() if name in agent.controller]
         return sources[-1]
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:

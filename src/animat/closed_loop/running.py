@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.agents import Agent, InTurn, interleave
+from animat.closed_loop.agents import Agent, interleave
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
 from animat.closed_loop.log import LogWriter, Record
@@ -305,8 +305,8 @@ def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
     for number, agent in enumerate(agents):
         if agent.delivery != "yoked" or number not in turns:
             continue
-        assert isinstance(agent.controller, InTurn)
-        sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller.by_name]
+        assert isinstance(agent.controller, Mapping)
+        sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller]
         if not sources:
             raise InvalidArgument(f"agents: expected episodes for {agent.name!r} to repeat, got none")
         if (first := turns.index(number)) < sources[0]:
@@ -317,7 +317,7 @@ def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
 def _agent_to_dict(agent: Agent) -> dict[str, Any]:
     optional = {
         # The controllers of successive episodes, in a cycle.
-        "in_turn": list(agent.controller.by_name) if isinstance(agent.controller, InTurn) else [],
+        "in_turn": list(agent.controller) if isinstance(agent.controller, Mapping) else [],
         "is_drawn": agent.drawn_from is not None,
         "is_turned_round": agent.is_turned_round,
         "switch_at": agent.switch_at,
