@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -32,6 +32,8 @@ from animat.responses.extraction import SILENCE_S
 from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
+
+T = TypeVar("T")
 
 
 @dataclass(eq=False)
@@ -120,8 +122,10 @@ class Driver:
         remembering = loop.remembering if agent.sees_neurons(turn) else None
         source, conditions = self._source_of(agent), list[int]()
         for iteration in range(loop.robot.episode_limit):
-            neurons = () if remembering is None else remembering.observed(self._remembered)
-            chosen = self._choose(agent, controller, np.append(observation, neurons))
+            seen = observation
+            if remembering is not None:
+                seen = np.concatenate([observation, remembering.observed(self._remembered)])
+            chosen = self._choose(agent, controller, seen)
             repeats = 0
             while True:
                 delivered = chosen
@@ -151,8 +155,7 @@ class Driver:
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Start the robot: all agents of a round have the same start."""
-        with self._expecting("the robot", "robot"):
-            observation = self._runner.reset(turn)
+        observation = self._answer_of("the robot", "robot", lambda: self._runner.reset(turn))
         if not np.all(np.isfinite(observation)):
             raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
@@ -169,8 +172,7 @@ class Driver:
 
     def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
         n = len(self.loop.conditions)
-        with self._expecting(agent.name, "controller"):
-            chosen = int(controller.act(observation, self._rng))
+        chosen = self._answer_of(agent.name, "controller", lambda: int(controller.act(observation, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -265,10 +267,10 @@ class Driver:
             command = self._decoder.command(np.asarray(x_hz, np.float32)[()], self._percentiles)
             command = -command if agent.is_turned_round else command
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
-        with self._expecting("the robot", "robot"):
-            moved = self._runner.step(self._last_command)
-            if iteration + 1 == agent.switch_at and not moved.terminated:
-                moved = moved._replace(observation=self._runner.switch_goal(self._n_presented))
+        moved = self._answer_of("the robot", "robot", lambda: self._runner.step(self._last_command))
+        if iteration + 1 == agent.switch_at and not moved.terminated:
+            other = self._answer_of("the robot", "robot", lambda: self._runner.switch_goal(self._n_presented))
+            moved = moved._replace(observation=other)
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
             raise Stop(Ending("robot", f"the robot returned {moved.observation.tolist()} with reward {moved.reward:g}"))
         return {
@@ -359,12 +361,11 @@ class Driver:
         fields = {"kind": "event", "what": ending.by, "message": ending.message, **request.to_dict(), **more}
         self.records.append(Record(fields))
 
-    @contextmanager
-    def _expecting(self, who: str, by: EndedBy) -> Iterator[None]:
-        """Expect an answer of the robot or an agent; whatever it raises ends the session."""
+    def _answer_of(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
+        """The answer of the robot or an agent, by a deadline; whatever it raises ends the session."""
         self._set_deadline(who)
         try:
-            yield
+            return ask()
         except Exception as error:
             raise Stop(Ending(by, f"{who} raised {describe_error(error)}")) from error
 
