@@ -239,7 +239,7 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         of_observed = np.take_along_axis(probabilities[each], halves.commands_of(halves.x_hz)[:, None], 1)[:, 0]
         transforms = prediction.transforms()
         distance = distance_from_uniform(transforms)
-        series = free_runs(simulator, prediction, FREE_RUNS, rng)
+        correlation, length, lasting = map(_band, _in_time(free_runs(simulator, prediction, FREE_RUNS, rng), median_hz))
         passing = prediction.probability @ (halves.values_hz >= median_hz)
         scores.append(
             Scores(
@@ -249,12 +249,15 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
                 transforms,
                 distance,
                 None if each in (MARGINAL, "memory") else (1 + int(np.sum(distances >= distance))) / (1 + _CHANCES),
-                *map(_band, _in_time(series, median_hz)),
+                correlation,
+                length,
+                lasting,
                 _by_condition(passing, halves),
             )
         )
     # At its own median, as a loop's thresholds adapt: drift is reported separately.
     recorded = _in_time(recorded_series(halves)[None], float(np.median(halves.x_hz)))
+    recorded_correlation, recorded_length, recorded_lasting = (of_one[0] for of_one in recorded)
     conditions = range(len(responses.conditions))
     first = [halves.first_of(c) for c in conditions]
     second = [halves.x_hz[halves.condition == c] for c in conditions]
@@ -264,7 +267,9 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         tuple(map(len, second)),
         np.array([[np.median(x) for x in half] for half in (first, second)], np.float64),
         _by_condition(halves.x_hz >= median_hz, halves),
-        *(of_one[0] for of_one in recorded),
+        recorded_correlation,
+        recorded_length,
+        recorded_lasting,
         tuple(scores),
         kind or default_kind(responses),
         responses.is_blocked,
