@@ -423,7 +423,7 @@ def test_a_culture_settles_before_the_first_episode(tmp_path: Path) -> None:
     assert len([tick for tick in session.ticks if tick.handled == "warm-up" and tick.episode == 1]) == 5
     assert_read_alike(tmp_path, loop)
     outline = Outline()
-    for record in session.log.records:
+    for record in session.log:
         outline.add(record.fields)
     assert (
         outline.moved_at_s == next(tick.wall_s for tick in session.ticks if tick.iteration == 0) > settling[-1].wall_s

@@ -81,7 +81,7 @@ class LogWriter:
 
     def written(self) -> Log:
         """The log as written so far, for reading."""
-        return Log(self._header, Records(self._path, self._places), 0)
+        return Log(self._path, self._header, self._places, 0)
 
     def sync(self) -> None:
         """Flush the file to disk, against a power cut."""
@@ -103,30 +103,36 @@ class LogWriter:
         self._whole += len(data)
 
 
-class Records:
-    """The records of a log after the first, read from its file on demand: the log may be larger than memory.
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A log's records after the first, read from its file on demand: it may be larger than memory.
 
-    `places` are the offsets in the file where each record begins, and where the last one ends.
+    Attributes:
+        header: the fields of the first record.
+        places: offsets in the file where each record begins, and where the last one ends.
+        lost_bytes: from the first damaged record on.
     """
 
-    def __init__(self, path: Path, places: array[int]) -> None:
-        self._path, self._places = path, places
+    path: Path
+    header: dict[str, Any]
+    places: array[int]
+    lost_bytes: int
 
     def __len__(self) -> int:
-        return len(self._places) - 1
+        return len(self.places) - 1
 
     def __getitem__(self, index: int) -> Record:
         number = range(len(self))[index]
-        with open_file(self._path) as file:
-            file.seek(self._places[number])
-            return parse_record(self._path, file.read(self._places[number + 1] - self._places[number]))
+        with open_file(self.path) as file:
+            file.seek(self.places[number])
+            return parse_record(self.path, file.read(self.places[number + 1] - self.places[number]))
 
     def __iter__(self) -> Iterator[Record]:
-        return (parse_record(self._path, data) for data in self._data())
+        return (parse_record(self.path, data) for data in self._data())
 
     def fields(self) -> Iterator[dict[str, Any]]:
         """The fields of each record, without the spikes."""
-        return (parse_fields(self._path, data) for data in self._data())
+        return (parse_fields(self.path, data) for data in self._data())
 
     def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]]:
         """All spikes in the order they were written: times in s and channels, of some thousand records at a time."""
@@ -136,19 +142,10 @@ class Records:
             yield np.concatenate(times_s), np.concatenate(channels)
 
     def _data(self) -> Iterator[bytes]:
-        with open_file(self._path) as file:
-            file.seek(self._places[0])
-            for place, end in itertools.pairwise(self._places):
+        with open_file(self.path) as file:
+            file.seek(self.places[0])
+            for place, end in itertools.pairwise(self.places):
                 yield file.read(end - place)
-
-
-@dataclass(frozen=True, eq=False)
-class Log:
-    """The contents of a log file: the fields of its first record, the others, and the bytes lost from damage on."""
-
-    header: dict[str, Any]
-    records: Records
-    lost_bytes: int
 
 
 def read_log(path: str | os.PathLike[str]) -> Log:
@@ -168,7 +165,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
             raise InvalidFile(f"{path}: expected the log of a closed-loop session, got one cut off in its first record")
         file.seek(places[0])
         header = parse_fields(path, file.read(places[1] - places[0]))
-    return Log(header, Records(path, places[1:]), n_bytes - places[-1])
+    return Log(path, header, places[1:], n_bytes - places[-1])
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.header import Header, read_header
-from animat.closed_loop.log import Log, Records, open_file, read_log
+from animat.closed_loop.log import Log, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
 from animat.closed_loop.tick import Ending, Tick, TickTable
@@ -31,10 +31,10 @@ _UPDATE_EVERY = 1000
 class Ticks(Iterable[Tick]):
     """Every tick of a log, in order of time, read again on each iteration."""
 
-    records: Records
+    log: Log
 
     def __iter__(self) -> Iterator[Tick]:
-        return (Tick.from_dict(fields["tick"]) for fields in self.records.fields() if fields.get("tick"))
+        return (Tick.from_dict(fields["tick"]) for fields in self.log.fields() if fields.get("tick"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Session:
     @property
     def ticks(self) -> Ticks:
         """Every tick, in order of time."""
-        return Ticks(self.log.records)
+        return Ticks(self.log)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -80,7 +80,7 @@ class Session:
             InvalidFile: for an inconsistent log.
         """
         with expect_session_log(self.folder / LOG_FILE):
-            blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.records.spike_blocks()]
+            blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.spike_blocks()]
             times_s, channels = (np.concatenate(column) for column in zip(*blocks, strict=True))
             # Stretches may touch, and times rounded to samples then overlap by one.
             order = np.argsort(times_s, kind="stable")
@@ -99,7 +99,7 @@ class Session:
                 # Keep what was read, for `outline` and `recording`.
                 vars(self)["_data"] = data = self._collect(table, progress)
             recording = data.recording_without_spikes(self.ending)
-            write_nwb(recording, self.recording_file, self.log.records.spike_blocks(), data.spike_counts)
+            write_nwb(recording, self.recording_file, self.log.spike_blocks(), data.spike_counts)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
@@ -129,13 +129,13 @@ class Session:
 
     def _collect(self, table: TickTable | None = None, progress: Progress | None = None) -> SessionData:
         """Read all records once, and write their ticks into a table."""
-        data, records = SessionData(self._header), self.log.records
-        for number, record in enumerate(records):
+        data = SessionData(self._header)
+        for number, record in enumerate(self.log):
             data.add(record)
             if table is not None and record.fields["kind"] == "seen" and record.fields["tick"]:
                 table.add({**record.fields["tick"], "electrode_pulses": count_electrode_pulses(record.fields)})
             if progress is not None and number % _UPDATE_EVERY == 0:
-                progress.update(number, len(records))
+                progress.update(number, len(self.log))
         return data
 
 
@@ -154,7 +154,7 @@ def read_session(path: str | os.PathLike[str]) -> Session:
     read_header(file, log.header)
     ending = Ending("crash", "no ending was written: the program was killed, or is still running")
     # The ending is the last record.
-    last = log.records[-1].fields if len(log.records) else {}
+    last = log[-1].fields if len(log) else {}
     with expect_session_log(file):
         if last.get("kind") == "end":
             ending = Ending(last["by"], last["message"])

@@ -80,7 +80,7 @@ def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> S
     place = {each.number: row for row, each in enumerate(whole)}
     shape = loop.decoder.percentiles_shape[:-1]
     no_command, commands, read_hz, rows = np.full(shape, np.nan).tolist(), [], [], []
-    for record in session.log.records.fields():
+    for record in session.log.fields():
         tick = record.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue

@@ -50,7 +50,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
         reading.window_s = float(header_data["loop"]["window_ms"][1]) * 1e-3
         # A missing "robot" is an error here, not below.
         robot_data, seed = header_data["loop"] | {"robot": header_data["loop"]["robot"]}, int(header_data["seed"])
-        for record in session.log.records:
+        for record in session.log:
             is_past = is_found and record.fields["kind"] == "seen" and record.fields.get("start_s", 0.0) >= to_s
             # In a pause before the first trial nothing moves yet; the robot's state is known from that trial.
             if is_past and reading.moments:
