@@ -61,7 +61,7 @@ def train_peer(name: str, seed: int, wanted: float, cap_s: float) -> dict[str, A
         torch.set_num_threads(1)
         net_arch = [64, 64]
 
-    scales = np.array([quantity.scale for quantity in make().unwrapped.setup.animat.robot.observation_spec], np.float32)
+    scales = np.array([quantity.scale for quantity in make().unwrapped.setup.environment.observation_spec], np.float32)
     many = gymnasium.make_vec("animat:Animat/Cartpole-v0", num_envs=100, mapping="9-thresholds")
 
     def mean_return(model: Any) -> float:

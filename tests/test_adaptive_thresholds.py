@@ -229,7 +229,7 @@ def adapted(session: Session, recorded: Responses, adjusted: AdjustedRanks, coun
     recorded_hz, m = [recorded.rates_of(condition) for condition in range(5)], adjusted.remembering.memory
     percentiles = percentiles_of(adjusted).astype(np.float32)
     answered, trace, load, before_s = list[Answered](), 0.0, 0.0, -np.inf
-    for record in session.log.records:
+    for record in session.log:
         tick = session_tick(record.fields)
         if tick is None:
             continue

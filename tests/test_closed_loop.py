@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import threading
+import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -23,7 +25,6 @@ from animat.closed_loop.agents import (
     ActorController,
     Agent,
     AnyCondition,
-    InTurn,
     OneCondition,
     interleave,
 )
@@ -32,12 +33,12 @@ from animat.closed_loop.outline import Outline
 from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import read_session, recover_session
-from animat.closed_loop.standing import Standing
 from animat.closed_loop.tick import Tick
 from animat.closed_loop.timing import drop_real_time_priority, real_time_priority
 from animat.coding.mapping import Linear, Thresholds
 from animat.cultures.budget import Account, Budget
 from animat.cultures.contract import CultureContract
+from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import BudgetSpent, InvalidArgument, UnsafeStimulus, UnusableData
 from animat.evaluation.heuristic import HeuristicPolicy
@@ -422,18 +423,27 @@ def test_a_culture_settles_before_the_first_episode(tmp_path: Path) -> None:
     assert len([tick for tick in session.ticks if tick.handled == "warm-up" and tick.episode == 1]) == 5
     assert_read_alike(tmp_path, loop)
     outline = Outline()
-    for record in session.log.records:
+    for record in session.log:
         outline.add(record.fields)
     assert (
         outline.moved_at_s == next(tick.wall_s for tick in session.ticks if tick.iteration == 0) > settling[-1].wall_s
     )
 
 
-def test_the_note_of_a_session_before_its_first_move() -> None:
-    standing = Standing(6)
-    assert standing.note() == "warm-up"
-    standing.begin("p0")
-    assert standing.note() == "p0: return 0.0 so far"
+def test_the_notes_of_a_session_from_its_warm_up_on(tmp_path: Path) -> None:
+    def slowly(culture: FakeCulture, observed: Observed) -> Observed:
+        culture._at += 1
+        time.sleep(0.3 if culture.deliveries == 1 else 0.01)
+        return observed
+
+    notes: list[str] = []
+    progress = SimpleNamespace(update=lambda done, total, note: notes.append(note))
+    loop = loop_of(robot=Navigation(episode_limit=20), warm_up=2)
+    with FakeCulture(fault=slowly, at=0) as culture:
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1, progress=progress)
+    total = f"{session.episodes[0].total:.1f}"
+    assert notes[0] == "warm-up" and notes[-1] == f"random: return {total}; means: random {total}"
+    assert any(re.fullmatch(r"random: return \S+ so far", note) for note in notes)
 
 
 def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
@@ -639,7 +649,7 @@ def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
 
 
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
-    who = InTurn({f"p{i}": OneCondition(i) for i in range(3)})
+    who = {f"p{i}": OneCondition(i) for i in range(3)}
     agents = [RANDOM, Agent("silent", "", who, "silent"), Agent("shuffled", "", who, "shuffled")]
     with FakeCulture() as culture:
         session = run_session(culture, loop_of(), agents, tmp_path, episodes=5)

@@ -726,7 +726,7 @@ def test_a_session_that_was_logged_before_stretches_were_is_read(tmp_path: Path)
     with FakeCulture(fault=raising(RuntimeError("smoke")), at=8) as culture:
         session = run(tmp_path / "new", culture)
     log = LogWriter(tmp_path / "old" / LOG_FILE, session.log.header)
-    for words, times_s, channels in session.log.records:
+    for words, times_s, channels in session.log:
         kept = {name: value for name, value in words.items() if name not in ("stretch", "stimuli")}
         seen = {"stimuli": words["stimuli"]} if words["kind"] == "seen" else {}
         log.append(Record(kept | seen, times_s, channels))
@@ -758,14 +758,14 @@ def test_a_log_cut_off_anywhere_is_whole_up_to_there(tmp_path: Path) -> None:
             continue
         whole = [record for record, end in zip(written, ends, strict=True) if end <= length]
         found = read_log(other)
-        assert [r.fields for r in found.records] == [r.fields for r in whole]
-        for got, want in zip(found.records, whole, strict=True):
+        assert [r.fields for r in found] == [r.fields for r in whole]
+        for got, want in zip(found, whole, strict=True):
             np.testing.assert_array_equal(got.spike_times_s, want.spike_times_s)
             np.testing.assert_array_equal(got.spike_channels, want.spike_channels)
     # A byte that changed is noticed: nothing from there on is taken for true.
     for place in range(ends[1], len(data), 7):
         other.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        assert len(read_log(other).records) < len(written)
+        assert len(read_log(other)) < len(written)
     for content in (b"", b"ANIMAT", b"something else entirely"):
         other.write_bytes(content)
         with pytest.raises(InvalidFile):

@@ -93,10 +93,10 @@ def test_a_film_begins_just_before_the_robot_first_moves(tmp_path: Path, pause_s
     assert scene.moments[0].iteration == -1 and scene.moments[-1].iteration == 5
     assert scene_of_session(tmp_path, (0.0, 58.0 + pause_s)).start_s == 0.0
     # Also where nothing moves yet, and of a session that was killed in its settling.
-    records = read_session(tmp_path).log.records
+    records = read_session(tmp_path).log
     first = next(number for number, record in enumerate(records) if record.fields.get("tick"))
     log = (tmp_path / LOG_FILE).read_bytes()
-    (tmp_path / LOG_FILE).write_bytes(log[: records._places[first + 1]])
+    (tmp_path / LOG_FILE).write_bytes(log[: records.places[first + 1]])
     for span_s in ((0.5, 1.5), (1.0, pause_s)):
         scene = scene_of_session(tmp_path, span_s)
         assert (scene.start_s, scene.stop_s) == span_s
@@ -213,7 +213,7 @@ def test_what_cannot_be_filmed_is_an_error_in_one_line_and_leaves_nothing(
     (none := tmp_path / "none").mkdir()
     (begun := tmp_path / "begun").mkdir()
     log = read_session(folder).log
-    (begun / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes()[: log.records._places[0]])
+    (begun / LOG_FILE).write_bytes((folder / LOG_FILE).read_bytes()[: log.places[0]])
     out = tmp_path / "film.gif"
     for said, *arguments in (
         ("expected a session (session.log) or policies", none, "--out", out),

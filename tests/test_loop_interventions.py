@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from animat.closed_loop.agents import ActorController, Agent, AnyCondition, InTurn, OneCondition, agent_of
+from animat.closed_loop.agents import ActorController, Agent, AnyCondition, OneCondition, agent_of
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
 from animat.closed_loop.tick import Tick
@@ -121,7 +121,7 @@ def test_controls_of_a_simulator_are_agents_of_a_loop() -> None:
     assert [agents[f"constant {x}"].controller.act(seen, rng) for x in "abcde"] == [0, 1, 2, 3, 4]
     assert [agents["heuristic"].controller.act(sign * seen, rng) for sign in (1, -1)] == [4, 0]
     for name in ("silent", "shuffled"):
-        assert isinstance(who := agents[name].controller, InTurn) and who.by_name == POLICIES
+        assert agents[name].controller == POLICIES
         assert agents[name].delivery == name
     assert [name for name, agent in agents.items() if not agent.calibrates] == [f"constant {x}" for x in "abcde"]
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from scipy.stats import kstest
 
-from animat.closed_loop.agents import Agent, InTurn
+from animat.closed_loop.agents import Agent
 from animat.closed_loop.runner import RobotRunner
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
@@ -70,7 +70,7 @@ def ran(folder: Path, seed: int, culture: int = 1) -> tuple[Session, Looking]:
     agents = [
         Agent("p0", "", looking),
         RANDOM,
-        Agent("silent", "", InTurn({"p0": looking, "p1": Looking()}), "silent"),
+        Agent("silent", "", {"p0": looking, "p1": Looking()}, "silent"),
     ]
     with FakeCulture(culture) as fake:
         loop = loop_of(robot=Anywhere(), warm_up=1)

@@ -47,8 +47,8 @@ def session(
     predicted = Prediction(
         np.zeros(1),
         np.zeros(1),
-        CommandSums(everywhere, summed(recorded)),
-        CommandSums(everywhere + 0 * drawn[..., 0], anew),
+        CommandSums(everywhere, summed(recorded)[..., None]),
+        CommandSums(everywhere + 0 * drawn[..., 0], anew[..., None]),
     )
     calibration: Any = SimpleNamespace(
         responses_hz=tuple(recorded),
@@ -233,7 +233,7 @@ def test_of_two_readouts_the_one_that_differs_is_named() -> None:
         answered = replace(each[0], responses=responses, command=np.stack([one.command for one in each], axis=1))
         predicted = left.predicted
         once, bootstrapped = (
-            CommandSums(each.presented, np.stack([each.total] * 2, -1))
+            CommandSums(each.presented, np.concatenate([each.total] * 2, -1))
             for each in (predicted.commanded, predicted.commanded_bootstraps)
         )
         recorded = tuple(np.stack([x, x], axis=1) for x in left.calibration.responses_hz)

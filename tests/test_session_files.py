@@ -50,7 +50,7 @@ def with_header(folder: Path, header: Any, records: bytes) -> Path:
 
 def as_logged(folder: Path) -> dict[str, Any]:
     """Spikes and stimuli of a session, from its log by hand: two electrodes a pulse, times rising."""
-    seen = [record for record in read_log(folder / LOG_FILE).records if record.fields["kind"] == "seen"]
+    seen = [record for record in read_log(folder / LOG_FILE) if record.fields["kind"] == "seen"]
     # A file has them channel by channel: spikes of one time are read in the order of their channels.
     spikes = sorted(pair for record in seen for pair in zip(record.spike_times_s, record.spike_channels, strict=True))
     columns = zip(*(row for record in seen for row in record.fields["stimuli"]), strict=True)
@@ -134,7 +134,7 @@ def test_a_table_that_cannot_be_written_is_made_later(tmp_path: Path, monkeypatc
 def long_log(folder: Path, ticks: int) -> None:
     """A log of so many ticks, as the loop writes it, with the spikes of all at the same times after each pulse."""
     header = read_log(ran(folder / "short").folder / LOG_FILE).header
-    last = next(w for w in read_log(folder / "short" / LOG_FILE).records.fields() if w["kind"] == "seen" and w["tick"])
+    last = next(w for w in read_log(folder / "short" / LOG_FILE).fields() if w["kind"] == "seen" and w["tick"])
     log = LogWriter(folder / "long" / LOG_FILE, header)
     spikes_s, channels = np.linspace(0.001, 0.009, 40), np.arange(40) % 16
     for n in range(ticks):
@@ -147,7 +147,7 @@ def long_log(folder: Path, ticks: int) -> None:
 
 @pytest.mark.oracle
 def test_memory_does_not_grow_with_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.closed_loop.log._BLOCK_BYTES", 2**18)
+    monkeypatch.setattr("animat.closed_loop.log._BLOCK_RECORDS", 128)
     peaks = {}
     for ticks in (500, 3_000):
         long_log(tmp_path / str(ticks), ticks)

@@ -114,7 +114,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
 
     # The thresholds adapt to each half on its own, computed again here from the responses before.
-    told = iter([w["percentiles_hz"] for w in session.log.records.fields() if "percentiles_hz" in w])
+    told = iter([w["percentiles_hz"] for w in session.log.fields() if "percentiles_hz" in w])
     now, moved = np.asarray(loop.percentiles, np.float32), 0
     answered_hz: list[list[tuple[int, float, float]]] = [[], []]
     for tick in session.ticks:

@@ -23,7 +23,7 @@ from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.free_runs import LAGS, autocorrelation, free_runs, run_lengths, shares_lasting
-from animat.neurons.history import Memory, recorded_states
+from animat.neurons.history import Memory, Ranked
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.prediction import halved, predict
@@ -284,21 +284,22 @@ def test_a_free_run_remembers_its_own_answers() -> None:
     )
     halves = halved(responses)
     simulator = fit_memory(halves.first, memory=Memory(0.3, 0.5, 0.6, 1.0))
-    states = recorded_states(halves.first, simulator.memory)
+    ranked = Ranked(halves.first)
+    (traces, left), loads = ranked.recorded(simulator.memory), ranked.loads(simulator.memory.load_s).every
     assert simulator.load_s > 0
-    runs = free_runs(simulator, predict(simulator, halves), halves, 3, np.random.default_rng(7))
+    runs = free_runs(simulator, predict(simulator, halves), 3, np.random.default_rng(7))
     places = place[halves.rows]
     since = places[0]
     uniforms = np.random.default_rng(7).random((n - since, 3), np.float32)
     answer_at = jax.jit(simulator.answer_at)
     for k in range(3):
-        trace, expected = states.trace[since], np.full(n, np.nan)
+        trace, expected = traces[since], np.full(n, np.nan)
         for p in range(since, n):
             trace = 0.0 if rested[p] else trace
             if p in places:
-                expected[p], trace = answer_at(every[p], uniforms[p - since, k], jnp.float32(trace), states.load[p])
+                expected[p], trace = answer_at(every[p], uniforms[p - since, k], jnp.float32(trace), loads[p])
             else:
-                trace = 0.3 * trace + states.left[p]
+                trace = 0.3 * trace + left[p]
             trace = 0.5 if burst[p] else trace
         assert np.array_equal(runs[k], expected, equal_nan=True)
 

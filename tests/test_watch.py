@@ -72,9 +72,9 @@ def test_totals_are_those_of_the_session(folder: Path) -> None:
         assert agent["mean"] == pytest.approx(fmean(returns))
         # Student's 97.5 % quantile with one degree of freedom.
         assert agent["half"] == pytest.approx(12.7062 * np.std(returns, ddof=1) / math.sqrt(2), rel=1e-4)
-    spikes = sum(len(record.spike_times_s) for record in session.log.records)
+    spikes = sum(len(record.spike_times_s) for record in session.log)
     assert found["spikes"]["n"] == sum(found["counts"]) == spikes
-    seen = [record.fields for record in session.log.records if record.fields["kind"] == "seen"]
+    seen = [record.fields for record in session.log if record.fields["kind"] == "seen"]
     on = [electrode for words in seen for row in words["stimuli"] for electrode in row[3]]
     assert found["fullest"] == [found["fullest"][0], max(on.count(e) for e in on)]
     assert on.count(int(found["fullest"][0])) == found["fullest"][1]
@@ -112,7 +112,7 @@ def test_a_log_is_followed_while_it_grows(folder: Path, tmp_path: Path) -> None:
         view.about()
     writer = LogWriter(tmp_path / LOG_FILE, log.header)
     ticks = 0
-    for number, record in enumerate(log.records):
+    for number, record in enumerate(log):
         writer.append(record)
         ticks += bool(record.fields.get("tick"))
         if number % 7 == 0:
@@ -182,7 +182,7 @@ def test_predicted_returns_are_shown_with_the_measured_ones(folder: Path, tmp_pa
 
     def shown(predicted: Any) -> dict[str, Any]:
         writer = LogWriter(tmp_path / LOG_FILE, {**log.header, "predicted": predicted})
-        for record in log.records:
+        for record in log:
             writer.append(record)
         writer.close()
         agents = whole(SessionView(tmp_path))["agents"]

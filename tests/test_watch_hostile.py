@@ -64,7 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def records(folder: Path) -> list[Any]:
     """The words of each record, the header's first, and its spikes."""
     log = read_log(folder / LOG_FILE)
-    return [(log.header, b"", 0), *((r.fields, _spikes(r), len(r.spike_times_s)) for r in log.records)]
+    return [(log.header, b"", 0), *((r.fields, _spikes(r), len(r.spike_times_s)) for r in log)]
 
 
 def _spikes(record: Any) -> bytes:

@@ -56,13 +56,7 @@ class AdaptiveThresholds:
         self._latest, self._weights = self._means(), np.ones(len(self._kept))
 
     def add(self, condition: int, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]) -> None:
-        """Add a new non-burst response.
-
-        Args:
-            condition: of its trial.
-            came: the history state when the trial came.
-            read_hz: x of each readout, Hz.
-        """
+        """Add a new non-burst response to a condition; `came`: the history state when its trial came."""
         row = self._first[condition] + self._added[condition] % self._kept[condition]
         self._hz[row] = read_hz
         self._ranks[row] = rank = self._recorded.of_response(came, read_hz)

@@ -31,7 +31,6 @@ class AnyCondition:
     n_conditions: int
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """A random condition."""
         return int(rng.integers(self.n_conditions))
 
 
@@ -42,7 +41,6 @@ class OneCondition:
     condition: int
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The condition."""
         return self.condition
 
 
@@ -53,7 +51,6 @@ class Greedy:
     policy: Any
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The most probable condition."""
         return self.policy.act_greedily(observation)
 
 
@@ -72,7 +69,6 @@ class ActorController:
         self.act(np.zeros(len(environment.observation_spec)), np.random.default_rng())
 
     def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> int:
-        """The condition, chosen as on the simulator."""
         # From a generator of its own, so that the loop's other draws do not depend on the actor.
         uniforms = rng.spawn(1)[0].random(self._environment.n_drawn, np.float32)
         return int(_decided(self._environment, self._actor, np.asarray(observation, np.float32), uniforms))
@@ -88,26 +84,6 @@ def _decided(
     return actor.act(environment, (observation / environment.scales)[None], uniforms[None])[0]
 
 
-@dataclass(frozen=True)
-class InTurn:
-    """Several controllers that take turns, one episode each: a control then represents all policies, not one of them.
-
-    Attributes:
-        by_name: the controllers, in order.
-    """
-
-    by_name: Mapping[str, Controller]
-
-    def act(self, observation: Float[np.ndarray, " observations"], rng: np.random.Generator) -> Any:
-        """The choice of the first; the loop calls each controller in its turn (`Agent.acting`)."""
-        return self.acting(0).act(observation, rng)
-
-    def acting(self, turn: int) -> Controller:
-        """The controller whose turn it is."""
-        controllers = tuple(self.by_name.values())
-        return controllers[turn % len(controllers)]
-
-
 @dataclass(frozen=True, eq=False)
 class Agent:
     """An agent, which acts in some of a session's episodes.
@@ -115,7 +91,8 @@ class Agent:
     Attributes:
         name: unique in its session.
         meaning: a short description.
-        controller: chooses the conditions.
+        controller: chooses the conditions; several, by name, take turns, one episode each: a control then represents
+            all policies, not one of them.
         delivery: as for a control (`animat.evaluation.controls.Control`). `"silent"`: spontaneous activity is read in
             place of the response; `"yoked"`: the stimuli of the last whole episode of one of its controllers are
             repeated.
@@ -128,7 +105,7 @@ class Agent:
 
     name: str
     meaning: str
-    controller: Controller
+    controller: Controller | Mapping[str, Controller]
     delivery: Delivered = "chosen"
     calibrates: bool = True
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
@@ -143,7 +120,10 @@ class Agent:
 
     def acting(self, turn: int) -> Controller:
         """The controller of the agent's episode number `turn`, counted from 0."""
-        return self.controller.acting(turn) if isinstance(self.controller, InTurn) else self.controller
+        if not isinstance(self.controller, Mapping):
+            return self.controller
+        controllers = tuple(self.controller.values())
+        return controllers[turn % len(controllers)]
 
 
 def random_control(n_conditions: int) -> Agent:
@@ -159,11 +139,7 @@ def agent_of(
 ) -> Agent:
     """A control of the simulator as an agent of a closed loop, in which policies take turns.
 
-    Args:
-        control: of the simulator.
-        environment: robot and mapping.
-        policies: by name.
-        responses_hz: non-burst responses of all conditions, for random spikes.
+    Random spikes are drawn from `responses_hz`, the non-burst responses of all conditions.
 
     Raises:
         InvalidArgument: for a control whose commands do not come from responses, which no loop can run.
@@ -173,9 +149,9 @@ def agent_of(
             f"control: expected one whose commands come from responses, got {control.name}, which only a simulator runs"
         )
     actor = control.actor
-    controller: Controller
+    controller: Controller | Mapping[str, Controller]
     if isinstance(actor, Networks):
-        controller = InTurn(dict(policies))
+        controller = policies
     elif isinstance(actor, Uniform):
         controller = AnyCondition(environment.n_conditions)
     elif isinstance(actor, Constant):
@@ -200,10 +176,6 @@ def interleave(episodes: Sequence[int], rng: np.random.Generator) -> list[int]:
 
     For each agent the session is divided into as many equal parts as it has episodes, with one episode in each part. If
     all have equally many, they act in rounds.
-
-    Args:
-        episodes: of each agent.
-        rng: draws the places within the parts.
     """
     places = [(part + rng.random()) / n for n in episodes for part in range(n)]
     agents = np.repeat(np.arange(len(episodes)), episodes)

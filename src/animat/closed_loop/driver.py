@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.closed_loop.adaptive import AdaptiveThresholds
-from animat.closed_loop.agents import Agent, Controller, InTurn
+from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
-from animat.closed_loop.standing import Standing
-from animat.closed_loop.stopping import Stop, ending_of, file_exists
+from animat.closed_loop.stopping import Stop, ending_of
 from animat.closed_loop.stretch import Request, Stretch, check_answer, read_response, stretch_record
-from animat.closed_loop.tick import Ending, Handled, Tick
+from animat.closed_loop.tick import EndedBy, Ending, Handled, Tick
 from animat.closed_loop.timing import Clock
 from animat.coding.encoder import Dealer
 from animat.cultures.base import Culture
@@ -32,46 +33,43 @@ from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
 
+T = TypeVar("T")
 
+
+@dataclass(eq=False)
 class Driver:
     """Runs episodes on a culture; everything that happens is appended to `records`, for another thread to write.
 
-    Args:
-        culture: open.
-        loop: the settings.
-        agents: of the session.
-        turns: the agent of each episode.
+    Attributes:
+        turns: the agent of each episode, by its number.
         account: of the stimulation budget.
-        clock: the machine's.
-        seed: decides every random draw.
         stop_file: checked before every request to the culture; once it exists, there are no more requests.
+        is_stopped: set by another thread, after which there are no more requests either.
+        deadline: latest time on `time.monotonic()` for an answer, and from whom; a supervisor watches it.
+        request: the latest request to the culture, answered or not; a supervisor logs it.
+        unfinished: the record of a response that has not moved the robot yet: to be logged if it never does.
     """
 
-    def __init__(
-        self,
-        culture: Culture,
-        loop: Loop,
-        agents: Sequence[Agent],
-        turns: Sequence[int],
-        account: Account,
-        clock: Clock,
-        seed: int,
-        stop_file: Path,
-    ) -> None:
+    culture: Culture
+    loop: Loop
+    agents: Sequence[Agent]
+    turns: Sequence[int]
+    account: Account
+    clock: Clock
+    seed: int
+    stop_file: Path
+    is_stopped: bool = False
+    deadline: tuple[float, str] = float("inf"), "nobody"
+    request: Request | None = None
+    unfinished: Record | None = None
+
+    def __post_init__(self) -> None:
+        loop, culture = self.loop, self.culture
         self.records: deque[Record] = deque()
-        self.standing = Standing(loop.robot.episode_limit)
-        self.is_stopped = False
-        self.deadline = float("inf"), "nobody"
-        """Latest time on `time.monotonic()` for an answer, and from whom; a supervisor watches it."""
-        self.request: Request | None = None
-        """The latest request to the culture, answered or not; a supervisor logs it."""
-        self._stop_file = stop_file
-        self._culture, self._loop, self._agents, self._turns = culture, loop, agents, turns
-        self._account, self._clock = account, clock
-        self._rng = np.random.default_rng([seed, 21])
+        self._rng = np.random.default_rng([self.seed, 21])
         runs = HostRunner if isinstance(loop.robot, HostRobot) else RobotRunner
-        self._runner: Runner = runs(loop.robot, np.random.default_rng([seed, 22]))
-        if any(agent.switch_at is not None for agent in agents):
+        self._runner: Runner = runs(loop.robot, np.random.default_rng([self.seed, 22]))
+        if any(agent.switch_at is not None for agent in self.agents):
             # Compile now, like its step.
             self._runner.switch_goal(0)
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
@@ -83,55 +81,50 @@ class Driver:
         self._n_presented = self._n_stretches = 0
         self._zero_s = self._observed_until_s = self._last_pulse_s = 0.0
         self._data_at_s = self._wall_zero_s = 0.0
-        self._last_command = self._at_rest
+        self._last_command: float | tuple[float, ...] = 0.0
         self._remembered = HistoryState()
         self._last_delivered: dict[str, list[int]] = {}
         """Conditions delivered in the last whole episode of each agent, the newest last."""
-        self._unfinished: tuple[Stretch, Sequence[Stimulus], dict[str, Any]] | None = None
-
-    @property
-    def _at_rest(self) -> float | tuple[float, ...]:
-        return 0.0 if (n := self._loop.robot.n_commands) == 1 else (0.0,) * n
-
-    @property
-    def unfinished(self) -> Record | None:
-        """The record of a response that has not moved the robot yet: to be logged if it never does."""
-        # Read once, as the loop's thread may clear it meanwhile.
-        return None if (unfinished := self._unfinished) is None else stretch_record(*unfinished)
 
     def stopped_by_file(self) -> Ending | None:
-        """The ending if a person created the stop file."""
-        message = f"stopped by a person (the file {self._stop_file.name})"
-        return Ending("person", message) if file_exists(self._stop_file) else None
+        """The ending if a person created the stop file.
+
+        Raises:
+            OSError: if that cannot be determined, for example in an unreadable folder.
+        """
+        with suppress(FileNotFoundError):
+            self.stop_file.stat()
+            return Ending("person", f"stopped by a person (the file {self.stop_file.name})")
+        return None
 
     def run(self) -> Ending:
         """Run all episodes; every failure is an ending, never an exception."""
         try:
             self._zero_s = self._now_s()
-            self._data_at_s = self._wall_zero_s = self._clock.now_s()
-            for episode, turn in enumerate(self._turns):
-                self._run_episode(episode, self._agents[turn])
-                self.standing.end()
+            self._data_at_s = self._wall_zero_s = self.clock.now_s()
+            for episode, turn in enumerate(self.turns):
+                self._run_episode(episode, self.agents[turn])
         except Stop as stop:
             return stop.ending
         except Exception as error:
             return Ending("crash", f"an error of the loop itself: {describe_error(error)}")
-        return Ending("plan", f"all {len(self._turns)} episodes were run")
+        return Ending("plan", f"all {len(self.turns)} episodes were run")
 
     def _run_episode(self, episode: int, agent: Agent) -> None:
-        loop = self._loop
+        loop = self.loop
         turn = self._n_begun[agent.name]
         self._n_begun[agent.name] += 1
         controller = agent.acting(turn)
         observation = self._start(episode, turn)
-        self._last_command = self._at_rest
+        self._last_command = 0.0 if (n := loop.robot.n_commands) == 1 else (0.0,) * n
         for rounds in loop.rounds_before(episode, is_silent=agent.delivery == "silent"):
             self._warm_up(agent, episode, rounds)
-        self.standing.begin(agent.name)
         remembering = loop.remembering if agent.sees_neurons(turn) else None
         source, conditions = self._source_of(agent), list[int]()
         for iteration in range(loop.robot.episode_limit):
-            seen = observation if remembering is None else remembering.append_to(observation, self._remembered)
+            seen = observation
+            if remembering is not None:
+                seen = np.concatenate([observation, remembering.observed(self._remembered)])
             chosen = self._choose(agent, controller, seen)
             repeats = 0
             while True:
@@ -145,7 +138,6 @@ class Driver:
                     break
                 repeats += 1
             conditions.append(delivered)
-            self.standing.add(tick.reward or 0.0)
             if tick.terminated or tick.truncated:
                 break
             observation = np.array(tick.observation)
@@ -157,19 +149,13 @@ class Driver:
         """The conditions that a yoked agent repeats: those of its controllers' newest episode."""
         if agent.delivery != "yoked":
             return []
-        assert isinstance(agent.controller, InTurn)
-        sources = [conditions for name, conditions in self._last_delivered.items() if name in agent.controller.by_name]
-        if not sources:
-            raise Stop(Ending("controller", f"{agent.name}: expected an earlier episode of a policy, got none"))
+        assert isinstance(agent.controller, Mapping)
+        sources = [conditions for name, conditions in self._last_delivered.items() if name in agent.controller]
         return sources[-1]
 
     def _start(self, episode: int, turn: int) -> Float64[np.ndarray, " observations"]:
         """Start the robot: all agents of a round have the same start."""
-        self._set_deadline("the robot")
-        try:
-            observation = self._runner.reset(turn)
-        except Exception as error:
-            raise Stop(Ending("robot", f"the robot raised {describe_error(error)}")) from error
+        observation = self._answer_of("the robot", "robot", lambda: self._runner.reset(turn))
         if not np.all(np.isfinite(observation)):
             raise Stop(Ending("robot", f"the robot starts at {observation.tolist()}"))
         self.records.append(Record({"kind": "start", "episode": episode, "observation": observation.tolist()}))
@@ -177,20 +163,16 @@ class Driver:
 
     def _warm_up(self, agent: Agent, episode: int, rounds: int) -> None:
         """A pause, then stimuli that bring the culture to the state of its recording: a rested one differs."""
-        self._observe((), self._loop.pause_s, self._now_s(), pause=True)
+        self._observe((), self.loop.pause_s, self._now_s(), pause=True)
         # The first pulse comes as if one had been delivered at the end of the pause.
         self._last_pulse_s = self._now_s()
         for _ in range(rounds):
-            for condition in self._rng.permutation(len(self._loop.conditions)).tolist():
+            for condition in self._rng.permutation(len(self.loop.conditions)).tolist():
                 self._present(agent, episode, -1, condition, condition, 0)
 
     def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
-        n = len(self._loop.conditions)
-        self._set_deadline(agent.name)
-        try:
-            chosen = int(controller.act(observation, self._rng))
-        except Exception as error:
-            raise Stop(Ending("controller", f"{agent.name} raised {describe_error(error)}")) from error
+        n = len(self.loop.conditions)
+        chosen = self._answer_of(agent.name, "controller", lambda: int(controller.act(observation, self._rng)))
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen
@@ -202,7 +184,7 @@ class Driver:
 
         In the warm-up (iteration -1) the robot stands still.
         """
-        loop, is_warm_up = self._loop, iteration < 0
+        loop, is_warm_up = self.loop, iteration < 0
         frequency_hz = self._dealer.frequency_hz(delivered)
         due_s = self._last_pulse_s + 1 / frequency_hz
         since_s, times_s = self._times(due_s, frequency_hz)
@@ -214,16 +196,17 @@ class Driver:
             ]
         # Two samples longer than the window, so that a spike at its very end is not left to the next stretch.
         duration_s = float(times_s[-1]) + loop.window_ms[1] * 1e-3 + 2 / self._rate_hz
-        decided_s = self._clock.now_s() - self._data_at_s
+        decided_s = self.clock.now_s() - self._data_at_s
         stretch = self._observe(stimuli, duration_s, since_s)
-        pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(stretch.asked_at_s + times_s)
+        pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(since_s - self._zero_s + times_s)
         after_s = pulse_time_s[-1:]
         # Lateness of the real times; up to a grid step comes from the grid and from rounding to samples.
         due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
         late_s = float(np.max(pulse_time_s - due_at_s))
         late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
         drawn_from = None if is_warm_up else agent.drawn_from
-        x_hz, fields, is_burst = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
+        x_hz, response = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
+        is_burst = response["is_burst"]
         self._last_pulse_s = self._zero_s + float(after_s[0])
         again = is_burst and loop.on_burst == "repeat" and repeats < loop.most_repeats and not is_warm_up
         tick: dict[str, Any] = {
@@ -245,7 +228,7 @@ class Driver:
             "truncated": False,
             "late_s": late_s,
             "decided_s": decided_s,
-            **fields,
+            **response,
         }
         self._n_presented += 1
         came = self._remembered
@@ -255,8 +238,8 @@ class Driver:
             self._remembered = loop.history.after(came, delivered, tick["rate_hz"], is_burst=is_burst)
         if loop.remembering is not None:
             tick["neurons"] = loop.remembering.observed(self._remembered)
-        tick["wall_s"] = self._clock.now_s() - self._wall_zero_s
-        self._unfinished = stretch, stimuli, dict(tick)
+        tick["wall_s"] = self.clock.now_s() - self._wall_zero_s
+        record = self.unfinished = stretch_record(stretch, stimuli, dict(tick))
         adapted: dict[str, Any] = {}
         try:
             if late_s and loop.on_late == "stop":
@@ -270,27 +253,24 @@ class Driver:
         finally:
             # Whatever happens to the robot, the culture's response is logged.
             finished = Tick(**tick)
-            self.records.append(stretch_record(stretch, stimuli, vars(finished), **adapted))
-            self._unfinished = None
+            self.records.append(record._replace(fields={**record.fields, "tick": vars(finished), **adapted}))
+            self.unfinished = None
         return finished, again
 
     def _move(
         self, agent: Agent, x_hz: Float64[np.ndarray, "*readouts"], is_burst: bool, iteration: int
     ) -> dict[str, Any]:
-        loop = self._loop
+        loop = self.loop
         handled: Handled = "skipped" if is_burst and loop.on_burst == "skip" else "used"
         if handled == "used":
             # In float32, as in training, so that a response on a percentile is exactly on it here as well.
             command = self._decoder.command(np.asarray(x_hz, np.float32)[()], self._percentiles)
             command = -command if agent.is_turned_round else command
             self._last_command = tuple(command.tolist()) if np.ndim(command) else float(command)
-        self._set_deadline("the robot")
-        try:
-            moved = self._runner.step(self._last_command)
-            if iteration + 1 == agent.switch_at and not moved.terminated:
-                moved = moved._replace(observation=self._runner.switch_goal(self._n_presented))
-        except Exception as error:
-            raise Stop(Ending("robot", f"the robot raised {describe_error(error)}")) from error
+        moved = self._answer_of("the robot", "robot", lambda: self._runner.step(self._last_command))
+        if iteration + 1 == agent.switch_at and not moved.terminated:
+            other = self._answer_of("the robot", "robot", lambda: self._runner.switch_goal(self._n_presented))
+            moved = moved._replace(observation=other)
         if not (np.isfinite(moved.reward) and np.all(np.isfinite(moved.observation))):
             raise Stop(Ending("robot", f"the robot returned {moved.observation.tolist()} with reward {moved.reward:g}"))
         return {
@@ -309,11 +289,11 @@ class Driver:
         """
         now_s = self._now_s()
         first_s = max(due_s - now_s, 0.0)
-        if self._loop.real_time:
+        if self.loop.real_time:
             # A culture that is held back to real time stands still meanwhile, and has to catch up.
-            behind_s = self._clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
+            behind_s = self.clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
             first_s = max(first_s, behind_s)
-        return now_s, on_ticks(first_s + np.arange(self._loop.pulses) / frequency_hz)
+        return now_s, on_ticks(first_s + np.arange(self.loop.pulses) / frequency_hz)
 
     def _observe(self, stimuli: Sequence[Stimulus], duration_s: float, since_s: float, pause: bool = False) -> Stretch:
         """Deliver stimuli, observe, and check the answer; times count from `since_s`; a pause is logged here."""
@@ -321,7 +301,7 @@ class Driver:
             raise Stop(Ending("person", "stopped by a person"))
         if stopped := self.stopped_by_file():
             raise Stop(stopped)
-        culture, account = self._culture, self._account
+        culture, account = self.culture, self.account
         try:
             account.check(stimuli)
         except BudgetSpent as spent:
@@ -359,7 +339,6 @@ class Driver:
         offset_s = observed.start_s - self._zero_s
         stretch = Stretch(
             request.stretch,
-            request.at_s,
             offset_s,
             observed.duration_s,
             self._on_samples(offset_s + observed.spikes.time_s),
@@ -370,11 +349,11 @@ class Driver:
         self._observed_until_s = offset_s + observed.duration_s
         if pause:
             self.records.append(stretch_record(stretch, (), None))
-        if self._loop.real_time:
+        if self.loop.real_time:
             until_s = self._wall_zero_s + (self._now_s() - self._zero_s)
-            self._set_deadline("the clock", max(0.0, until_s - self._clock.now_s()))
-            self._clock.sleep_until(until_s)
-        self._data_at_s = self._clock.now_s()
+            self._set_deadline("the clock", max(0.0, until_s - self.clock.now_s()))
+            self.clock.sleep_until(until_s)
+        self._data_at_s = self.clock.now_s()
         return stretch
 
     def _log_fault(self, ending: Ending, request: Request, **more: Any) -> None:
@@ -382,17 +361,25 @@ class Driver:
         fields = {"kind": "event", "what": ending.by, "message": ending.message, **request.to_dict(), **more}
         self.records.append(Record(fields))
 
+    def _answer_of(self, who: str, by: EndedBy, ask: Callable[[], T]) -> T:
+        """The answer of the robot or an agent, by a deadline; whatever it raises ends the session."""
+        self._set_deadline(who)
+        try:
+            return ask()
+        except Exception as error:
+            raise Stop(Ending(by, f"{who} raised {describe_error(error)}")) from error
+
     def _set_deadline(self, who: str, in_s: float = 0.0) -> None:
         """Set who has to answer next, and the expected time, to which the patience is added."""
-        self.deadline = time.monotonic() + in_s + self._loop.patience_s, who
+        self.deadline = time.monotonic() + in_s + self.loop.patience_s, who
 
     def _now_s(self) -> float:
         """The culture's clock; fails if the connection is lost."""
         self._set_deadline("the culture")
         try:
-            return self._culture.now_s
+            return self.culture.now_s
         except Exception as error:
-            raise Stop(ending_of(error, self._culture, self.is_stopped)) from error
+            raise Stop(ending_of(error, self.culture, self.is_stopped)) from error
 
     def _on_samples(self, times_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " times"]:
         # The same numbers as in a recording of the session, so that windows agree to the last bit.

@@ -76,14 +76,10 @@ class Header:
     """The description of a session, from which its files are made.
 
     Attributes:
-        channels: of the culture.
         sampling_rate_hz: of the culture; NaN: unknown.
         start_min: start of the session on the culture's clock.
         recorded_at: when it began, ISO 8601.
-        provenance: of the culture.
-        presentation: how stimuli were presented.
         conditions: their labels.
-        agents: their names.
         observed: the columns of the robot's observation, with their units.
         loop: all settings, as JSON.
         readouts: names of the groups of channels that were read; none where all channels were read as one.
@@ -108,11 +104,7 @@ def observed_columns(robot: Robot[Any]) -> list[str]:
 
 
 def read_header(file: Path, fields: Mapping[str, Any]) -> Header:
-    """The header of a session's log.
-
-    Args:
-        file: the log, for messages.
-        fields: of its first record.
+    """The header of a session's log, from the fields of its first record.
 
     Raises:
         InvalidFile: naming a field that is missing or invalid.

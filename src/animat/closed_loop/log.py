@@ -17,15 +17,15 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int, Int64
+from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidFile
 from animat.plain_file import expect_plain_file
 from animat.writing import sync_folder
 
@@ -35,8 +35,8 @@ RECORD = b"REC1"
 HEAD = struct.Struct("<4sIII")
 """The head of each record: `RECORD`, the length of the fields, the number of spikes, the checksum of both."""
 _BUFFER_BYTES = 2**18
-_BLOCK_BYTES = 2**23
-"""How much of the log is read at once for its spikes."""
+_BLOCK_RECORDS = 4096
+"""How many records are read at once for their spikes."""
 _NO_TIMES, _NO_CHANNELS = np.empty(0, np.float64), np.empty(0, np.int64)
 
 
@@ -49,43 +49,30 @@ class Record(NamedTuple):
 
 
 class LogWriter:
-    """Appends records; the operating system has each when `append` returns, so a killed program loses none.
-
-    Args:
-        path: a new file.
-        header: fields of the first record.
+    """Appends records to a new file; the operating system has each when `append` returns: a kill loses none.
 
     Raises:
-        InvalidArgument: if the file exists.
-        InvalidFile: if it cannot be written.
+        InvalidFile: if the file exists, or cannot be written.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
-        self.path = path
-        self._header, self._places = dict(header), array("Q")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
-        except FileExistsError:
-            raise InvalidArgument(f"{path}: expected no session, got one; choose another folder") from None
-        except OSError as error:
-            raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error
-        self._whole = 0
-        try:
-            self._write(MAGIC)
-            self.append(Record(self._header))
-            self.sync()
-            sync_folder(path.parent)
-        except OSError as error:
-            self.close()
-            raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._path, self._header = path, dict(header)
+        self._places, self._whole = array("Q"), 0
+        with ExitStack() as stack:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
+                stack.callback(self.close)
+                self._write(MAGIC)
+                self.append(Record(self._header))
+                self.sync()
+                sync_folder(path.parent)
+            except OSError as error:
+                raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error
+            stack.pop_all()
 
     def append(self, record: Record) -> None:
-        """Write a record.
-
-        Raises:
-            OSError: if it cannot be written; the file then ends with the record before it.
-        """
+        """Write a record; if that raises OSError, the file ends with the record before it."""
         fields = json.dumps(record.fields).encode()
         spikes = record.spike_times_s.astype("<f8").tobytes() + record.spike_channels.astype("<i4").tobytes()
         body = fields + spikes
@@ -94,7 +81,7 @@ class LogWriter:
 
     def written(self) -> Log:
         """The log as written so far, for reading."""
-        return Log(self._header, Records(self.path, self._places), 0)
+        return Log(self._path, self._header, self._places, 0)
 
     def sync(self) -> None:
         """Flush the file to disk, against a power cut."""
@@ -116,74 +103,49 @@ class LogWriter:
         self._whole += len(data)
 
 
-class Records:
-    """The records of a log after the first, read from its file on demand: the log may be larger than memory.
-
-    Args:
-        path: of the log.
-        places: offsets in the file where each record begins, and where the last one ends.
-    """
-
-    def __init__(self, path: Path, places: array[int]) -> None:
-        self._path, self._places = path, places
-
-    def __len__(self) -> int:
-        return len(self._places) - 1
-
-    def __getitem__(self, index: int) -> Record:
-        number = range(len(self))[index]
-        with open_log(self._path) as file:
-            file.seek(self._places[number])
-            return parse_record(self._path, file.read(self._places[number + 1] - self._places[number]))
-
-    def __iter__(self) -> Iterator[Record]:
-        return (parse_record(self._path, data) for data in self._data())
-
-    def fields(self) -> Iterator[dict[str, Any]]:
-        """The fields of each record, without the spikes."""
-        return (parse_fields(self._path, data) for data in self._data())
-
-    def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int[np.ndarray, " spikes"]]]:
-        """All spikes in the order they were written: times in s and channels, about a million at a time."""
-        places = np.frombuffer(self._places, np.uint64).astype(np.int64)
-        with open_log(self._path) as file:
-            first = 0
-            while first < len(self):
-                last = max(first + 1, int(np.searchsorted(places, places[first] + _BLOCK_BYTES)) - 1)
-                file.seek(places[first])
-                data = memoryview(file.read(places[last] - places[first]))
-                times, channels = [], []
-                for at in (places[first:last] - places[first]).tolist():
-                    _, n_bytes, n_spikes, _ = HEAD.unpack_from(data, at)
-                    if n_spikes:
-                        at += HEAD.size + n_bytes
-                        times.append(data[at : at + 8 * n_spikes])
-                        channels.append(data[at + 8 * n_spikes : at + 12 * n_spikes])
-                first = last
-                if times:
-                    times_s = np.frombuffer(b"".join(times), "<f8").astype(np.float64, copy=False)
-                    yield times_s, np.frombuffer(b"".join(channels), "<i4")
-
-    def _data(self) -> Iterator[bytes]:
-        with open_log(self._path) as file:
-            file.seek(self._places[0])
-            for place, end in itertools.pairwise(self._places):
-                yield file.read(end - place)
-
-
 @dataclass(frozen=True, eq=False)
 class Log:
-    """The contents of a log file.
+    """A log's records after the first, read from its file on demand: it may be larger than memory.
 
     Attributes:
-        header: the fields of its first record.
-        records: the others, in the order they were written.
+        header: the fields of the first record.
+        places: offsets in the file where each record begins, and where the last one ends.
         lost_bytes: from the first damaged record on.
     """
 
+    path: Path
     header: dict[str, Any]
-    records: Records
+    places: array[int]
     lost_bytes: int
+
+    def __len__(self) -> int:
+        return len(self.places) - 1
+
+    def __getitem__(self, index: int) -> Record:
+        number = range(len(self))[index]
+        with open_file(self.path) as file:
+            file.seek(self.places[number])
+            return parse_record(self.path, file.read(self.places[number + 1] - self.places[number]))
+
+    def __iter__(self) -> Iterator[Record]:
+        return (parse_record(self.path, data) for data in self._data())
+
+    def fields(self) -> Iterator[dict[str, Any]]:
+        """The fields of each record, without the spikes."""
+        return (parse_fields(self.path, data) for data in self._data())
+
+    def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]]:
+        """All spikes in the order they were written: times in s and channels, of some thousand records at a time."""
+        spikes = map(_spikes, self._data())
+        while block := list(itertools.islice(spikes, _BLOCK_RECORDS)):
+            times_s, channels = zip(*block, strict=True)
+            yield np.concatenate(times_s), np.concatenate(channels)
+
+    def _data(self) -> Iterator[bytes]:
+        with open_file(self.path) as file:
+            file.seek(self.places[0])
+            for place, end in itertools.pairwise(self.places):
+                yield file.read(end - place)
 
 
 def read_log(path: str | os.PathLike[str]) -> Log:
@@ -193,28 +155,22 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         InvalidFile: if it is missing, not a log, or has no intact first record.
     """
     path = expect_plain_file(path)
-    with open_log(path) as file:
+    with open_file(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InvalidFile(f"{path}: expected the log of a closed-loop session, got something else")
         places, n_bytes = array("Q", [len(MAGIC)]), os.fstat(file.fileno()).st_size
         while (end := _end_of_intact(file, places[-1], n_bytes)) is not None:
             places.append(end)
         if len(places) < 2:
-            raise InvalidFile(
-                f"{path}: expected the log of a closed-loop session, got one that ends in its first record"
-            )
+            raise InvalidFile(f"{path}: expected the log of a closed-loop session, got one cut off in its first record")
         file.seek(places[0])
         header = parse_fields(path, file.read(places[1] - places[0]))
-    return Log(header, Records(path, places[1:]), n_bytes - places[-1])
+    return Log(path, header, places[1:], n_bytes - places[-1])
 
 
 @contextmanager
-def open_log(path: Path) -> Iterator[BinaryIO]:
-    """Open a log file for reading.
-
-    Raises:
-        InvalidFile: if it cannot be read.
-    """
+def open_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a log, or a table beside it, for reading; raises InvalidFile if it cannot be read."""
     try:
         with path.open("rb", buffering=_BUFFER_BYTES) as file:
             yield file
@@ -237,16 +193,16 @@ def _end_of_intact(file: BinaryIO, at: int, n_bytes: int) -> int | None:
 
 
 def parse_record(path: Path, data: bytes) -> Record:
-    """A record from its bytes, which are intact; `path` is for messages.
+    """A record from its bytes, which are intact; raises InvalidFile, naming `path`, if its fields are not JSON."""
+    return Record(parse_fields(path, data), *_spikes(data))
 
-    Raises:
-        InvalidFile: if its fields are not JSON.
-    """
+
+def _spikes(data: bytes) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+    """The times and channels of a record's spikes."""
     _, n_fields, n_spikes, _ = HEAD.unpack_from(data)
-    times_at = HEAD.size + n_fields
-    times_s = np.frombuffer(data, "<f8", n_spikes, times_at).astype(np.float64)
-    channels = np.frombuffer(data, "<i4", n_spikes, times_at + 8 * n_spikes).astype(np.int64)
-    return Record(parse_fields(path, data), times_s, channels)
+    at = HEAD.size + n_fields
+    channels = np.frombuffer(data, "<i4", n_spikes, at + 8 * n_spikes)
+    return np.frombuffer(data, "<f8", n_spikes, at).astype(np.float64), channels.astype(np.int64)
 
 
 def parse_fields(path: Path, data: bytes) -> dict[str, Any]:
@@ -261,25 +217,18 @@ def parse_fields(path: Path, data: bytes) -> dict[str, Any]:
     return _with_current_names(fields)
 
 
-_RECORD = {"contenders": "agents", "sentence": "message"}
-_LOOP = {"lead_in": "warm_up", "following": "adaptive"}
-_TICK = {"contender": "agent"}
-_HANDLED = {"lead-in": "warm-up"}
+_CURRENT = {"contenders": "agents", "sentence": "message", "contender": "agent"}
+_CURRENT |= {"lead_in": "warm_up", "following": "adaptive"}
+"""Names in older logs, and the current ones."""
 
 
 def _with_current_names(fields: dict[str, Any]) -> dict[str, Any]:
-    """A record's fields with the old names of older logs replaced by the current ones."""
-    fields = _rename(fields, _RECORD)
-    if isinstance(loop := fields.get("loop"), dict):
-        fields["loop"] = _rename(loop, _LOOP)
-    if isinstance(tick := fields.get("tick"), dict):
-        fields["tick"] = tick = _rename(tick, _TICK)
-        if isinstance(handled := tick.get("handled"), str):
-            tick["handled"] = _HANDLED.get(handled, handled)
+    """A record's fields with the names of older logs replaced, also in its loop and its tick."""
+    fields = {_CURRENT.get(name, name): value for name, value in fields.items()}
+    for part in fields.keys() & {"loop", "tick"}:
+        if isinstance(fields[part], dict):
+            fields[part] = {_CURRENT.get(name, name): value for name, value in fields[part].items()}
+    tick = fields.get("tick")
+    if isinstance(tick, dict) and tick.get("handled") == "lead-in":
+        tick["handled"] = "warm-up"
     return fields
-
-
-def _rename(fields: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    if names.keys().isdisjoint(fields):
-        return fields
-    return {names.get(name, name): value for name, value in fields.items()}

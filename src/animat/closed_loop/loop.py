@@ -25,6 +25,7 @@ from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
 from animat.robots.base import Robot
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
+from animat.tables import read_only
 from animat.training.policy import Policy
 
 OnBurst = Literal["use", "repeat", "skip"]
@@ -65,11 +66,9 @@ class Loop:
         on_late: after a late pulse: `"continue"`, or `"stop"` the session; it is logged.
         pause_s: seconds without a stimulus before each episode, and each time in the settling.
         warm_up: trials of each condition after the pause, in random order, before the robot moves: a rested culture
-            responds differently from a recorded one. The responses count for adaptive thresholds. None: 2 where an
-            action is one pulse, 0 where it is several, which are each other's history.
-        settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode. A recording
-            tires a culture more than a loop does, and the culture recovers in the first minute. None: `SETTLINGS` where
-            thresholds adapt and an action is one pulse, else 0.
+            responds differently from a recorded one. None: 2 where an action is one pulse, 0 where it is several.
+        settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode, as a culture
+            recovers from its recording. None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
         patience_s: time beyond the expected that a culture may take to answer before it counts as hung; and the time
             that the robot, and an agent, may take.
         real_time: whether a culture that is faster is held back to real time.
@@ -104,14 +103,10 @@ class Loop:
 
     def __post_init__(self) -> None:
         expect_fit(self.robot.name, self.robot.n_commands, len(self.readouts))
-        percentiles = np.array(self.percentiles, np.float32)
+        given, percentiles = self.percentiles, read_only(self, "percentiles", np.float32)
         if percentiles.shape != self.decoder.percentiles_shape or not np.all(np.diff(percentiles) >= 0):
             each = f" for each of {len(self.readouts)} readouts" if len(self.readouts) > 1 else ""
-            raise InvalidArgument(
-                f"percentiles: expected {N_PERCENTILES} rising numbers in Hz{each}, got {self.percentiles}"
-            )
-        percentiles.setflags(write=False)
-        object.__setattr__(self, "percentiles", percentiles)
+            raise InvalidArgument(f"percentiles: expected {N_PERCENTILES} rising numbers in Hz{each}, got {given}")
         check_window(self.window_ms)
         _ = self.presentation
         _ = self.encoder
@@ -120,14 +115,11 @@ class Loop:
         for name, allowed in (("on_burst", get_args(OnBurst)), ("on_late", get_args(OnLate))):
             if getattr(self, name) not in allowed:
                 raise InvalidArgument(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
-        if self.warm_up is None:
-            object.__setattr__(self, "warm_up", 2 if self.pulses == 1 else 0)
-        if self.settling is None:
-            object.__setattr__(
-                self, "settling", SETTLINGS if self.pulses == 1 and self.adaptive_from is not None else 0
-            )
-        for name in ("warm_up", "settling"):
-            if not (isinstance(number := getattr(self, name), int) and 0 <= number <= MOST_WARM_UP):
+        for name, usual in {"warm_up": 2, "settling": SETTLINGS if self.adaptive_from is not None else 0}.items():
+            if (number := getattr(self, name)) is None:
+                number = usual if self.pulses == 1 else 0
+                object.__setattr__(self, name, number)
+            if not (isinstance(number, int) and 0 <= number <= MOST_WARM_UP):
                 raise InvalidArgument(f"{name}: expected a whole number from 0 to {MOST_WARM_UP}, got {number!r}")
         for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -196,14 +188,16 @@ class Loop:
         recorded = policy.presentation
         if pulses is None:
             pulses = 1 if recorded is None else recorded.pulses
-        trained = {"conditions": policy.conditions, "window_ms": policy.window_ms, "readouts": policy.readouts}
-        settings = {**trained, **settings}
-        if settings["window_ms"] is None:
-            del settings["window_ms"]
-        loop = cls(
-            policy.robot, policy.mapping, percentiles=np.asarray(percentiles, np.float32), pulses=pulses, **settings
-        )
-        return loop, _differences(policy, loop)
+        window_ms = policy.window_ms or DEFAULT_WINDOW_MS
+        settings = {"conditions": policy.conditions, "window_ms": window_ms, "readouts": policy.readouts, **settings}
+        percentiles = np.asarray(percentiles, np.float32)
+        loop = cls(policy.robot, policy.mapping, percentiles=percentiles, pulses=pulses, **settings)
+        findings = list(other_presentation(recorded, loop.presentation))
+        if policy.window_ms not in (None, loop.window_ms):
+            trained, read = describe_window(policy.window_ms), describe_window(loop.window_ms)
+            message = f"the policy was trained on responses {trained}, but the loop reads those {read}"
+            findings.append(Finding("other-window", "warning", message))
+        return loop, tuple(findings)
 
     def to_dict(self) -> dict[str, Any]:
         """As plain data, for the log of a session."""
@@ -219,12 +213,3 @@ class Loop:
             "readouts": self.readouts.to_dict(),
             "pulse": self.pulse.to_list(),
         }
-
-
-def _differences(policy: Policy, loop: Loop) -> tuple[Finding, ...]:
-    findings = list(other_presentation(policy.presentation, loop.presentation))
-    if policy.window_ms is not None and policy.window_ms != loop.window_ms:
-        trained, read = describe_window(policy.window_ms), describe_window(loop.window_ms)
-        message = f"the policy was trained on responses {trained}, but the loop reads those {read}"
-        findings.append(Finding("other-window", "warning", message))
-    return tuple(findings)

@@ -14,8 +14,6 @@ class Episode:
     """One episode of an agent.
 
     Attributes:
-        number: in the session, from 0.
-        agent: its name.
         start: the observation before the first step; empty in older logs, which do not have it.
         total: the sum of rewards, in the task's own units.
         iterations: of the robot.
@@ -25,8 +23,6 @@ class Episode:
         warm_up_pulses: those before the robot moved; the following counts exclude the warm-up.
         electrode_pulses: one for each electrode of each pulse.
         trials: including repeated ones.
-        bursts: responses that were bursts.
-        late: trials that came late.
     """
 
     number: int
@@ -45,16 +41,16 @@ class Episode:
 
 
 class Outline:
-    """Counts of a session's records, which are added in order.
+    """Counts of a session's records, which are added in order: those of an `Episode`, for all together.
 
     Attributes:
         left_out: what the culture's device reported and the session lacks, by kind; known at the end.
-        ticks: number of ticks.
-        pulses: that the culture received.
-        bursts: responses that were bursts.
         late: ticks whose pulses came late.
         latest_s: the largest lateness.
         moved_at_s: when a robot first moved, on the clock of `wall_s`; None before.
+        answered: the last stretch of time that the culture answered; -1 before.
+        moving: the last episode in which a robot moved; None before.
+        returns: of each agent's whole episodes.
     """
 
     def __init__(self) -> None:
@@ -62,10 +58,12 @@ class Outline:
         self.ticks = self.pulses = self.bursts = self.late = 0
         self.latest_s = 0.0
         self.moved_at_s: float | None = None
+        self.moving: Episode | None = None
+        self.returns: dict[str, list[float]] = {}
         self._starts: dict[int, tuple[float, ...]] = {}
         self._episodes: dict[int, Episode] = {}
         self._pending: dict[int, dict[str, Any]] = {}
-        self._answered = -1
+        self.answered = -1
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -76,16 +74,13 @@ class Outline:
     def unanswered(self) -> tuple[dict[str, Any], ...]:
         """Fields of requests that were never answered in a usable way: whether their pulses were delivered is not
         known, and no recording has them."""
-        return tuple(
-            fields
-            for fields in self._pending.values()
-            if any(pattern != NOTHING for _, pattern, *_ in fields["stimuli"]) and fields.get("is_admitted", True)
-        )
+        pending = self._pending.values()
+        return tuple(fields for fields in pending if _count_pulses(fields) and fields.get("is_admitted", True))
 
     @property
     def unanswered_pulses(self) -> int:
         """Number of pulses that were requested and never answered."""
-        return sum(pattern != NOTHING for fields in self.unanswered for _, pattern, *_ in fields["stimuli"])
+        return sum(map(_count_pulses, self.unanswered))
 
     def add(self, fields: Mapping[str, Any]) -> None:
         """Count one record."""
@@ -94,13 +89,13 @@ class Outline:
             # Older logs do not number their stretches.
             if stretch is not None:
                 self._pending.pop(stretch, None)
-                self._answered = max(self._answered, stretch)
+                self.answered = max(self.answered, stretch)
             if fields["tick"]:
                 self._add_tick(fields["tick"], count_electrode_pulses(fields))
         elif kind in ("asked", "event"):
             # Another thread writes the request: its record may follow that of its answer, or that of the event that
             # ended it, which has more fields.
-            if stretch is not None and stretch > self._answered and (kind == "event" or stretch not in self._pending):
+            if stretch is not None and stretch > self.answered and (kind == "event" or stretch not in self._pending):
                 self._pending[stretch] = dict(fields)
         elif kind == "start":
             self._starts[fields["episode"]] = tuple(fields["observation"])
@@ -112,8 +107,7 @@ class Outline:
         n_pulses -= list(tick["patterns"]).count(NOTHING)
         episode = self._episodes.get(number)
         if episode is None:
-            episode = Episode(number, tick["agent"], self._starts.pop(number, ()))
-            self._episodes[number] = episode
+            episode = self._episodes[number] = Episode(number, tick["agent"], self._starts.pop(number, ()))
         self.ticks += 1
         self.pulses += n_pulses
         self.bursts += tick["is_burst"]
@@ -126,6 +120,7 @@ class Outline:
             episode.warm_up_pulses += n_pulses
             return
         self.moved_at_s = tick.get("wall_s") if self.moved_at_s is None else self.moved_at_s
+        self.moving = episode
         episode.electrode_pulses += electrode_pulses
         episode.trials += 1
         episode.bursts += tick["is_burst"]
@@ -133,6 +128,12 @@ class Outline:
         if tick["reward"] is not None:
             episode.total += tick["reward"]
             episode.iterations += 1
+        if episode.is_whole:
+            self.returns.setdefault(episode.agent, []).append(episode.total)
+
+
+def _count_pulses(fields: Mapping[str, Any]) -> int:
+    return sum(pattern != NOTHING for _, pattern, *_ in fields["stimuli"])
 
 
 def count_electrode_pulses(fields: Mapping[str, Any]) -> int:

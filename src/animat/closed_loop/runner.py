@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -18,32 +18,15 @@ from animat.wrappers import other_goal
 
 
 class Moved(NamedTuple):
-    """The result of a step.
+    """The result of a step, in the robot's own units.
 
-    Attributes:
-        reward: in the task's own units.
-        terminated: the task ended by itself.
-        observation: after the step, in the robot's own units.
-        truncated: the robot itself cut the episode off; at its `episode_limit` the caller does.
+    `truncated`: the robot itself cut the episode off; at its `episode_limit` the caller does.
     """
 
     reward: float
     terminated: bool
     observation: Float64[np.ndarray, " observations"]
     truncated: bool = False
-
-
-class Runner(Protocol):
-    """A robot with its state."""
-
-    def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Start an episode where the robot draws it, in the same state for the same number; returns the observation."""
-
-    def step(self, u: ArrayLike) -> Moved:
-        """Move by one or several commands in [-1, 1]."""
-
-    def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """Give the robot another goal, the same for the same number; returns the observation."""
 
 
 @lru_cache(maxsize=8)
@@ -70,16 +53,12 @@ def _compiled(robot: Robot[Any]) -> tuple[Callable[..., Any], ...]:
 class RobotRunner:
     """A robot with its state; its step is compiled once, in advance, and takes some 30 us.
 
-    Args:
-        robot: that is moved.
-        rng: draws the robot's noise, and the starts of its episodes.
+    The generator draws the robot's noise, and the starts of its episodes.
     """
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator) -> None:
         self.robot, self._rng = robot, rng
-        # A robot that cannot be hashed is compiled for each runner.
-        compiled = _compiled if isinstance(robot, Hashable) else _compiled.__wrapped__
-        self._step, self._start, self._switch = compiled(robot)
+        self._step, self._start, self._switch = _compiled(robot)
         self._key = jax.random.key(int(rng.integers(2**31)))
         # Other goals come from starts that no episode has.
         self._goals = jax.random.split(self._key)[1]
@@ -88,25 +67,25 @@ class RobotRunner:
         self.step(np.zeros(() if robot.n_commands == 1 else robot.n_commands))
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """As in `Runner`."""
+        """Start an episode where the robot draws it, in the same state for the same number; returns the observation."""
         self._state, observation = self._start(self._key, number)
         return np.asarray(observation, np.float64)
 
     def step(self, u: ArrayLike) -> Moved:
-        """As in `Runner`."""
+        """Move by one or several commands in [-1, 1]."""
         uniforms = self._rng.random(self.robot.noise_size, dtype=np.float32)
         self._state, stepped = self._step(uniforms, self._state, np.asarray(u, np.float32))
         stepped = np.asarray(stepped, np.float64)
         return Moved(float(stepped[0]), bool(stepped[1]), stepped[2:])
 
     def switch_goal(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """As in `Runner`: the goal of another start."""
+        """Give the robot the goal of another start, the same for the same number; returns the observation."""
         self._state, observation = self._switch(self._goals, number, self._state)
         return np.asarray(observation, np.float64)
 
 
 class HostRunner:
-    """A robot that is stepped on the host, with its state; arguments as for `RobotRunner` and `Bodies`."""
+    """A robot that is stepped on the host, with its state; arguments and methods as for `RobotRunner` and `Bodies`."""
 
     def __init__(self, robot: Robot[Any], rng: np.random.Generator, *, with_pictures: bool = False) -> None:
         assert isinstance(robot, HostRobot)
@@ -117,12 +96,10 @@ class HostRunner:
         self.step(np.zeros(robot.n_commands))
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
-        """As in `Runner`."""
         self._bodies.reseed([(self._entropy, number)])
         return np.asarray(self._bodies.begin()[0], np.float64)
 
     def step(self, u: ArrayLike) -> Moved:
-        """As in `Runner`."""
         stepped = self._bodies.step(np.asarray(u, np.float32).reshape(1, -1))
         (reward,), (terminated,), (truncated,) = stepped.reward, stepped.terminated, stepped.truncated
         return Moved(float(reward), bool(terminated), stepped.observation[0].astype(np.float64), bool(truncated))
@@ -134,3 +111,6 @@ class HostRunner:
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """A picture of the robot now; None if it draws none."""
         return self._bodies.picture()
+
+
+Runner: TypeAlias = RobotRunner | HostRunner

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -13,20 +14,22 @@ from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, 
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from animat.closed_loop.agents import Agent, InTurn, interleave
+from animat.closed_loop.agents import Agent, interleave
 from animat.closed_loop.driver import Driver
 from animat.closed_loop.header import FORMAT, observed_columns, read_header
-from animat.closed_loop.interrupts import stop_on_signals
 from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
+from animat.closed_loop.outline import Outline
 from animat.closed_loop.session import Session, expect_no_session
 from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
 from animat.closed_loop.tick import Ending
-from animat.closed_loop.timing import Clock, WallClock, drop_real_time_priority, real_time_priority
+from animat.closed_loop.timing import Clock, drop_real_time_priority, real_time_priority
+from animat.ctrl_c import KILLS, handled
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
@@ -66,16 +69,13 @@ def run_session(
     """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
     Whatever happens, `session.log` has every tick except those of the last 0.2 s before a SIGKILL, and the stimuli
-    that were requested and not yet answered. Once this or `recover_session` returns, `session.nwb` is a recording like
-    any other. Unless the plan was completed or the budget spent, the culture is then stopped: it delivers nothing until
-    it is closed and opened again. `ending` says what happened; nothing is raised for it, not even for Ctrl-C and
-    SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An exception of `progress` is raised
-    again, once the culture is stopped and the log is written.
+    that were requested and not yet answered. Unless the plan was completed or the budget spent, the culture is then
+    stopped: it delivers nothing until it is closed and opened again. `ending` says what happened; nothing is raised for
+    it, not even for Ctrl-C and SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An
+    exception of `progress` is raised again, once the culture is stopped and the log is written.
 
     Args:
         culture: open; it stays open.
-        loop: the settings.
-        agents: of the session.
         folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line per tick.
         episodes: of each agent; one number, or one for each.
         seed: decides every random draw, except what the culture does.
@@ -85,10 +85,9 @@ def run_session(
         predicted: mean return expected of each agent, with its interval; stored in the log for viewers.
 
     Raises:
-        InvalidArgument: for a culture that is closed or stopped, no agents, an agent that sees the history state in a
-            loop without one, a prediction for an unknown agent, or a folder with a session or a file `STOP`.
-        Mismatch: for conditions on electrodes that the culture cannot stimulate, readouts of electrodes that it does
-            not record, or a folder of other work.
+        InvalidArgument: for a culture, agents, a prediction or a loop that cannot be run, or a folder with a session or
+            a file `STOP`.
+        Mismatch: for electrodes that the culture does not stimulate or record, or a folder of other work.
         InvalidFile: if the folder is a file, or the log cannot be begun.
         UnsafeStimulus: for a pulse beyond the culture's limits.
     """
@@ -100,15 +99,14 @@ def run_session(
     stop_file = Path(folder) / STOP_FILE
     if stop_file.exists():
         raise InvalidArgument(f"{stop_file}: expected none yet, as it ends a session: remove it first")
-    account, progress = account or Account(), progress or Silent()
     turns = _put_sources_first(interleave(planned, np.random.default_rng([seed, 20])), agents)
-    driver = Driver(culture, loop, agents, turns, account, clock or WallClock(), seed, stop_file)
+    driver = Driver(culture, loop, agents, turns, account or Account(), clock or Clock(), seed, stop_file)
     file = Path(folder) / LOG_FILE
     # As it is read back from the log.
-    header = json.loads(json.dumps(_header(culture, loop, agents, turns, account, seed, predicted or {})))
+    header = json.loads(json.dumps(_header(driver, predicted or {})))
     read_header(file, header)
     with closing(LogWriter(file, header)) as log:
-        ending = _Supervisor(culture, loop, driver, log, progress, len(turns)).run()
+        ending = _Supervisor(driver, log, progress or Silent()).run()
         session = Session(file.parent, log.written(), ending)
         try:
             session.write()
@@ -122,28 +120,21 @@ def run_session(
 
 
 class _Supervisor:
-    def __init__(
-        self,
-        culture: Culture,
-        loop: Loop,
-        driver: Driver,
-        log: LogWriter,
-        progress: Progress,
-        episodes: int,
-    ) -> None:
-        self._culture, self._loop, self._driver = culture, loop, driver
-        self._log, self._progress, self._episodes = log, progress, episodes
-        self._synced = time.monotonic()
+    def __init__(self, driver: Driver, log: LogWriter, progress: Progress) -> None:
+        self._driver, self._culture, self._loop = driver, driver.culture, driver.loop
+        self._log, self._progress, self._synced = log, progress, time.monotonic()
+        self._outline = Outline()
         self._ending: Ending | None = None
-        self._logged_request = self._logged_answer = -1
+        self._logged_request = -1
         self._not_halted: str | None = None
-        self._left_out = culture.left_out
+        self._left_out = driver.culture.left_out
 
     def run(self) -> Ending:
         """Start the loop and supervise it until its end."""
         thread = threading.Thread(target=self._drive, name="closed loop", daemon=True)
         with ExitStack() as stack:
-            stack.enter_context(stop_on_signals(self._stop_for_person))
+            # They request an end instead of interrupting the loop.
+            stack.enter_context(handled((signal.SIGINT, *KILLS), lambda *_: self._stop_for_person()))
             if gc.isenabled():
                 # A collection can take 50 ms, and the loop makes no cycles.
                 stack.callback(gc.enable)
@@ -162,21 +153,18 @@ class _Supervisor:
                 with suppress(Exception):
                     self._end(thread, ending)
                 raise
-            if ending is not None:
-                return self._end(thread, ending)
-            ending = self._ending or Ending("crash", "the loop's thread ended without giving a reason")
-            if ending.by not in ("plan", "budget"):
-                self._halt(ending)
-            return self._finish(ending)
+            return self._end(thread, ending)
 
     def _end(self, thread: threading.Thread, ending: Ending) -> Ending:
-        """Ask a loop that did not end by itself to end, and abandon it if it does not."""
-        self._driver.is_stopped = True
-        self._halt(ending)
-        thread.join(_GRACE_S)
+        """Stop the culture; ask a loop that did not end by itself to end, and abandon it if it does not."""
+        if ending.by not in ("plan", "budget"):
+            self._driver.is_stopped = True
+            self._halt(ending)
         if thread.is_alive():
-            drop_real_time_priority(thread)
-        self._halt(ending)
+            thread.join(_GRACE_S)
+            if thread.is_alive():
+                drop_real_time_priority(thread)
+            self._halt(ending)
         return self._finish(ending)
 
     def _drive(self) -> None:
@@ -190,11 +178,13 @@ class _Supervisor:
             return nullcontext()
         return real_time_priority(inherited=inherited)
 
-    def _watch(self, thread: threading.Thread) -> Ending | None:
-        """Log and watch while the loop runs; returns why it must be ended from outside, or None if it ended."""
-        driver = self._driver
-        while thread.is_alive():
+    def _watch(self, thread: threading.Thread) -> Ending:
+        """Log and watch while the loop runs; returns why it ended, or must be ended from outside."""
+        driver, is_running = self._driver, True
+        while is_running:
             thread.join(_POLL_S)
+            # Looked at before writing, so that the last records are written and reported too.
+            is_running = thread.is_alive()
             try:
                 self._write()
             except OSError as error:
@@ -207,8 +197,20 @@ class _Supervisor:
                 return Ending(
                     "hang", f"{who} did not answer {self._loop.patience_s:g} s after it should have: abandoned"
                 )
-            self._progress.update(driver.standing.episodes, self._episodes, driver.standing.note())
-        return None
+            self._report()
+        return self._ending or Ending("crash", "the loop's thread ended without giving a reason")
+
+    def _report(self) -> None:
+        """Report how many episodes are over, the last return, and the agents' means; `"warm-up"` before any."""
+        episode, returns = self._outline.moving, self._outline.returns
+        done: float = sum(map(len, returns.values()))
+        note = "warm-up"
+        if episode is not None:
+            done += 0 if episode.is_whole else min(1.0, episode.iterations / self._loop.robot.episode_limit)
+            note = f"{episode.agent}: return {episode.total:.1f}{'' if episode.is_whole else ' so far'}"
+        if returns:
+            note += f"; means: {', '.join(f'{name} {fmean(of):.1f}' for name, of in returns.items())}"
+        self._progress.update(done, len(self._driver.turns), note)
 
     def _write(self) -> None:
         records = self._driver.records
@@ -216,8 +218,7 @@ class _Supervisor:
         for number in range(len(records)):
             self._log.append(records[0])
             # Removed only once written, so that a full disk loses no record that could be written later.
-            written = records.popleft().fields
-            self._logged_answer = written["stretch"] if written["kind"] == "seen" else self._logged_answer
+            self._outline.add(records.popleft().fields)
             if number % _BATCH == _BATCH - 1:
                 # A pause of 0 would not yield the processor to the loop's thread on a single core.
                 time.sleep(_PAUSE_S)
@@ -239,7 +240,7 @@ class _Supervisor:
             # Read before writing: if the robot answers just now, its finished tick is among the written records.
             unfinished = self._driver.unfinished
             self._write()
-            if unfinished is not None and unfinished.fields["stretch"] > self._logged_answer:
+            if unfinished is not None and unfinished.fields["stretch"] > self._outline.answered:
                 self._log.append(unfinished)
             left_out = more_left_out(self._left_out, self._culture.left_out)
             fields = {"kind": "end", "by": ending.by, "message": ending.message, "left_out": left_out}
@@ -274,16 +275,8 @@ class _Supervisor:
             self._not_halted = None
 
 
-def _header(
-    culture: Culture,
-    loop: Loop,
-    agents: Sequence[Agent],
-    turns: Sequence[int],
-    account: Account,
-    seed: int,
-    predicted: Mapping[str, Interval],
-) -> dict[str, Any]:
-    channels = culture.channels
+def _header(driver: Driver, predicted: Mapping[str, Interval]) -> dict[str, Any]:
+    culture, loop, agents, channels = driver.culture, driver.loop, driver.agents, driver.culture.channels
     predictions = {name: {"mean": r.value, "low": r.low, "high": r.high} for name, r in predicted.items()}
     return {
         "kind": "header",
@@ -296,12 +289,12 @@ def _header(
         "provenance": culture.provenance,
         "limits": asdict(culture.limits),
         # Including what was spent before the session.
-        "account": account.to_dict(),
+        "account": driver.account.to_dict(),
         "loop": loop.to_dict(),
         "observed": observed_columns(loop.robot),
         "agents": [_agent_to_dict(agent) for agent in agents],
-        "turns": [agents[turn].name for turn in turns],
-        "seed": seed,
+        "turns": [agents[turn].name for turn in driver.turns],
+        "seed": driver.seed,
         **({"predicted": predictions} if predictions else {}),
     }
 
@@ -312,8 +305,8 @@ def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
     for number, agent in enumerate(agents):
         if agent.delivery != "yoked" or number not in turns:
             continue
-        assert isinstance(agent.controller, InTurn)
-        sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller.by_name]
+        assert isinstance(agent.controller, Mapping)
+        sources = [i for i, turn in enumerate(turns) if agents[turn].name in agent.controller]
         if not sources:
             raise InvalidArgument(f"agents: expected episodes for {agent.name!r} to repeat, got none")
         if (first := turns.index(number)) < sources[0]:
@@ -324,7 +317,7 @@ def _put_sources_first(turns: list[int], agents: Sequence[Agent]) -> list[int]:
 def _agent_to_dict(agent: Agent) -> dict[str, Any]:
     optional = {
         # The controllers of successive episodes, in a cycle.
-        "in_turn": list(agent.controller.by_name) if isinstance(agent.controller, InTurn) else [],
+        "in_turn": list(agent.controller) if isinstance(agent.controller, Mapping) else [],
         "is_drawn": agent.drawn_from is not None,
         "is_turned_round": agent.is_turned_round,
         "switch_at": agent.switch_at,
@@ -334,11 +327,7 @@ def _agent_to_dict(agent: Agent) -> dict[str, Any]:
 
 
 def check_episodes(name: str, episodes: int) -> None:
-    """Refuse no episodes, or more than a session can plan: all turns are drawn before the first episode.
-
-    Raises:
-        InvalidArgument: under the name of the argument or option.
-    """
+    """Raise InvalidArgument for no episodes, or more than a session can plan: all turns are drawn before the first."""
     if not 1 <= episodes <= MOST_EPISODES:
         expected = "at least 1" if episodes < 1 else f"at most {MOST_EPISODES:,}"
         raise InvalidArgument(f"{name}: expected {expected}, got {shown(episodes)}")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from animat.closed_loop.header import Header, read_header
-from animat.closed_loop.log import Log, Records, read_log
+from animat.closed_loop.log import Log, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
 from animat.closed_loop.tick import Ending, Tick, TickTable
@@ -31,21 +31,15 @@ _UPDATE_EVERY = 1000
 class Ticks(Iterable[Tick]):
     """Every tick of a log, in order of time, read again on each iteration."""
 
-    records: Records
+    log: Log
 
     def __iter__(self) -> Iterator[Tick]:
-        return (Tick.from_dict(fields["tick"]) for fields in self.records.fields() if fields.get("tick"))
+        return (Tick.from_dict(fields["tick"]) for fields in self.log.fields() if fields.get("tick"))
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A session as its log describes it; long parts are read on demand.
-
-    Attributes:
-        folder: of the session.
-        log: everything that was written.
-        ending: how it ended.
-    """
+    """A session as its log describes it; long parts are read on demand."""
 
     folder: Path
     log: Log
@@ -64,7 +58,7 @@ class Session:
     @property
     def ticks(self) -> Ticks:
         """Every tick, in order of time."""
-        return Ticks(self.log.records)
+        return Ticks(self.log)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -86,7 +80,7 @@ class Session:
             InvalidFile: for an inconsistent log.
         """
         with expect_session_log(self.folder / LOG_FILE):
-            blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.records.spike_blocks()]
+            blocks = [(np.empty(0), np.empty(0, np.int64)), *self.log.spike_blocks()]
             times_s, channels = (np.concatenate(column) for column in zip(*blocks, strict=True))
             # Stretches may touch, and times rounded to samples then overlap by one.
             order = np.argsort(times_s, kind="stable")
@@ -96,20 +90,16 @@ class Session:
     def write(self, progress: Progress | None = None) -> None:
         """Write the ticks as a table, and then the recording: if the recording exists, both do.
 
-        Args:
-            progress: updated with the number of records read.
-
         Raises:
             InvalidFile: for an inconsistent log, or if a file cannot be written.
         """
-        header = self._header
         with expect_session_log(self.folder / LOG_FILE):
             with atomic_write(self.ticks_file) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-                table = TickTable(file, header.conditions, header.observed, header.readouts)
+                table = TickTable(file, self._header)
                 # Keep what was read, for `outline` and `recording`.
                 vars(self)["_data"] = data = self._collect(table, progress)
             recording = data.recording_without_spikes(self.ending)
-            write_nwb(recording, self.recording_file, self.log.records.spike_blocks(), data.spike_counts)
+            write_nwb(recording, self.recording_file, self.log.spike_blocks(), data.spike_counts)
 
     def to_dict(self) -> dict[str, Any]:
         """The outline as plain data."""
@@ -139,13 +129,13 @@ class Session:
 
     def _collect(self, table: TickTable | None = None, progress: Progress | None = None) -> SessionData:
         """Read all records once, and write their ticks into a table."""
-        data, records = SessionData(self._header), self.log.records
-        for number, record in enumerate(records):
+        data = SessionData(self._header)
+        for number, record in enumerate(self.log):
             data.add(record)
             if table is not None and record.fields["kind"] == "seen" and record.fields["tick"]:
                 table.add({**record.fields["tick"], "electrode_pulses": count_electrode_pulses(record.fields)})
             if progress is not None and number % _UPDATE_EVERY == 0:
-                progress.update(number, len(records))
+                progress.update(number, len(self.log))
         return data
 
 
@@ -164,7 +154,7 @@ def read_session(path: str | os.PathLike[str]) -> Session:
     read_header(file, log.header)
     ending = Ending("crash", "no ending was written: the program was killed, or is still running")
     # The ending is the last record.
-    last = log.records[-1].fields if len(log.records) else {}
+    last = log[-1].fields if len(log) else {}
     with expect_session_log(file):
         if last.get("kind") == "end":
             ending = Ending(last["by"], last["message"])
@@ -172,11 +162,10 @@ def read_session(path: str | os.PathLike[str]) -> Session:
 
 
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
-    """Make the folder of a new session; the error for an existing session says what to do with it.
+    """Make the folder of a new session.
 
     Raises:
-        InvalidArgument: if the folder holds a session.
-        Mismatch: if it holds work of another kind, such as recordings.
+        InvalidArgument, Mismatch: if it holds a session, saying what to do with it, or other work.
         InvalidFile: if it is a file, or cannot be made or written to.
     """
     folder = Path(folder)
@@ -195,11 +184,7 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
 
 
 def recover_session(path: str | os.PathLike[str], progress: Progress | None = None) -> Session:
-    """Read a session whose program was killed, and write its missing recording and table.
-
-    Args:
-        path: of its folder or its log.
-        progress: updated with the number of records read.
+    """Read a session, from its folder or its log, whose program was killed, and write its missing recording and table.
 
     Raises:
         InvalidFile: if the log cannot be read or the recording not written.
@@ -221,11 +206,8 @@ def _expect_no_loss(session: Session) -> None:
     """Raise if the existing table has more ticks than a damaged log: overwriting it would lose ticks."""
     if not session.log.lost_bytes or not session.ticks_file.exists():
         return
-    try:
-        with session.ticks_file.open("rb") as table:
-            written = sum(1 for _ in table) - 1
-    except OSError as error:
-        raise InvalidFile(f"{session.ticks_file}: cannot be read: {error.strerror or error}") from error
+    with open_file(session.ticks_file) as table:
+        written = sum(1 for _ in table) - 1
     if written > session.outline.ticks:
         raise Mismatch(
             f"{session.ticks_file}: expected no more ticks than the log has, which is damaged after "

@@ -28,15 +28,7 @@ STOP_FILE = "STOP"
 
 
 class SessionData:
-    """What a session's files need from its records, except the spikes, which stay in the log.
-
-    Args:
-        header: of the session.
-
-    Attributes:
-        outline: counts of the records.
-        spike_counts: of each channel.
-    """
+    """What a session's files need from its records, except the spikes, which stay in the log."""
 
     def __init__(self, header: Header) -> None:
         self.outline = Outline()
@@ -49,7 +41,6 @@ class SessionData:
         self._watched_s = self._end_s = 0.0
 
     def add(self, record: Record) -> None:
-        """Add one record."""
         fields = record.fields
         self.outline.add(fields)
         self.spike_counts.add(record.spike_times_s, record.spike_channels)
@@ -67,14 +58,7 @@ class SessionData:
         self._end_s = max(self._end_s, fields["start_s"] + fields["duration_s"])
 
     def recording_without_spikes(self, ending: Ending) -> Recording:
-        """The session as a recording, without its spikes.
-
-        Args:
-            ending: how the session ended.
-
-        Raises:
-            UnusableData: for inconsistent records.
-        """
+        """The session as a recording, without its spikes; raises UnusableData for inconsistent records."""
         header, outline = self._header, self.outline
         metadata = {
             **header.provenance,

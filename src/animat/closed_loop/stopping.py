@@ -2,25 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from animat.closed_loop.tick import Ending
 from animat.cultures.base import Culture
 from animat.cultures.failures import describe_error
 from animat.errors import UnsafeStimulus
-
-
-def file_exists(file: Path) -> bool:
-    """Whether a file exists; checked before every trial.
-
-    Raises:
-        OSError: if that cannot be determined, for example in an unreadable folder.
-    """
-    try:
-        file.stat()
-    except FileNotFoundError:
-        return False
-    return True
 
 
 class Stop(Exception):

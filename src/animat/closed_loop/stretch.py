@@ -1,14 +1,11 @@
-"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response.
-
-The closed loop checks every answer of a backend before using it.
-"""
+"""A stretch of time of a closed loop: the request to the culture, the check of its answer, and the response."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -24,10 +21,9 @@ from animat.stimulation.stimulus import Stimulus
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """A request to the culture; it is logged even if no answer comes.
+    """A request to the culture for a stretch of time, numbered from 0; it is logged even if no answer comes.
 
     Attributes:
-        stretch: number of the stretch of time in the session, from 0.
         at_s: time of the request, on the session's clock.
         stimuli: their times count from `at_s`.
     """
@@ -51,7 +47,6 @@ class Stretch:
     """What was observed in a stretch of time; times are on the session's clock, rounded to the culture's samples."""
 
     number: int
-    asked_at_s: float
     start_s: float
     duration_s: float
     spike_times_s: Float64[np.ndarray, " spikes"]
@@ -65,10 +60,10 @@ def rows_of(stimuli: Sequence[Stimulus]) -> list[list[Any]]:
     return [[s.frequency_hz, s.pattern, s.presentation, list(s.electrodes)] for s in stimuli]
 
 
-def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None, **more: Any) -> Record:
+def stretch_record(stretch: Stretch, stimuli: Sequence[Stimulus], tick: dict[str, Any] | None) -> Record:
     """The log record of a stretch of time."""
     span = {"stretch": stretch.number, "start_s": stretch.start_s, "duration_s": stretch.duration_s}
-    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick, **more}
+    fields = {"kind": "seen", **span, "stimuli": rows_of(stimuli), "tick": tick}
     return Record(fields, stretch.spike_times_s, stretch.spike_channels)
 
 
@@ -85,13 +80,11 @@ def check_answer(
     """What is wrong with an answer of the culture, in a sentence; None for a possible one.
 
     Args:
-        observed: the answer.
         requested_s: requested times of the stimuli, counted from `since_s`: none may begin earlier.
         duration_s: requested duration, which the answer must cover at least.
         since_s: time of the request, on the culture's clock.
         from_s: earliest possible start of the answer, on the culture's clock.
         sample_s: duration of a sample; times may be rounded to whole samples.
-        n_channels: of the culture.
     """
     try:
         times_s, channel = observed.spikes
@@ -125,20 +118,6 @@ def check_answer(
     return None
 
 
-class Response(NamedTuple):
-    """A response.
-
-    Attributes:
-        x_hz: the decoder's input, one number per readout.
-        fields: of its tick (`animat.closed_loop.tick.Tick`).
-        is_burst: whether it was a burst.
-    """
-
-    x_hz: Float64[np.ndarray, "*readouts"]
-    fields: dict[str, Any]
-    is_burst: bool
-
-
 def read_response(
     loop: Loop,
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None,
@@ -146,8 +125,8 @@ def read_response(
     members: Bool[np.ndarray, "readouts channels"],
     after_s: Float64[np.ndarray, "1"],
     rng: np.random.Generator,
-) -> Response:
-    """The response after a pulse, or one drawn in its place."""
+) -> tuple[Float64[np.ndarray, "*readouts"], dict[str, Any]]:
+    """The response after a pulse, or one drawn in its place: x of each readout, Hz, and the fields of its tick."""
     rate_hz, active_ratio = read_windows(stretch, after_s, loop.window_ms)
     reads_all = loop.readouts.are_all
     x_hz = rate_hz[0] if reads_all else loop.readouts.read(stretch, members, after_s, loop.window_ms)[0]
@@ -157,12 +136,10 @@ def read_response(
     if drawn_from is not None:
         x_hz = drawn_from[rng.integers(len(drawn_from))]
         rate_hz = np.atleast_1d(x_hz) if reads_all else rate_hz
-    is_burst = bool(active_ratio[0] > loop.burst_threshold) and drawn_from is None
-    fields = {
+    return x_hz, {
         "spikes": spikes,
         "rate_hz": float(rate_hz[0]),
         "active_ratio": float(active_ratio[0]),
-        "is_burst": is_burst,
+        "is_burst": bool(active_ratio[0] > loop.burst_threshold) and drawn_from is None,
         "readout_hz": () if reads_all else tuple(np.atleast_1d(x_hz).tolist()),
     }
-    return Response(x_hz, fields, is_burst)

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self, TextIO
 
+from animat.closed_loop.header import Header
+
 Handled = Literal["used", "repeated", "skipped", "warm-up", "unfinished"]
 EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
 
@@ -16,29 +18,22 @@ class Tick:
     """One presentation, its response, and the result. Times are in seconds on the session's clock.
 
     Attributes:
-        number: of the presentation in the session, from 0.
-        agent: whose episode it is.
-        episode: number of the episode in the session, from 0.
+        number, episode: in the session, from 0.
         iteration: of the robot in the episode, from 0; a repeated presentation has its own row and the same iteration,
             and the warm-up has -1.
         chosen: the condition that was chosen, by the agent or, in a warm-up, at random.
         delivered: the condition that the culture received; of a silent agent the chosen one, without its pulses.
-        frequency_hz: frequency of the delivered condition.
+        frequency_hz: of the delivered condition.
         patterns: of each pulse, -1 where its electrodes are not one of the culture's patterns; none of a silent agent.
         pulse_time_s: when each pulse really began.
         read_after_s: time of the pulse after which the response was read, or when it would have come.
-        spikes: in the response window.
+        spikes, active_ratio: in the response window, and the share of channels that had any.
         rate_hz: x of all channels; of an agent whose responses are drawn, the drawn one.
         readout_hz: x of each readout, where these are groups of channels; else empty.
-        active_ratio: share of channels that spiked in the window.
-        is_burst: whether `active_ratio` is above the threshold.
         handled: what was done with the response; `"warm-up"` before the robot of an episode moves; `"unfinished"` if
             something went wrong before the robot had moved.
         command: that moved the robot, one for each readout where there are several; None where it was not moved.
-        reward: of the step.
-        observation: after the step.
-        terminated: the task ended by itself.
-        truncated: the episode limit ended it.
+        reward, observation: of the step, and after it.
         late_s: largest lateness of its pulses; 0 within a step of the grid.
         decided_s: from when the data of the previous response window had arrived until this presentation was requested.
         wall_s: the machine's clock at the end, from the start of the session.
@@ -74,10 +69,10 @@ class Tick:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """A tick from its `vars`, read back from JSON."""
-        # Older logs have neither readouts nor neurons.
-        known: dict[str, Any] = {"readout_hz": (), "neurons": (), **data}
-        known = {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
-        return cls(**{each.name: known[each.name] for each in fields(cls)})
+        # Older logs have neither readouts nor neurons, which are empty then.
+        known: dict[str, Any] = {each.name: data[each.name] for each in fields(cls) if each.name in data}
+        known |= {name: tuple(value) for name, value in known.items() if isinstance(value, list)}
+        return cls(**known)
 
 
 @dataclass(frozen=True)
@@ -112,47 +107,37 @@ TAIL |= {name: name for name in ("late_s", "decided_s", "wall_s")}
 
 
 class TickTable:
-    """Writes ticks to a CSV file, for users of a spreadsheet or pandas without this package.
+    """Writes ticks to a CSV file, one line each, for users of a spreadsheet or pandas without this package.
 
-    One line per tick, with all digits; `Tick` describes the columns.
+    All digits are written; `Tick` describes the columns. Unknown values are empty cells: the command and the
+    observation if the response did not move the robot. Flags are 0 or 1; patterns and times of several pulses are
+    separated by spaces.
 
-    Unknown values are empty cells: the command and the observation if the response did not move the robot. Flags are 0
-    or 1; patterns and times of several pulses are separated by spaces.
+    Each group of channels has a column of its `rate_hz` and, if there are several, of its `command`.
 
     Args:
         file: open for text, without translation of line ends.
-        conditions: their names, for `chosen` and `delivered`.
-        observed: the columns of the robot's observation.
-        readouts: names of groups of channels, each with a column of its `rate_hz` and, if there are several, of its
-            `command`; none where all channels are read as one.
     """
 
-    def __init__(
-        self, file: TextIO, conditions: Sequence[str], observed: Sequence[str], readouts: Sequence[str] = ()
-    ) -> None:
-        self._writer = csv.writer(file, lineterminator="\n")
-        self._conditions, self._n_observed, self._n_readouts = conditions, len(observed), len(readouts)
-        names = [name.replace(" ", "_") for name in readouts]
-        names = list(readouts) if len(set(names)) < len(names) else names
+    def __init__(self, file: TextIO, header: Header) -> None:
+        self._writer, self._header = csv.writer(file, lineterminator="\n"), header
+        names = [name.replace(" ", "_") for name in header.readouts]
+        names = list(header.readouts) if len(set(names)) < len(names) else names
         commands = [f"command_{name}" for name in names] if len(names) > 1 else ["command"]
         head = [name for column in HEAD for name in (commands if column == "command" else [column])]
-        self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *observed, *TAIL))
+        self._writer.writerow((*head, *(f"rate_hz_{name}" for name in names), *header.observed, *TAIL))
 
     def add(self, tick: Mapping[str, Any]) -> None:
-        """Write a tick, as in the fields of its record, with its `electrode_pulses`.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
-        command = tick["command"]
+        """Write a tick, as in the fields of its record, with its `electrode_pulses`."""
+        command, n_readouts = tick["command"], len(self._header.readouts)
         texts = {name: " ".join(map(str, tick[name])) for name in ("patterns", "pulse_time_s")}
-        texts |= {name: self._conditions[tick[name]] for name in ("chosen", "delivered")}
+        texts |= {name: self._header.conditions[tick[name]] for name in ("chosen", "delivered")}
         flags = {name: int(tick[name]) for name in ("is_burst", "terminated", "truncated")}
         cells = {**tick, **texts, **flags}
         row = [cells[name] for name in HEAD.values()]
-        row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, self._n_readouts)
-        row += tick["readout_hz"] if self._n_readouts else ()
-        row += tick["observation"] or (None,) * self._n_observed
+        row[-2:-1] = command if isinstance(command, Sequence) else (command,) * max(1, n_readouts)
+        row += tick["readout_hz"] if n_readouts else ()
+        row += tick["observation"] or (None,) * len(self._header.observed)
         row += (cells[name] for name in TAIL.values())
         # NaN is not equal to itself.
         self._writer.writerow([value if value == value else None for value in row])

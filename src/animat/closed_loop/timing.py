@@ -7,31 +7,20 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from typing import Protocol
 
 _SPUN_S = 0.0003
 """The last part of a wait, spent spinning: the kernel wakes a sleeper up to some 0.1 ms late."""
 
 
-class Clock(Protocol):
-    """A monotonic clock, in seconds from any origin, that can wait."""
+class Clock:
+    """The machine's monotonic clock, in seconds from any origin; tests replace it."""
 
     def now_s(self) -> float:
         """The time now."""
-
-    def sleep_until(self, time_s: float) -> None:
-        """Return at `time_s`; immediately if it has passed."""
-
-
-class WallClock:
-    """The machine's monotonic clock."""
-
-    def now_s(self) -> float:
-        """Seconds since about when the machine started."""
         return time.perf_counter()
 
     def sleep_until(self, time_s: float) -> None:
-        """Sleep, and spin for the last 0.3 ms."""
+        """Return at `time_s`, immediately if it has passed: sleep, and spin for the last 0.3 ms."""
         left_s = time_s - time.perf_counter() - _SPUN_S
         if left_s > 0:
             time.sleep(left_s)
@@ -44,10 +33,8 @@ def real_time_priority(*, inherited: bool) -> Iterator[None]:
     """Run the calling thread with real-time priority, where the system allows it.
 
     Linux allows it to root, and to users with a real-time priority limit (`ulimit -r`). Elsewhere nothing changes.
-    Threads with this priority take turns, even on a single core.
-
-    Args:
-        inherited: whether threads and programs that it starts meanwhile have the priority, too.
+    Threads with this priority take turns, even on a single core. If `inherited`, threads and programs that it starts
+    meanwhile have the priority, too.
     """
     before = None
     with contextlib.suppress(AttributeError, OSError):

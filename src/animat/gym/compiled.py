@@ -1,4 +1,4 @@
-"""An environment as two compiled functions from arrays to arrays, which Gymnasium's environments call.
+"""What one Gymnasium environment and a vector share: Animats stepped together in compiled code, and their pictures.
 
 The cost of a call into compiled code depends more on the number of arrays passed than on what is computed. So an
 iteration takes and returns one row of float32 per environment, which packs the state and the observation.
@@ -8,62 +8,106 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float32, Int64
+from jaxtyping import Array, Bool, Float32, Int64, UInt8
 
 from animat.environment import Environment, State
-from animat.gym.setup import Setup
+from animat.errors import InvalidArgument
+from animat.gym.setup import set_up
+from animat.robots.base import capability
+from animat.robots.drawing import draw_robot
 
 Rows = Float32[np.ndarray, "environments numbers"]
 
 
-class CompiledAnimat:
-    """Starts and steps any number of Animats on numpy arrays, with all random numbers from a numpy generator.
+class CompiledAnimats:
+    """Some Animats on numpy arrays, with all random numbers from a numpy generator.
 
-    It is compiled at the first call, once for all environments of the same Animat.
+    They are compiled at the first call, once for all environments of the same Animat.
+
+    Args:
+        n: how many.
+        robot, render_mode, options: of the environment (`animat.gym.single.AnimatEnv`).
+
+    Raises:
+        InvalidArgument: as `set_up` does, for an unknown render mode, or `rgb_array` for a robot that cannot be drawn.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        self._environment, self._simulator = setup.environment, setup.simulator
+    render_mode: str | None
+
+    def __init__(self, n: int, robot: str, render_mode: str | None, options: dict[str, Any]) -> None:
+        self.setup = set_up(robot, **options)
+        if render_mode not in (None, "rgb_array"):
+            hint = "; gymnasium.make shows these pictures in a window, with pygame" if render_mode == "human" else ""
+            raise InvalidArgument(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}{hint}")
+        if render_mode is not None:
+            capability(self.setup.environment.robot, "draw")
+        self.render_mode = render_mode
+        self._rows: Rows | None = None
+        self._shown: list[list[Float32[np.ndarray, " observations"]]] = [[] for _ in range(n)]
+        self._commands: Float32[np.ndarray, "environments *commands"]
 
     def __getstate__(self) -> dict[str, Any]:
         """Compiled functions are not pickled; they are compiled again after unpickling."""
         return {name: value for name, value in vars(self).items() if name != "_functions"}
 
-    def start(self, n: int, rng: np.random.Generator) -> Rows:
-        """Start `n` episodes."""
-        return np.asarray(self._functions.start(rng.integers(0, 2**32, n, dtype=np.uint32)))
+    def _expect_started(self, method: str) -> Rows:
+        if self._rows is None:
+            raise gymnasium.error.ResetNeeded(f"{method}: expected an episode that reset() started, got none")
+        return self._rows
 
-    def step(self, rows: Rows, actions: Int64[np.ndarray, " environments"], rng: np.random.Generator) -> Rows:
-        """One iteration of each."""
-        n, noise_size = len(rows), self._environment.noise_size
+    def _start(self, rng: np.random.Generator) -> Rows:
+        """Rows of new episodes."""
+        start, _, _ = self._functions
+        return np.asarray(start(rng.integers(0, 2**32, len(self._shown), dtype=np.uint32)))
+
+    def _step(self, rows: Rows, actions: Int64[np.ndarray, " environments"], rng: np.random.Generator) -> Rows:
+        """Rows after an iteration of each."""
+        _, step, _ = self._functions
+        n, noise_size = len(rows), self.setup.environment.noise_size
         inputs = np.empty((n, 1 + noise_size), np.float32)
         inputs[:, 0] = actions
         inputs[:, 1:] = rng.random((n, noise_size), np.float32)
-        return np.asarray(self._functions.step(inputs, rows, self._simulator))
+        return np.asarray(step(inputs, rows, self.setup.simulator))
 
-    def read(self, rows: Rows) -> tuple[Any, Rows]:
-        """The `State` and the observations in the rows, as numpy copies, shape (environments, ...)."""
-        return self._functions.read(rows)
+    def _go_on_from(self, rows: Rows, begun: Bool[np.ndarray, " environments"]) -> tuple[Any, Rows]:
+        """Returns the `State` and the observations in the rows, as numpy copies, shape (environments, ...)."""
+        _, _, read = self._functions
+        self._rows, (state, observations) = rows, read(rows)
+        if self.render_mode is not None:
+            self._commands = state.info["command"]
+            # Copies, as the observations belong to the user.
+            of_robot = observations[:, : len(self.setup.environment.robot.observation_spec)].copy()
+            for i, observation in enumerate(of_robot):
+                self._shown[i] = [observation] if begun[i] else [*self._shown[i], observation]
+        return state, observations
+
+    def _pictures(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
+        """Pictures of the robots as they are now; None without a render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render: expected render_mode="rgb_array" when the environment was created, got None')
+            return None
+        self._expect_started("render")
+        return tuple(
+            draw_robot(self.setup.environment.robot, now, command=u if u.ndim else float(u), earlier=earlier)
+            for (*earlier, now), u in zip(self._shown, self._commands, strict=True)
+        )
 
     @cached_property
-    def _functions(self) -> _Functions:
-        return _compiled(self._environment)
-
-
-class _Functions(NamedTuple):
-    start: Callable[..., Array]
-    step: Callable[..., Array]
-    read: Callable[[Rows], tuple[Any, Rows]]
+    def _functions(self) -> tuple[Callable[..., Any], ...]:
+        return _compiled(self.setup.environment)
 
 
 @lru_cache(maxsize=64)
-def _compiled(environment: Environment[Any]) -> _Functions:
+def _compiled(environment: Environment[Any]) -> tuple[Callable[..., Any], ...]:
+    """Starts and steps, as rows, and the reading of rows."""
+
     def with_observation(state: State) -> tuple[State, Array]:
         return state, environment.observe(state)
 
@@ -89,4 +133,4 @@ def _compiled(environment: Environment[Any]) -> _Functions:
         state, observations = jax.tree.unflatten(structure, parts)
         return state, observations
 
-    return _Functions(jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read)
+    return jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read

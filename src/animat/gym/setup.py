@@ -36,13 +36,7 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What an environment runs on.
-
-    Attributes:
-        environment: neurons, mapping and robot, with wrappers; static.
-        simulator: of the neurons; data.
-        condition_labels: of the actions 0, 1, ..., such as `("5 Hz", ...)`.
-    """
+    """What an environment runs on; `condition_labels` are those of the actions 0, 1, ..., such as `("5 Hz", ...)`."""
 
     environment: EpisodeLimit[Any]
     simulator: NeuronSimulator
@@ -114,12 +108,11 @@ def set_up(
     if recordings is not None and simulator is not None:
         raise InvalidArgument("recordings, simulator: expected one of them, got both")
     check_window(window_ms)
-    if recordings is None:
-        window = None if tuple(window_ms) == DEFAULT_WINDOW_MS else window_ms
-        reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window}
-        for name, value in reading.items():
-            if value is not None:
-                raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
+    window = None if tuple(window_ms) == DEFAULT_WINDOW_MS else window_ms
+    reading = {"at_min": at_min, "conditions": conditions, "kind": kind, "readouts": readouts, "window_ms": window}
+    for name, value in reading.items():
+        if value is not None and recordings is None:
+            raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
     if recordings is not None:
         by = None if conditions is None else conditions_named(conditions)
         read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")

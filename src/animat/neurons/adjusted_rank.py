@@ -25,12 +25,10 @@ class AdjustedRanks:
     by least squares together with a mean for each condition; each readout has its own.
 
     Attributes:
-        remembering: the tracker of trace and load.
         sorted_hz: the recording's non-burst responses, rising, shape (responses,), or (readouts, responses).
         slopes: a and b, shape (2, readouts); 0 for parts of the history that the recording's simulator does not have.
-        responses_hz: non-burst responses of each condition, in the order of time, Hz, shape (responses,), or
-            (responses, readouts).
-        ranks: y of each, shape (responses, readouts).
+        responses_hz: non-burst responses of each condition, in the order of time, Hz.
+        ranks: y of each.
     """
 
     remembering: HistoryTracker
@@ -43,31 +41,21 @@ class AdjustedRanks:
     def of(cls, responses: Responses, simulator: NeuronSimulator) -> Self:
         """From a recording's responses, with the memory of its simulator."""
         remembering, usable = HistoryTracker.of(responses, simulator), ~responses.is_burst
-        n_conditions, condition, read_hz = (
-            len(responses.conditions),
-            responses.condition[usable],
-            responses.read_hz[usable],
-        )
+        condition, read_hz = responses.condition[usable], responses.read_hz[usable]
+        n_conditions = len(responses.conditions)
         sorted_hz, memory = np.sort(read_hz.T, axis=-1), remembering.memory
         history = Ranked(responses).states(memory)[usable] * [memory != NO_MEMORY, memory.load_s > 0]
         ranks = _ranks(sorted_hz, read_hz)
         design = np.concatenate([np.eye(n_conditions)[condition], history], axis=1)
         slopes = np.linalg.lstsq(design, ranks, rcond=None)[0][n_conditions:]
         adjusted = ranks - history @ slopes
-        rows = [condition == each for each in range(n_conditions)]
-        return cls(
-            remembering, sorted_hz, slopes, tuple(read_hz[of] for of in rows), tuple(adjusted[of] for of in rows)
-        )
+        of_condition = (tuple(x[condition == c] for c in range(n_conditions)) for x in (read_hz, adjusted))
+        return cls(remembering, sorted_hz, slopes, *of_condition)
 
     def of_response(
         self, came: HistoryState, read_hz: Float64[np.ndarray, "*readouts"]
     ) -> Float64[np.ndarray, " readouts"]:
-        """y of another response.
-
-        Args:
-            came: the history state at its trial (`HistoryTracker.when`).
-            read_hz: x of each readout, Hz.
-        """
+        """y of another response, with the history state at its trial (`HistoryTracker.when`)."""
         return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)
 
 

@@ -18,7 +18,6 @@ from animat.responses.responses import Responses
 LARGEST_LOSS = 0.05
 """A difference in P(x >= P50) between data and simulator above which `findings` warns."""
 
-
 _evenly_drawn = jax.jit(NeuronSimulator.evenly_drawn, static_argnums=1)
 """Compiled once for all simulators of a shape."""
 
@@ -47,28 +46,21 @@ class Fidelity:
         return float(np.abs(self.in_data - self.in_simulator).max())
 
     def findings(self, *, of_memory: bool = False) -> tuple[Finding, ...]:
-        """Warnings if binning, or drawing from too few neighbours, moves P(x >= P50) by more than `LARGEST_LOSS`, or if
-        responses lie above the range.
-
-        Args:
-            of_memory: whether the simulator has a memory.
+        """Warnings if binning, or drawing from too few neighbours (of a memory), moves P(x >= P50) by more than
+        `LARGEST_LOSS`, or if responses lie above the range.
         """
         found = []
         loss = np.abs(self.in_data - self.in_simulator)
         worst = np.unravel_index(np.argmax(loss), loss.shape)
-        if loss[worst] > LARGEST_LOSS:
+        if (value := float(loss[worst])) > LARGEST_LOSS:
             of = self.labels[worst[0]] + (f" on {self.readouts[worst[1]]}" if loss.ndim == 2 else "")
             changed = f"changes P(x >= P50) of {of} from {self.in_data[worst]:.2f} to {self.in_simulator[worst]:.2f}"
-            value = float(loss[worst])
+            name, how = "binning", f"the histogram {changed}"
+            remedy = "use more bins, no range (edges are then percentiles) or the empirical simulator"
             if of_memory:
-                message = (
-                    f"drawing from similar histories {changed}: with so few responses some are drawn too often; record "
-                    "more"
-                )
-                found.append(Finding("few-neighbours", "warning", message, value))
-            else:
-                remedy = "use more bins, no range (edges are then percentiles) or the empirical simulator"
-                found.append(Finding("binning", "warning", f"the histogram {changed}: {remedy}", value))
+                name, how = "few-neighbours", f"drawing from similar histories {changed}"
+                remedy = "with so few responses some are drawn too often; record more"
+            found.append(Finding(name, "warning", f"{how}: {remedy}", value))
         if self.n_above_range:
             message = f"responses above the histogram's range, which are counted in its last bin: {self.n_above_range}"
             found.append(Finding("above-range", "warning", message, float(self.n_above_range)))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Int64
+from jaxtyping import Array, Float, Float64, Int64
 
-from animat.neurons.history import recorded_states
+from animat.neurons.history import Ranked
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.prediction import Halves, Prediction
 from animat.neurons.simulator import NeuronSimulator
@@ -25,7 +25,7 @@ def recorded_series(halves: Halves) -> Float64[np.ndarray, " presentations"]:
 
 
 def free_runs(
-    simulator: NeuronSimulator | None, prediction: Prediction, halves: Halves, n: int, rng: np.random.Generator
+    simulator: NeuronSimulator | None, prediction: Prediction, n: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "n presentations"]:
     """Draw n series of responses from a simulator in place of the held-out half.
 
@@ -35,6 +35,7 @@ def free_runs(
     Returns:
         Responses in Hz at the places of the recorded ones, NaN elsewhere.
     """
+    halves = prediction.halves
     presented, place = halves.whole.presentations
     places = place[halves.rows]
     runs = np.full((n, len(presented.rate_hz)), np.nan)
@@ -43,36 +44,27 @@ def free_runs(
         drawn = [np.searchsorted(row[:-1], u, side="right") for row, u in zip(at_most, uniform, strict=True)]
         runs[:, places] = halves.values_hz[np.stack(drawn, axis=1)]
         return runs
-    states = recorded_states(halves.first, simulator.memory)
-    since = int(places[0])
-    is_answered = np.isin(np.arange(len(presented.rate_hz)), places)
-    rate_hz = _remembering(
-        simulator,
-        np.maximum(presented.condition, 0)[since:],
-        states.load.astype(np.float32)[since:],
-        states.left.astype(np.float32)[since:],
-        is_answered[since:],
-        presented.is_burst[since:],
-        presented.is_rested[since:],
-        np.float32(states.trace[since]),
-        rng.random((len(states.load) - since, n), np.float32),
+    ranked, since = Ranked(halves.first), int(places[0])
+    traces, left = ranked.recorded(simulator.memory)
+    trials = (
+        np.maximum(presented.condition, 0),
+        ranked.loads(simulator.memory.load_s).every.astype(np.float32),
+        left.astype(np.float32),
+        np.isin(np.arange(len(left)), places),
+        presented.is_burst,
+        presented.is_rested,
     )
+    uniforms = rng.random((len(left) - since, n), np.float32)
+    rate_hz = _remembering(simulator, np.float32(traces[since]), tuple(each[since:] for each in trials), uniforms)
     runs[:, places] = halves.read(np.asarray(rate_hz))[places - since].T
     return runs
 
 
 @jax.jit
 def _remembering(
-    simulator: MemorySimulator,
-    condition: Int64[Array, " trials"],
-    load: Float[Array, " trials"],
-    left: Float[Array, " trials"],
-    is_answered: Bool[Array, " trials"],
-    is_burst: Bool[Array, " trials"],
-    is_rested: Bool[Array, " trials"],
-    trace: Float[Array, ""],
-    uniforms: Float[Array, "trials n"],
+    simulator: MemorySimulator, trace: Float[Array, ""], trials: tuple[Array, ...], uniforms: Float[Array, "trials n"]
 ) -> Float[Array, "trials n *readouts"]:
+    """Answers of n runs to the trials, whose arrays are those of `free_runs`, from one trace on."""
     answer = jax.vmap(simulator.answer_at, (None, 0, 0, None))
 
     def trial(trace: Float[Array, " n"], inputs: tuple[Array, ...]) -> tuple[Array, Array]:
@@ -83,8 +75,7 @@ def _remembering(
         # As in `history.Ranked`: the trace after a burst is not known.
         return jnp.where(is_burst, 0.5, after), rate_hz
 
-    begun = jnp.full(uniforms.shape[1], trace)
-    return jax.lax.scan(trial, begun, (condition, load, left, is_answered, is_burst, is_rested, uniforms))[1]
+    return jax.lax.scan(trial, jnp.full(uniforms.shape[1], trace), (*trials, uniforms))[1]
 
 
 def autocorrelation(series: Float64[np.ndarray, "*n trials"]) -> Float64[np.ndarray, "*n lags"]:

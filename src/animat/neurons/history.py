@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.responses.conditions import NO_CONDITION
-from animat.responses.responses import Responses, Trials
+from animat.responses.responses import Responses
 
 INITIAL_HISTORY = (0.5, 0.5)
 """Trace and load at the start of an episode: its warm-up was presented in random order, as in a recording.
@@ -48,12 +48,9 @@ NO_MEMORY = Memory(0.0, 0.0, 1.0)
 
 
 class Loads(NamedTuple):
-    """The load of a recording.
+    """The load of a recording: at every trial, at each response, and after the trial before that.
 
     Attributes:
-        every: at each trial, shape (presentations,).
-        at: at each response, shape (responses,).
-        after: after the trial before it, shape (responses,).
         kept: the share that is left when a trial of each condition comes, shape (conditions,).
         added: by each trial; 0: there is no load.
     """
@@ -66,12 +63,12 @@ class Loads(NamedTuple):
 
 
 class Ranked:
-    """Responses by rank.
+    """Responses by rank, and the history states of all trials of their recording (`Responses.presentations`).
 
     Attributes:
         sorted_hz: the non-burst responses, rising.
-        rank: of each, the share of non-burst responses below it, ties counted half, shape (responses,).
-        means: the mean rank of each condition's non-burst responses, shape (conditions,).
+        rank: of each, the share of non-burst responses below it, ties counted half.
+        means: the mean rank of each condition's non-burst responses.
         rows: of each condition, the responses that can be drawn.
     """
 
@@ -97,14 +94,13 @@ class Ranked:
         self, memory: Memory
     ) -> tuple[Float64[np.ndarray, " presentations"], Float64[np.ndarray, " presentations"]]:
         """The trace before each trial, and the increment by its response."""
-        presented: Trials = self._presented
+        presented = self._presented
         # For trials without a condition, the middle rank is as good as any.
         means = np.where(presented.condition == NO_CONDITION, 0.5, self.means[presented.condition])
         left = trace_increment(ranks_among(self.sorted_hz, presented.rate_hz), means, memory)
         trace, traces = 0.0, []
-        for is_rested, is_burst, more in zip(
-            presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist(), strict=True
-        ):
+        trials = (presented.is_rested.tolist(), presented.is_burst.tolist(), left.tolist())
+        for is_rested, is_burst, more in zip(*trials, strict=True):
             trace = 0.0 if is_rested else trace
             traces.append(trace)
             # The trace after a burst is not known: the next response is not drawn, and the trace starts again.
@@ -148,28 +144,3 @@ def trace_increment(
 ) -> Float64[np.ndarray, " responses"]:
     """What responses add to the trace."""
     return np.asarray((1 - memory.decay) * (rank + memory.weight * mean) / (1 + memory.weight))
-
-
-class RecordedStates(NamedTuple):
-    """The history state before each trial of a recording, for a simulator fitted to a part of it.
-
-    Attributes:
-        trace, load: at the trial, shape (presentations,).
-        left: what its recorded response adds to the trace, shape (presentations,).
-    """
-
-    trace: Float64[np.ndarray, " presentations"]
-    load: Float64[np.ndarray, " presentations"]
-    left: Float64[np.ndarray, " presentations"]
-
-
-def recorded_states(responses: Responses, memory: Memory) -> RecordedStates:
-    """The history states of all trials of a recording.
-
-    Args:
-        responses: to which a simulator was fitted. Ranks are among these; there may be more trials
-            (`Responses.presentations`).
-    """
-    ranked = Ranked(responses)
-    traces, left = ranked.recorded(memory)
-    return RecordedStates(traces, ranked.loads(memory.load_s).every, left)

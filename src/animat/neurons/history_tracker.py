@@ -30,8 +30,8 @@ class HistoryTracker:
     Attributes:
         memory: of the recording's simulator; without memory the state does not change.
         added: what a trial adds to the load.
-        sorted_hz: non-burst responses of that recording, all channels as one, rising, shape (responses,).
-        mean_ranks: the mean rank of each condition's responses, shape (conditions,).
+        sorted_hz: non-burst responses of that recording, all channels as one, rising.
+        mean_ranks: the mean rank of each condition's responses.
     """
 
     memory: Memory
@@ -49,25 +49,18 @@ class HistoryTracker:
         return cls(memory, added, ranked.sorted_hz, ranked.means)
 
     def when(self, before: HistoryState, at_s: float, *, is_rested: bool) -> HistoryState:
-        """The state at a trial.
+        """The state at a trial that is read after the pulse at `at_s`.
 
-        Args:
-            before: the state after the previous trial; `HistoryState()` after silence.
-            at_s: the pulse after which the trial is read, s.
-            is_rested: whether there was no pulse in the second before it.
+        `before` is the state after the previous trial, `is_rested` whether no pulse came in the second before this one.
         """
         load_s = self.memory.load_s
         load = before.load * np.exp((before.at_s - at_s) / load_s) if load_s else before.load
         return HistoryState(0.0 if is_rested else before.trace, float(load), float(at_s))
 
     def after(self, came: HistoryState, condition: int, rate_hz: float, *, is_burst: bool) -> HistoryState:
-        """The state after a trial.
+        """The state after a trial, from that at it and the response of all channels, Hz per channel.
 
-        Args:
-            came: the state at the trial.
-            condition: of the trial; `NO_CONDITION` if it has none.
-            rate_hz: the response of all channels, Hz per channel.
-            is_burst: whether the response was a burst, after which the trace is not known.
+        After a burst the trace is not known.
         """
         rank = ranks_among(self.sorted_hz, np.array([rate_hz]))
         # For trials without a condition, the middle rank is as good as any.
@@ -81,12 +74,6 @@ class HistoryTracker:
         if self.memory == NO_MEMORY:
             return INITIAL_HISTORY
         return state.trace, state.load if self.memory.load_s else INITIAL_HISTORY[1]
-
-    def append_to(
-        self, observation: Float64[np.ndarray, " numbers"], state: HistoryState
-    ) -> Float64[np.ndarray, " more_numbers"]:
-        """What a policy observes: the robot's observation, then trace and load."""
-        return np.concatenate([observation, self.observed(state)])
 
     def to_dict(self) -> dict[str, float]:
         """Its parameters as plain data."""

@@ -64,29 +64,21 @@ class JointHistogramSimulator(NeuronSimulator):
 def fit_joint_histogram(
     responses: Responses, *, bins: int = 20, range_hz: float | None = None, room: int | None = None
 ) -> JointHistogramSimulator:
-    """Fit a histogram per condition to each readout, and keep the ranks of the readouts in each trial.
+    """Fit a histogram per condition to each of several readouts, and keep their ranks in each trial.
 
-    Args:
-        responses: of several readouts.
-        bins, range_hz: as in `fit_histogram`.
-        room: as in `fit_empirical`.
-
-    Raises:
-        InvalidArgument, UnusableData: as `fit_histogram` does.
+    Arguments and errors are those of `fit_histogram` and `fit_empirical`.
     """
-    every = [responses.of_readout(d) for d in range(len(responses.readouts))]
-    alone = [fit_histogram(each, bins=bins, range_hz=range_hz) for each in every]
-    of_condition = [
-        np.flatnonzero(~responses.is_burst & (responses.condition == c)) for c in range(len(responses.conditions))
-    ]
-    counts = np.array([len(rows) for rows in of_condition])
+    each_alone = (responses.of_readout(d) for d in range(len(responses.readouts)))
+    alone = [fit_histogram(each, bins=bins, range_hz=range_hz) for each in each_alone]
+    of_condition = [responses.read_of(c) for c in range(len(responses.conditions))]
+    counts = np.array([len(read_hz) for read_hz in of_condition])
     ranks = np.zeros((len(counts), max(int(counts.max()), room or 0), len(alone)))
     # A fixed seed: the same responses give the same simulator.
     rng = np.random.default_rng(0)
-    for condition, rows in enumerate(of_condition):
-        for d in range(len(alone)):
-            order = np.lexsort((rng.random(len(rows)), responses.read_hz[rows, d]))
-            ranks[condition, order, d] = np.arange(len(rows))
+    for condition, read_hz in enumerate(of_condition):
+        for d, x_hz in enumerate(read_hz.T):
+            order = np.lexsort((rng.random(len(x_hz)), x_hz))
+            ranks[condition, order, d] = np.arange(len(x_hz))
     return JointHistogramSimulator(
         stacked([each.cumulative for each in alone]),
         stacked([each.edges_hz for each in alone]),

@@ -24,12 +24,9 @@ def fit_simulator(
     room: int | None = None,
     memory: Memory | None = None,
 ) -> NeuronSimulator:
-    """Fit a simulator of a `Kind`: `bins` and `range_hz` are for histograms, `room` for the other kinds and for
-    histograms of several readouts, `memory` for the memory kind.
+    """Fit a simulator of a `Kind`; arguments and errors are those of `fit_histogram`, `fit_empirical` and `fit_memory`.
 
-    Raises:
-        InvalidArgument: for an unknown kind, and as `fit_histogram`, `fit_empirical` and `fit_memory` do.
-        UnusableData: if a condition has no non-burst response.
+    Histograms of several readouts need `room`, too.
     """
     if kind == "histogram" and len(responses.readouts) > 1:
         return fit_joint_histogram(responses, bins=bins, range_hz=range_hz, room=room)

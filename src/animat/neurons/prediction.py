@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
 from animat.errors import UnusableData
-from animat.neurons.history import recorded_states
+from animat.neurons.history import Ranked
 from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, pooled_percentiles
 from animat.responses.responses import Responses
 
 FEWEST = 20
@@ -25,12 +25,11 @@ class Halves(NamedTuple):
     """A recording's responses in two parts.
 
     Attributes:
-        whole: all of them.
         first: those to fit to.
-        rows: the non-burst responses of the second part, by their row in `whole`, shape (held,).
-        condition: of these, shape (held,).
-        x_hz: of these, in the precision in which thresholds are compared, shape (held,).
+        rows: the non-burst responses of the second part, by their row in `whole`.
+        condition, x_hz: of these, in the precision in which thresholds are compared.
         values_hz: all distinct values of responses in the recording, of any condition and half, rising.
+        percentiles_hz: P0, P10, ..., P100 of the first part.
         readout: the readout of these responses; None: the only one.
     """
 
@@ -40,6 +39,7 @@ class Halves(NamedTuple):
     condition: Int64[np.ndarray, " held"]
     x_hz: Float32[np.ndarray, " held"]
     values_hz: Float32[np.ndarray, " values"]
+    percentiles_hz: Float32[np.ndarray, " percentiles"]
     readout: int | None = None
 
     def read(self, every: Float[np.ndarray, "*some"]) -> Float[np.ndarray, "*others"]:
@@ -50,13 +50,13 @@ class Halves(NamedTuple):
         """The non-burst responses to one condition in the first half, in Hz."""
         return self.read(self.first.read_of(condition))
 
+    def commands_of(self, x_hz: Float[np.ndarray, " some"]) -> Int64[np.ndarray, " some"]:
+        """The commands of responses with nine thresholds, from 0 to 9."""
+        return np.searchsorted(self.percentiles_hz[1:10], x_hz, side="right")
+
 
 def halved(responses: Responses, readout: int | None = None) -> Halves:
     """Split a recording's responses in the middle: by time, or within each condition if presented in blocks.
-
-    Args:
-        responses: of one recording.
-        readout: which of several is to be predicted.
 
     Raises:
         UnusableData: for a single condition, or a half with fewer than `FEWEST` non-burst responses to a condition.
@@ -80,21 +80,17 @@ def halved(responses: Responses, readout: int | None = None) -> Halves:
                 f"condition {label}: expected {FEWEST} non-burst responses or more in each half of the recording, got "
                 f"{n[0]} and {n[1]}; leave it out with --conditions, or record more trials"
             )
-    rows = np.flatnonzero(is_held & ~responses.is_burst)
-    every = responses.read_hz if readout is None else responses.read_hz[:, readout]
-    x_hz = every.astype(np.float32)
-    first = responses.at_rows(np.flatnonzero(~is_held))
-    return Halves(responses, first, rows, responses.condition[rows], x_hz[rows], np.unique(x_hz), readout)
+    rows, first = np.flatnonzero(is_held & ~responses.is_burst), responses.at_rows(np.flatnonzero(~is_held))
+    x_hz = (responses.read_hz if readout is None else responses.read_hz[:, readout]).astype(np.float32)
+    percentiles_hz = np.asarray(pooled_percentiles(first))[... if readout is None else readout]
+    condition, values_hz = responses.condition[rows], np.unique(x_hz)
+    return Halves(responses, first, rows, condition, x_hz[rows], values_hz, percentiles_hz, readout)
 
 
 class Prediction(NamedTuple):
-    """Distributions over the values of a recording, one for each held-out response.
+    """Distributions over the values of a recording, one for each held-out response, made from n responses each."""
 
-    Attributes:
-        probability: of each value, shape (held, values).
-        n: the number of responses that each is made from, shape (held,).
-    """
-
+    halves: Halves
     probability: Float64[np.ndarray, "held values"]
     n: Float64[np.ndarray, " held"]
 
@@ -103,12 +99,39 @@ class Prediction(NamedTuple):
         """The distribution functions."""
         return np.cumsum(self.probability, axis=1)
 
+    def crps(self) -> Float64[np.ndarray, " held"]:
+        """The continuous ranked probability score of each held-out response, in Hz; smaller is better.
+
+            CRPS = integral of (F(z) - 1[z >= x])^2 dz
+
+        Source: Gneiting and Raftery 2007, doi:10.1198/016214506000001437.
+        """
+        values_hz = self.halves.values_hz.astype(np.float64)
+        passed = values_hz[:-1] >= self.halves.x_hz[:, None]
+        return np.asarray((self.at_most[:, :-1] - passed) ** 2 @ np.diff(values_hz))
+
+    def transforms(self) -> Float64[np.ndarray, "held 2"]:
+        """The probability integral transform of each held-out response, F(x-) and F(x): below x, and up to it."""
+        at = np.searchsorted(self.halves.values_hz, self.halves.x_hz)[:, None]
+        mass = np.take_along_axis(self.probability, at, 1)
+        up_to = np.take_along_axis(self.at_most, at, 1)
+        return np.concatenate([up_to - mass, up_to], axis=1)
+
+    def of_commands(self, prior: Float64[np.ndarray, "held classes"] | float) -> Float64[np.ndarray, "held classes"]:
+        """The probability of each command with nine thresholds, for each held-out response.
+
+        A command that was never drawn is not impossible. Ten responses, distributed as in a coarser prediction
+        (`prior`), are added to the n that a prediction is made from: p = (n p_n + 10 prior) / (n + 10).
+        """
+        n, commands = self.n[:, None], np.eye(CLASSES)[self.halves.commands_of(self.halves.values_hz)]
+        return np.asarray((n * (self.probability @ commands) + CLASSES * prior) / (n + CLASSES))
+
 
 def predict_marginal(halves: Halves) -> Prediction:
     """Predict by the first half's non-burst responses of all conditions together, ignoring the condition."""
     x_hz = halves.read(halves.first.read_hz)[~halves.first.is_burst].astype(np.float32)
     share = _shares(x_hz, halves.values_hz)
-    return Prediction(np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
+    return Prediction(halves, np.tile(share, (len(halves.rows), 1)), np.full(len(halves.rows), float(len(x_hz))))
 
 
 def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
@@ -117,9 +140,9 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
     The condition is known and, if the simulator has a memory, everything recorded before. A histogram's draw counts as
     the largest value of the recording that is not above it, so that thresholds give the same commands.
     """
-    values_hz = halves.values_hz
     if isinstance(simulator, MemorySimulator):
         return _predict_with_memory(simulator, halves)
+    values_hz = halves.values_hz
     if isinstance(simulator, EmpiricalSimulator):
         counts = np.asarray(simulator.counts)
         table = halves.read(np.asarray(simulator.values_hz))
@@ -131,23 +154,18 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
         of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
     else:
         raise TypeError(f"simulator: expected a histogram, empirical or memory simulator, got {type(simulator)}")
-    return Prediction(np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
+    return Prediction(halves, np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
 
 
 def _predict_with_memory(simulator: MemorySimulator, halves: Halves) -> Prediction:
     places = halves.whole.presentations[1][halves.rows]
-    states = recorded_states(halves.first, simulator.memory)
-    near = _rows_near(
-        simulator, halves.condition, states.trace[places].astype(np.float32), states.load[places].astype(np.float32)
-    )
-    first, end = (np.asarray(each) for each in near)
-    index = np.searchsorted(halves.values_hz, halves.read(np.asarray(simulator.after_hz)))
-    n_values = len(halves.values_hz)
-    counted = [
-        np.bincount(index[c, a:b], minlength=n_values) for c, a, b in zip(halves.condition, first, end, strict=True)
-    ]
-    n = (end - first).astype(np.float64)
-    return Prediction(np.stack(counted) / n[:, None], n)
+    ranked, memory = Ranked(halves.first), simulator.memory
+    trace, load = ranked.recorded(memory)[0], ranked.loads(memory.load_s).every
+    at = (each[places].astype(np.float32) for each in (trace, load))
+    first, end = (np.asarray(each) for each in _rows_near(simulator, halves.condition, *at))
+    after_hz, rows = halves.read(np.asarray(simulator.after_hz)), zip(halves.condition, first, end, strict=True)
+    shares = [_shares(after_hz[c, a:b], halves.values_hz) for c, a, b in rows]
+    return Prediction(halves, np.stack(shares), (end - first).astype(np.float64))
 
 
 _rows_near = jax.jit(jax.vmap(MemorySimulator.rows_near, (None, 0, 0, 0)))
@@ -168,26 +186,6 @@ def _below(
     return np.asarray(np.where(edges_hz[place] == x_hz, cumulative[place], inside), np.float64)
 
 
-def crps(prediction: Prediction, halves: Halves) -> Float64[np.ndarray, " held"]:
-    """The continuous ranked probability score of each held-out response, in Hz; smaller is better.
-
-        CRPS = integral of (F(z) - 1[z >= x])^2 dz
-
-    Source: Gneiting and Raftery 2007, doi:10.1198/016214506000001437.
-    """
-    values_hz = halves.values_hz.astype(np.float64)
-    passed = values_hz[:-1] >= halves.x_hz[:, None]
-    return np.asarray((prediction.at_most[:, :-1] - passed) ** 2 @ np.diff(values_hz))
-
-
-def transformed(prediction: Prediction, halves: Halves) -> Float64[np.ndarray, "held 2"]:
-    """The probability integral transform of each held-out response, F(x-) and F(x): below x, and up to it."""
-    at = np.searchsorted(halves.values_hz, halves.x_hz)[:, None]
-    mass = np.take_along_axis(prediction.probability, at, 1)
-    up_to = np.take_along_axis(prediction.at_most, at, 1)
-    return np.concatenate([up_to - mass, up_to], axis=1)
-
-
 def share_below(
     transforms: Float64[np.ndarray, "held 2"], at: Float64[np.ndarray, " places"]
 ) -> Float64[np.ndarray, " places"]:
@@ -200,31 +198,3 @@ def share_below(
     low, high = transforms.T[:, :, None]
     within = (at - low) / np.maximum(high - low, 1e-12)
     return np.asarray(np.clip(within, 0.0, 1.0).mean(axis=0))
-
-
-def command_probabilities(
-    prediction: Prediction,
-    prior: Float64[np.ndarray, "held classes"] | float,
-    halves: Halves,
-    thresholds_hz: Float[np.ndarray, " thresholds"],
-) -> Float64[np.ndarray, "held classes"]:
-    """The probability of each command with nine thresholds, for each held-out response.
-
-    A command that was never drawn is not impossible. Ten responses, distributed as in a coarser prediction, are added
-    to the n that a prediction is made from: p = (n p_n + 10 prior) / (n + 10).
-
-    Args:
-        prior: the probabilities of the coarser prediction; a number for all.
-        thresholds_hz: P10, P20, ..., P90 of the first half.
-    """
-    of_value = np.searchsorted(thresholds_hz, halves.values_hz, side="right")
-    n = prediction.n[:, None]
-    return np.asarray((n * (prediction.probability @ np.eye(CLASSES)[of_value]) + CLASSES * prior) / (n + CLASSES))
-
-
-def log_likelihood_bits(
-    probability: Float64[np.ndarray, "held classes"], halves: Halves, thresholds_hz: Float[np.ndarray, " thresholds"]
-) -> Float64[np.ndarray, " held"]:
-    """The logarithm to base 2 of the predicted probability of each held-out response's command."""
-    observed = np.searchsorted(thresholds_hz, halves.x_hz, side="right")[:, None]
-    return np.asarray(np.log2(np.take_along_axis(probability, observed, 1)[:, 0]))

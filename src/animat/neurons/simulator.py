@@ -25,8 +25,7 @@ LARGEST_BINS = 10_000
 """Most bins of a histogram: a draw compares with each edge, and a recording has some hundred responses."""
 
 PERCENTILES = tuple(range(0, 101, 10))
-"""The percentiles of the pooled non-burst responses that a simulator carries: P0 (smallest), P10, ..., P100 (largest).
-"""
+"""The percentiles of the pooled non-burst responses that a simulator carries."""
 
 
 class Answer(NamedTuple):
@@ -163,11 +162,7 @@ class EmpiricalSimulator(NeuronSimulator):
 
 
 def check_binning(bins: int, range_hz: float | None) -> None:
-    """Check the bins of a histogram before there is anything to fit it to.
-
-    Raises:
-        InvalidArgument: for fewer than one or more than `LARGEST_BINS` bins, or a range that is not positive.
-    """
+    """Raise InvalidArgument for a number of bins or a range that no histogram can have."""
     if not 1 <= bins <= LARGEST_BINS:
         raise InvalidArgument(f"bins: expected 1 to {LARGEST_BINS:,}, got {bins}; only histogram simulators have bins")
     if range_hz is not None and not 0 < range_hz < np.inf:
@@ -177,10 +172,9 @@ def check_binning(bins: int, range_hz: float | None) -> None:
 def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
     """Fit a histogram per condition to the non-burst responses.
 
-    The paper's bins are equally wide, over a range chosen for its culture. For another culture a bin can hold several
-    percentiles, and the differences between conditions that the mapping uses are lost; if responses fall over hours,
-    they are lost later. So by default the edges are percentiles of the responses: with 20 bins P0, P5, ..., P100 of all
-    conditions together, which keeps the shares on either side of P10, P20, ..., P90.
+    The paper's bins are equally wide, over a range chosen for its culture; for another one, or later, a bin can hold
+    several percentiles, and the differences between conditions that the mapping uses are lost. So by default the edges
+    are percentiles of the responses: with 20 bins P0, P5, ..., P100 of all conditions together.
 
     Args:
         responses: of one recording, every condition with at least one non-burst response.

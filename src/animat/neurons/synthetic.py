@@ -14,27 +14,18 @@ MEANS_HZ = (30.0, 36.0, 42.0, 48.0, 54.0)
 LABELS = ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")
 
 
-def synthetic_simulator(
-    means_hz: Sequence[float] = MEANS_HZ,
-    *,
-    shape: float = 6.0,
-    bins: int = 20,
-    range_hz: float = 120.0,
-    n_responses: int = 500,
-) -> HistogramSimulator:
+def synthetic_simulator(means_hz: Sequence[float] = MEANS_HZ, *, shape: float = 6.0) -> HistogramSimulator:
     """The histogram simulator of gamma-distributed responses, in closed form: nothing is drawn or fitted.
 
         x | condition c  ~  Gamma(shape, means_hz[c] / shape)
 
     With the defaults, a response passes the pooled median (38.7 Hz) with probability 0.22, 0.38, 0.53, 0.64 and 0.74.
+    The histogram has the paper's 20 bins from 0 to 120 Hz, the last with all above. P0 and P100 are not those of the
+    distribution, 0 and infinity, but of the paper's n = 500 responses: 1/(n + 1) and n/(n + 1).
 
     Args:
         means_hz: mean response to each condition, Hz per channel.
         shape: of all gamma distributions; the larger, the narrower.
-        bins, range_hz: of the histogram, from 0; responses above the range are counted in the last bin.
-        n_responses: of a recording, all conditions together (the paper: 500). The percentiles P0 and P100, which for
-            the distribution would be 0 and infinity, are those of the extremes of this many responses: the quantiles
-            1/(n + 1) and n/(n + 1).
 
     Raises:
         InvalidArgument: for no means, or a number that is not positive.
@@ -45,17 +36,16 @@ def synthetic_simulator(
     means = np.asarray(means_hz, np.float64)
     if means.ndim != 1 or not len(means) or not np.all(np.isfinite(means) & (means > 0)):
         raise InvalidArgument(f"means_hz: expected a positive mean in Hz per condition, got {means_hz!r}")
-    for name, value in {"shape": shape, "bins": bins, "range_hz": range_hz, "n_responses": n_responses}.items():
-        if not (np.isfinite(value) and value > 0):
-            raise InvalidArgument(f"{name}: expected a positive number, got {value!r}")
+    if not (np.isfinite(shape) and shape > 0):
+        raise InvalidArgument(f"shape: expected a positive number, got {shape!r}")
 
-    edges_hz = np.linspace(0.0, range_hz, bins + 1)
+    edges_hz = np.linspace(0.0, 120.0, 21)
     cumulative = gammainc(shape, edges_hz * shape / means[:, None])
     cumulative[:, -1] = 1.0
 
     def pooled(x_hz: float, share: float) -> float:
         return float(np.mean(gammainc(shape, x_hz * shape / means))) - share
 
-    shares = np.clip(np.array(PERCENTILES) / 100, 1 / (n_responses + 1), n_responses / (n_responses + 1))
+    shares = np.clip(np.array(PERCENTILES) / 100, 1 / 501, 500 / 501)
     percentiles_hz = [brentq(pooled, 0.0, 100 * float(means.max()), (share,)) for share in shares]
     return HistogramSimulator(*(to_jax(each) for each in (cumulative, edges_hz, percentiles_hz)))

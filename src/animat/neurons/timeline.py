@@ -28,7 +28,6 @@ _MEMORY_OF_BLOCKS = Finding(
     "responds after a different one; record with --order mixed",
 )
 
-
 ALONE_MIN = 10.0
 """How long the simulator of a single recording holds: the paper's interval."""
 
@@ -82,11 +81,7 @@ class SimulatorTimeline:
         return max(0, int(np.searchsorted(self.start_min, minute, side="right")) - 1)
 
     def requested_row(self, minute: float) -> int:
-        """The same for a minute that a user gave.
-
-        Raises:
-            InvalidArgument: for a minute before the first recording, or NaN.
-        """
+        """The same for a minute that a user gave; raises InvalidArgument for one before the first recording, or NaN."""
         if not minute >= self.start_min[0]:
             raise InvalidArgument(
                 f"at_min: expected a minute on the culture's clock from the first recording on, which started at "

@@ -7,24 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
 from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.prediction import (
-    CLASSES,
-    Halves,
-    command_probabilities,
-    crps,
-    halved,
-    log_likelihood_bits,
-    predict,
-    predict_marginal,
-    share_below,
-    transformed,
-)
-from animat.neurons.simulator import pooled_percentiles
+from animat.neurons.prediction import CLASSES, Halves, halved, predict, predict_marginal, share_below
 from animat.neurons.timeline import default_kind
 from animat.responses.responses import Responses
 from animat.tables import briefly
@@ -71,16 +59,16 @@ class Scores:
 
     Attributes:
         kind: its name; `MARGINAL` for the baseline.
-        bits: log-likelihood of each held-out command with nine thresholds, shape (held,).
-        crps_hz: continuous ranked probability score of each, shape (held,).
-        transforms: the probability integral transform of each, from F(x-) to F(x), shape (held, 2).
+        bits: log-likelihood of each held-out command with nine thresholds.
+        crps_hz: continuous ranked probability score of each.
+        transforms: the probability integral transform of each, from F(x-) to F(x).
         distance: Kolmogorov's distance of the transforms from uniform.
         p_value: the probability of such a distance by chance; None for kinds that do not predict equally from all
             responses to a condition, for which it does not hold.
         autocorrelation: of the free runs, at lags 1 to `LAGS`.
         run_length: the mean length, in the free runs, of runs at or above P50 of the first half.
         lasting: the share of these that last 1 to `LAGS` trials or more.
-        above: P(x >= P50) predicted for the held-out trials of each condition, shape (conditions,).
+        above: P(x >= P50) predicted for the held-out trials of each condition.
     """
 
     __repr__ = briefly
@@ -96,15 +84,26 @@ class Scores:
     lasting: Band
     above: Float64[np.ndarray, " conditions"]
 
+    def to_dict(self) -> dict[str, Any]:
+        """All numbers as JSON data, except those of single trials."""
+        return {
+            "bits": float(self.bits.mean()),
+            "crps_hz": float(self.crps_hz.mean()),
+            "distance": self.distance,
+            "p_value": self.p_value,
+            "pit": pit_shares(self.transforms).tolist(),
+            **{name: _plain(getattr(self, name)) for name in ("above", "autocorrelation", "run_length", "lasting")},
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class Validation:
     """All kinds of simulators on one recording: fitted to its first half, scored on its second.
 
     Attributes:
-        n_fitted, n_held: non-burst responses to each condition in the first and the second half, shape (conditions,).
-        medians_hz: of these, shape (2, conditions).
-        above: P(x >= P50) of the held-out responses to each, P50 that of the first half, shape (conditions,).
+        n_fitted, n_held: non-burst responses to each condition in the first and the second half.
+        medians_hz: of these.
+        above: P(x >= P50) of the held-out responses to each, P50 that of the first half.
         autocorrelation, run_length, lasting: of the held-out responses, as in `Scores`; runs at or above their own P50,
             as the thresholds of a loop adapt.
         scores: of the marginal distribution and of each kind.
@@ -144,35 +143,15 @@ class Validation:
 
     def to_dict(self) -> dict[str, Any]:
         """All numbers as JSON data, except those of single trials."""
-        kinds = {
-            scores.kind: {
-                "bits": float(scores.bits.mean()),
-                "crps_hz": float(scores.crps_hz.mean()),
-                "distance": scores.distance,
-                "p_value": scores.p_value,
-                "pit": pit_shares(scores.transforms).tolist(),
-                "above": scores.above.tolist(),
-                "autocorrelation": {end: x.tolist() for end, x in scores.autocorrelation._asdict().items()},
-                "run_length": {end: float(x) for end, x in scores.run_length._asdict().items()},
-                "lasting": {end: x.tolist() for end, x in scores.lasting._asdict().items()},
-            }
-            for scores in self.scores
-        }
+        numbers = "n_fitted", "n_held", "medians_hz", "drift", "above", "autocorrelation", "run_length", "lasting"
         return {
             "verdict": self.verdict,
             "simulator": self.kind,
             "conditions": list(self.labels),
-            "n_fitted": list(self.n_fitted),
-            "n_held": list(self.n_held),
-            "medians_hz": self.medians_hz.tolist(),
-            "drift": self.drift,
-            "above": self.above.tolist(),
-            "autocorrelation": self.autocorrelation.tolist(),
-            "run_length": self.run_length,
-            "lasting": self.lasting.tolist(),
+            **{name: _plain(getattr(self, name)) for name in numbers},
             "conditions_bring_bits": self.gain("empirical", MARGINAL)._asdict(),
             "memory_brings_bits": self.gain("memory", "empirical")._asdict(),
-            "simulators": kinds,
+            "simulators": {scores.kind: scores.to_dict() for scores in self.scores},
         }
 
     @property
@@ -244,11 +223,10 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     if (readout is None) != (n == 1) or not 0 <= (readout or 0) < n:
         raise InvalidArgument(f"readout: expected one of {n} readouts, or None if there is only one, got {readout}")
     rng, halves = np.random.default_rng(seed), halved(responses, readout)
+    median_hz = halves.percentiles_hz[5]
     kinds: tuple[str, ...] = get_args(Kind)
     if kind is not None and kind not in kinds:
         raise InvalidArgument(f"kind: expected one of {', '.join(kinds)}, got {kind!r}")
-    percentiles = np.asarray(pooled_percentiles(halves.first))
-    percentiles = percentiles if readout is None else percentiles[readout]
     simulators = {each: fit_simulator(halves.first, kind=each) for each in kinds}
     distances, band = _chance_levels(halves, rng)
     probabilities: dict[str, Float64[np.ndarray, "held classes"]] = {}
@@ -257,29 +235,29 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         simulator = simulators.get(each)
         prediction = predict_marginal(halves) if simulator is None else predict(simulator, halves)
         prior = probabilities.get("empirical" if each == "memory" else MARGINAL, 1 / CLASSES)
-        probabilities[each] = command_probabilities(prediction, prior, halves, percentiles[1:10])
-        transforms = transformed(prediction, halves)
+        probabilities[each] = prediction.of_commands(prior)
+        of_observed = np.take_along_axis(probabilities[each], halves.commands_of(halves.x_hz)[:, None], 1)[:, 0]
+        transforms = prediction.transforms()
         distance = distance_from_uniform(transforms)
-        series = free_runs(simulator, prediction, halves, FREE_RUNS, rng)
-        lengths = [run_lengths(one, percentiles[5]) for one in series]
-        passing = prediction.probability @ (halves.values_hz >= percentiles[5])
+        correlation, length, lasting = map(_band, _in_time(free_runs(simulator, prediction, FREE_RUNS, rng), median_hz))
+        passing = prediction.probability @ (halves.values_hz >= median_hz)
         scores.append(
             Scores(
                 each,
-                log_likelihood_bits(probabilities[each], halves, percentiles[1:10]),
-                crps(prediction, halves),
+                np.log2(of_observed),
+                prediction.crps(),
                 transforms,
                 distance,
                 None if each in (MARGINAL, "memory") else (1 + int(np.sum(distances >= distance))) / (1 + _CHANCES),
-                _band(autocorrelation(series)),
-                _band(np.array([_mean(runs) for runs in lengths])),
-                _band(np.array([shares_lasting(runs) for runs in lengths])),
+                correlation,
+                length,
+                lasting,
                 _by_condition(passing, halves),
             )
         )
-    recorded = recorded_series(halves)
     # At its own median, as a loop's thresholds adapt: drift is reported separately.
-    lasted = run_lengths(recorded, float(np.median(halves.x_hz)))
+    recorded = _in_time(recorded_series(halves)[None], float(np.median(halves.x_hz)))
+    recorded_correlation, recorded_length, recorded_lasting = (of_one[0] for of_one in recorded)
     conditions = range(len(responses.conditions))
     first = [halves.first_of(c) for c in conditions]
     second = [halves.x_hz[halves.condition == c] for c in conditions]
@@ -288,10 +266,10 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
         tuple(map(len, first)),
         tuple(map(len, second)),
         np.array([[np.median(x) for x in half] for half in (first, second)], np.float64),
-        _by_condition(halves.x_hz >= percentiles[5], halves),
-        autocorrelation(recorded),
-        _mean(lasted),
-        shares_lasting(lasted),
+        _by_condition(halves.x_hz >= median_hz, halves),
+        recorded_correlation,
+        recorded_length,
+        recorded_lasting,
         tuple(scores),
         kind or default_kind(responses),
         responses.is_blocked,
@@ -351,12 +329,22 @@ def _chance_levels(
     return np.array(distances), (float(low), float(high))
 
 
+def _plain(value: Any) -> Any:
+    """A number, an array or a `Band` as JSON data."""
+    if isinstance(value, Band):
+        return {end: _plain(each) for end, each in value._asdict().items()}
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
 def _by_condition(x: Any, halves: Halves) -> Float64[np.ndarray, " conditions"]:
     return np.array([x[halves.condition == c].mean() for c in range(len(halves.whole.conditions))], np.float64)
 
 
-def _mean(runs: Int64[np.ndarray, " runs"]) -> float:
-    return float(runs.mean()) if len(runs) else float("nan")
+def _in_time(series: Float64[np.ndarray, "n trials"], threshold_hz: float) -> tuple[Any, Any, Any]:
+    """The autocorrelation of each series, the mean length of its runs, and the shares that last."""
+    lengths = [run_lengths(one, threshold_hz) for one in series]
+    means = [runs.mean() if len(runs) else np.nan for runs in lengths]
+    return autocorrelation(series), np.array(means), np.array([shares_lasting(runs) for runs in lengths])
 
 
 def _band(x: Float64[np.ndarray, "n *some"]) -> Band:

@@ -55,7 +55,6 @@ class Calibration:
     drift: MedianDrift | None
     start_min: float
     conditions: tuple[Condition, ...]
-    window_ms: tuple[float, float]
     presentation: Presentation | None
     findings: tuple[Finding, ...]
     fitted: dict[str, Any]
@@ -131,7 +130,6 @@ class Calibration:
             drift=median_drift([each for each in timeline.responses if each.start_min <= start_min]),
             start_min=start_min,
             conditions=timeline.conditions,
-            window_ms=timeline.window_ms,
             presentation=timeline.presentation,
             findings=timeline.findings_at(start_min),
             fitted={name: timeline.fitted[name] for name in FITTED},

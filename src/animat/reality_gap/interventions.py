@@ -26,12 +26,9 @@ EPISODES = 100
 
 @dataclass(frozen=True)
 class Intervention:
-    """The same policies with something in place of the culture.
+    """The same policies with something in place of the culture, in closed loop (`is_measured`) or on its simulator.
 
-    Attributes:
-        name, meaning: of the intervention.
-        is_measured: whether in closed loop on the culture, or on its simulator.
-        lost: loss against the policies' measured return, with its interval over episodes.
+    `lost` is the loss against the policies' measured return, with its interval over episodes.
     """
 
     name: str
@@ -63,26 +60,22 @@ def run_ideal_actuator(
 def intervention_table(
     rows: Sequence[Row], meaning_of_ideal: str, with_ideal: Float64[np.ndarray, " episodes"]
 ) -> tuple[Intervention, ...]:
-    """The table: the simulator, an ideal actuator, then the measured interventions; empty without complete episodes.
+    """The table: the simulator, an ideal actuator (`run_ideal_actuator`), then the measured interventions.
 
-    Args:
-        rows: of the session's table, the policies first.
-        meaning_of_ideal, with_ideal: as returned by `run_ideal_actuator`.
+    The session's rows have the policies first; without a complete episode of theirs it is empty.
     """
     usual_returns = rows[0].measured
     if not len(usual_returns):
         return ()
-    by_name = {row.name: row for row in rows}
+    measured = {row.name: row for row in rows if len(row.measured)}
     lost = _lost(usual_returns, with_ideal)
     table = [
         Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
         Intervention("ideal actuator", meaning_of_ideal, False, float(with_ideal.mean()), lost),
     ]
-    for name in MEASURED:
-        row = by_name.get(name)
-        if row is not None and len(row.measured):
-            lost = _lost(usual_returns, row.measured)
-            table.append(Intervention(name, row.meaning, True, float(row.measured.mean()), lost))
+    for row in (measured[name] for name in MEASURED if name in measured):
+        lost = _lost(usual_returns, row.measured)
+        table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
     return tuple(table)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 from typing import Any
 
 from animat.environment import Animat
@@ -16,39 +16,26 @@ RESOLUTION = 0.5
 """Of the grid: fast and coarse, with an error of 0.8 on the range of 200 of the cartpole."""
 
 
-class BackgroundOptimum:
+def begin_optimum(environment: Animat[Any], simulator: NeuronSimulator) -> Future[float]:
     """The optimal return, computed in a background thread, on another core than a loop without deadlines."""
+    optimum: Future[float] = Future()
 
-    def __init__(self, environment: Animat[Any], simulator: NeuronSimulator) -> None:
-        self._value: Future[float] = Future()
+    def work() -> None:
+        try:
+            # Only the value, which is reported as "about": its uncertainty would take a third longer.
+            grid = grid_for(environment.robot).scaled(RESOLUTION)
+            (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
+            optimum.set_result(float(value))
+        except BaseException as error:
+            optimum.set_exception(error)
 
-        def work() -> None:
-            try:
-                # Only the value, which is reported as "about": its uncertainty would take a third longer.
-                grid = grid_for(environment.robot).scaled(RESOLUTION)
-                (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
-                self._value.set_result(float(value))
-            except BaseException as error:
-                self._value.set_exception(error)
+    # A daemon, so that a user who stops the program need not wait for it.
+    threading.Thread(target=work, name="optimal return", daemon=True).start()
+    return optimum
 
-        # A daemon, so that a user who stops the program need not wait for it.
-        threading.Thread(target=work, name="optimal return", daemon=True).start()
 
-    @property
-    def is_done(self) -> bool:
-        """Whether the computation has ended, with a value or an error."""
-        return self._value.done()
-
-    def value(self, progress: Progress | None) -> float:
-        """Wait for the value.
-
-        Raises:
-            Exception: if it could not be computed.
-        """
-        if not self.is_done:
-            in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
-        return self._value.result()
-
-    def join(self) -> None:
-        """Wait until the computation has ended: a program that exits while JAX computes is killed by a signal."""
-        wait([self._value])
+def wait_for_optimum(optimum: Future[float], progress: Progress | None) -> float:
+    """Wait for the value, or raise the error because of which it could not be computed."""
+    if not optimum.done():
+        in_phase(progress, "optimal return").update(0, 1, "computing it on the simulator")
+    return optimum.result()

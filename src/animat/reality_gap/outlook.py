@@ -20,7 +20,6 @@ class Outlook:
     """What is known beforehand of a session's length; minutes are from its start.
 
     Attributes:
-        planned_min: duration of all episodes, as on the simulator.
         drifted_min: time until the recordings' drift has changed P50 by a quarter since the last of them, and a lower
             bound of it; None if the recordings do not determine the drift.
         budget_min: time until the budget of pulses is spent; infinite without one.
@@ -30,27 +29,23 @@ class Outlook:
     drifted_min: tuple[float, float] | None
     budget_min: float
 
-    @property
-    def has_drifted(self) -> bool:
-        """Whether the drift was that large before the session."""
-        return self.drifted_min is not None and self.drifted_min[0] <= 0
-
     def __str__(self) -> str:
+        text = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; "
+        available_min, remedy = self.budget_min, ""
         if self.drifted_min is None:
-            drift = "at least two recordings are needed to estimate the culture's drift"
+            text += "at least two recordings are needed to estimate the culture's drift"
         else:
-            drift = (
+            text += (
                 f"at the drift of the recordings the median response {_when(*self.drifted_min)}, beyond which adaptive "
                 "thresholds may not help"
             )
-        text = f"the session is planned for about {self.planned_min:.0f} min of the culture's time; {drift}"
+            if self.drifted_min[0] > 0:
+                available_min = min(self.drifted_min[0], available_min)
+            else:
+                remedy = "; use newer recordings, with --at-min or by recording again"
         if np.isfinite(self.budget_min):
             text += f"; the budget of pulses lasts for about {self.budget_min:.0f} min"
-        available_min = self.budget_min
-        if self.has_drifted:
-            text += "; use newer recordings, with --at-min or by recording again"
-        elif self.drifted_min is not None:
-            available_min = min(self.drifted_min[0], available_min)
+        text += remedy
         return text + ("; the plan is longer: ask for fewer --episodes" if self.planned_min > available_min else "")
 
 
@@ -72,13 +67,10 @@ def outlook(
     account: Account,
     now_min: float,
 ) -> Outlook:
-    """How long a session will be and can be.
+    """How long a session will be and can be from `now_min` of the culture's clock on.
 
-    Args:
-        calibration: whose recordings' drift is extrapolated.
-        episodes: for each agent the number of episodes, how often each condition is presented in one of them, and
-            whether the culture gets pulses.
-        now_min: on the culture's clock.
+    `episodes` has for each agent the number of episodes, how often each condition is presented in one of them, and
+    whether the culture gets pulses.
     """
     gives = np.array([condition.electrodes != RESTING for condition in loop.conditions])
     interval_s = loop.pulses * np.array([condition.interval_s for condition in loop.conditions])

@@ -25,7 +25,6 @@ EPISODES = 200
 """Episodes of each policy and control in one roll-out."""
 ROLL_OUTS = 5
 """Roll-outs on the recording's simulator; there is one on each bootstrap simulator."""
-
 BOOTSTRAPS_ON_HOST = 40
 """Bootstraps for a robot that is stepped on the host: fewer, as an episode takes a thousand times as long."""
 
@@ -34,11 +33,10 @@ class Prediction(NamedTuple):
     """The predictions for one agent.
 
     Attributes:
-        returns: of its episodes on the recording's simulator, shape (episodes,).
-        bootstrap_means: its mean return on each bootstrap simulator, shape (bootstraps,); their spread is due to the
-            recording's responses and, a little, to the episodes.
-        commanded: in all its episodes on the recording's simulator, shape (conditions,).
-        commanded_bootstraps: on each bootstrap simulator, shape (bootstraps, conditions).
+        returns: of its episodes on the recording's simulator.
+        bootstrap_means: its mean return on each bootstrap simulator; their spread is due to the recording's responses
+            and, a little, to the episodes.
+        commanded: in all its episodes on the recording's simulator; `commanded_bootstraps`: on each bootstrap one.
     """
 
     returns: Float64[np.ndarray, " episodes"]
@@ -53,7 +51,7 @@ class Prediction(NamedTuple):
 
 
 def pool(predicted: Sequence[Prediction]) -> Prediction:
-    """Pool the predictions of several policies."""
+    """The predictions of several policies as one."""
     return Prediction(
         np.concatenate([each.returns for each in predicted]),
         np.mean([each.bootstrap_means for each in predicted], axis=0),
@@ -76,17 +74,12 @@ def predict(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, Prediction]:
-    """Run policies and controls on the simulator of a recording and on its bootstrap simulators.
+    """The prediction for each policy and control, by its name: on a recording's simulator and its bootstrap simulators.
 
     Args:
-        policies: side by side.
-        names: of the policies.
-        environment: of the policies.
+        policies: side by side, with their `names`.
         seed: decides every random draw.
         progress: updated before the policies and each control.
-
-    Returns:
-        The prediction for each policy and control, by its name.
     """
     progress = progress or Silent()
     simulators, episodes_each = [calibration.simulator] * ROLL_OUTS + list(calibration.bootstraps), EPISODES
@@ -113,10 +106,11 @@ def predict(
             progress.update(number, len(acting), control.name)
             episodes = list(side_by_side(run, repeat(number), range(len(simulators))))
             returns = np.array([each.returns for each in episodes])
-            commanded = _stacked([CommandSums(each.presented, each.commanded) for each in episodes])
+            presented = np.array([each.presented for each in episodes])
+            total = np.array([each.commanded for each in episodes]).reshape(*presented.shape, -1)
             rows = {control.name: [*range(control.n_actors)]} if number else {name: [i] for i, name in enumerate(names)}
             for name, of in rows.items():
-                each = CommandSums(*(sums[:, of] for sums in commanded)).summed(1)
+                each = CommandSums(presented[:, of], total[:, of]).summed(1)
                 predictions[name] = Prediction(
                     returns[:ROLL_OUTS, of].ravel(),
                     returns[ROLL_OUTS:, of].mean(axis=(1, 2)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -33,14 +33,7 @@ LEAST_COMMAND = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Data on policies whose measured return differs from the predicted one.
-
-    Attributes:
-        session: responses to the policies.
-        calibration: of the predicting recording.
-        predicted: of all policies together.
-        gap: the sign of their gap: -1 if less was measured.
-    """
+    """Data on policies, all together, whose measured return differs from the predicted one; `gap`: -1 if it is less."""
 
     session: SessionResponses
     calibration: Calibration
@@ -137,8 +130,8 @@ def trend(evidence: Evidence) -> Finding | None:
     if not changes:
         return None
     message = (
-        f"the culture changed over the session's {session.span_min:.0f} min: responses {', '.join(changes)} (of their "
-        f"mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
+        f"the culture changed over the session's {np.ptp(time_s) / 60:.0f} min: responses {', '.join(changes)} (of "
+        f"their mean, standard error), and the returns with them (Kendall's tau with time {with_time.statistic:+.2f})"
     )
     return Finding("trend", "note", message, most)
 
@@ -165,29 +158,26 @@ def answers(evidence: Evidence) -> Finding | None:
     if episodes < FEWEST_EPISODES:
         return None
     conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
-    names, read_hz = evidence.session.responses.readouts.names, evidence.session.responses.read_hz
-    # There is no axis for a single readout.
-    of_readouts: list[Any] = [()] if read_hz.ndim == 1 else [(d,) for d in range(len(names))]
-    tested = [(i, of) for i in conditions.tolist() for of in of_readouts]
+    responses, names = evidence.session.responses, evidence.session.responses.readouts.names
+    tested = [(i, d) for i in conditions.tolist() for d in range(len(names))]
     differences, most = [], 0.0
-    for i, of in tested:
-        at: Any = (i, *of)
-        n, total = measured.presented[:, i], measured.total[:, *at]
-        mean, expected = float(total.sum() / n.sum()), float(predicted.commanded.mean[at])
+    for i, d in tested:
+        n, total = measured.presented[:, i], measured.total[:, i, d]
+        mean, expected = float(total.sum() / n.sum()), float(predicted.commanded.mean[i, d])
         between = episodes / (episodes - 1) * float(np.sum((total - mean * n) ** 2)) / float(n.sum()) ** 2
         error = max(between, _variance(mean, int(n.sum()))) ** 0.5
-        bootstrapped = float(np.nanvar(predicted.commanded_bootstraps.mean[:, *at]))
+        bootstrapped = float(np.nanvar(predicted.commanded_bootstraps.mean[:, i, d]))
         expected_error = max(bootstrapped, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = mean - expected
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < LEVEL / len(tested) and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
-            measured_hz = read_hz[evidence.session.responses.condition == i, *of].mean()
-            on = f" on {names[of[0]]}" if of else ""
+            each_hz = responses.read_hz[responses.condition == i], recorded_hz[i]
+            measured_hz, usual_hz = (x_hz.reshape(len(x_hz), -1)[:, d].mean() for x_hz in each_hz)
+            on = f" on {names[d]}" if len(names) > 1 else ""
             differences.append(
-                f"{_conditions(evidence)[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
-                f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, "
-                f"{recorded_hz[i][:, *of].mean():.3g} in the recording)"
+                f"{responses.conditions[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
+                f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, {usual_hz:.3g} in the recording)"
             )
     if not differences:
         return None

@@ -20,16 +20,13 @@ class Row:
     """A row of the table.
 
     Attributes:
-        name, meaning: of the agent.
-        predicted: returns on the simulator, shape (episodes,).
-        bootstrap_means: mean return on each bootstrap simulator, shape (bootstraps,).
-        measured: returns of complete episodes on the culture, shape (episodes,).
+        predicted, bootstrap_means: as in a `Prediction`.
+        measured: returns of complete episodes on the culture.
         pulses_per_action: given to the culture, without the warm-up; the same holds for the measurements below.
         electrode_pulses: mean number per complete episode, one for each electrode of each pulse; NaN without episodes.
         predicted_electrode_pulses: per episode on the simulator; None if the conditions' electrodes are not known.
         pulse_cost: of an electrode pulse, in the units of the return.
-        bursts: share of responses that were bursts.
-        late: share of trials that came late.
+        bursts, late: shares of responses that were bursts, and of trials that came late.
         comparison: of the policies' measured returns with these; None for the policies, and if either has none.
         met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without a goal,
             and without complete episodes.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import wait
 from dataclasses import replace
 from typing import Any
 
@@ -36,7 +37,7 @@ from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.interventions import half_an_episode, intervention_table, run_ideal_actuator
-from animat.reality_gap.optimum import BackgroundOptimum
+from animat.reality_gap.optimum import begin_optimum, wait_for_optimum
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
 from animat.reality_gap.reasons import Evidence, reasons
@@ -104,7 +105,14 @@ def run_policies(
     """
     first = check_policies(policies)
     check_conditions(first, calibration)
-    loop, findings = _loop_of(first, calibration, pulses, settings)
+    settings = {"burst_threshold": calibration.burst_threshold, **settings}
+    if calibration.adaptive:
+        settings["adaptive_from"] = calibration.adjusted
+    # The recording's conditions have their stimuli: older policies do not know those of patterns.
+    settings["conditions"] = calibration.conditions
+    if first.neural_observation:
+        settings["remembering"] = calibration.remembering
+    loop, findings = Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
     findings += tuple(_warnings(first, loop, calibration, culture.now_s / 60))
     account = account or Account()
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
@@ -154,10 +162,10 @@ def run_policies(
         seed=seed,
         progress=in_phase(progress, "predicting"),
     )
-    optimum = BackgroundOptimum(animat, simulator) if why_no_optimum is None else None
+    optimum = begin_optimum(animat, simulator) if why_no_optimum is None else None
     if optimum is not None and (loop.real_time or not isinstance(culture, VirtualCulture)):
         # Such a loop must not wait for a core.
-        optimum.value(progress)
+        wait_for_optimum(optimum, progress)
     plan = [
         (n, predicted[each.name].presented, each.delivery != "silent") for n, each in zip(of_each, agents, strict=True)
     ]
@@ -184,14 +192,14 @@ def run_policies(
             },
         )
     except Exception:
-        if optimum is not None:
-            optimum.join()
+        # A program that exits while JAX computes is killed by a signal.
+        wait([] if optimum is None else [optimum])
         raise
     best = None
     # A user who stopped the session does not wait for it.
-    if optimum is not None and (optimum.is_done or session.ending.by == "plan"):
+    if optimum is not None and (optimum.done() or session.ending.by == "plan"):
         try:
-            best = optimum.value(progress)
+            best = wait_for_optimum(optimum, progress)
         except Exception as error:
             findings += (Finding("no-optimum", "note", f"no optimal return: {describe_error(error)}"),)
     rows = _rows(agents, tuple(policies), predicted, session, loop, first.pulse_cost)
@@ -200,8 +208,6 @@ def run_policies(
         responses = read_responses(session, loop, tuple(policies))
         gap_reasons = reasons(Evidence(responses, calibration, pool([predicted[p] for p in policies]), sign))
     return RealityGap(
-        robot=loop.robot.name,
-        mapping=loop.mapping.name,
         loop=loop,
         calibrated_at_min=calibration.start_min,
         optimum=best,
@@ -214,20 +220,6 @@ def run_policies(
         reasons=gap_reasons,
         whose_work=() if ideal is None else intervention_table(rows, *ideal),
     )
-
-
-def _loop_of(
-    first: Policy, calibration: Calibration, pulses: int | None, settings: dict[str, Any]
-) -> tuple[Loop, tuple[Finding, ...]]:
-    """The loop for policies like the first one, and its findings."""
-    settings = {"burst_threshold": calibration.burst_threshold, **settings}
-    if calibration.adaptive:
-        settings["adaptive_from"] = calibration.adjusted
-    # The recording's conditions have their stimuli: older policies do not know those of patterns.
-    settings["conditions"] = calibration.conditions
-    if first.neural_observation:
-        settings["remembering"] = calibration.remembering
-    return Loop.of_policy(first, calibration.percentiles, pulses=pulses, **settings)
 
 
 def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: float) -> Iterator[Finding]:
@@ -264,12 +256,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
 
 
 def planned_episodes(policies: int, controls: int, episodes: int) -> list[int]:
-    """Episodes of each policy, then of each control.
-
-    Args:
-        policies, controls: their numbers.
-        episodes: of each policy, and at most of each control.
-    """
+    """Episodes of each policy, then of each control, which has at most as many."""
     of_a_control = max(FEWEST_OF_A_CONTROL, math.ceil(policies * episodes / controls))
     return [episodes] * policies + [min(episodes, of_a_control)] * controls
 
@@ -295,11 +282,7 @@ def check_policies(policies: Mapping[str, Policy]) -> Policy:
 
 
 def check_conditions(first: Policy, calibration: Calibration) -> None:
-    """Raise unless a calibration has the policies' conditions and readouts.
-
-    Raises:
-        Mismatch: if it lacks them.
-    """
+    """Raise Mismatch unless a calibration has the policies' conditions and readouts."""
     if first.mapping is not None:
         expect_conditions(first, calibration.conditions, calibration.readouts)
 
@@ -341,14 +324,12 @@ def _rows(
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
     rows = [policies]
-    for agent in agents:
-        if agent.name in names:
-            if len(names) > 1:
-                rows.append(row(agent.name, agent.meaning, [agent.name]))
-            continue
-        control = row(agent.name, agent.meaning, [agent.name])
+    # The policies come first; a single one has its row already.
+    for agent in agents if len(names) > 1 else agents[1:]:
+        own = row(agent.name, agent.meaning, [agent.name])
         # With a different goal in mid-episode policies should do equally well: there is nothing to outperform.
-        if len(control.measured) and len(policies.measured) and agent.switch_at is None:
-            control = replace(control, comparison=compare_episodes(policies.measured, control.measured))
-        rows.append(control)
+        is_compared = agent.name not in names and agent.switch_at is None
+        if is_compared and len(own.measured) and len(policies.measured):
+            own = replace(own, comparison=compare_episodes(policies.measured, own.measured))
+        rows.append(own)
     return tuple(rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,24 +17,26 @@ from animat.responses.extraction import SILENCE_S
 from animat.responses.responses import Responses, Trials
 from animat.robots.base import Robot
 
+_TICK = [("condition", np.int64), ("rate_hz", np.float64), ("is_burst", np.bool_), ("active_ratio", np.float64)]
+_TICK += [(name, np.float64) for name in ("read_s", "late_s", "first_s")] + [("episode", np.int64), ("moved", np.bool_)]
+
 
 class CommandSums(NamedTuple):
     """The commands that each condition led to.
 
     Attributes:
-        presented: how often each condition was presented, shape (..., conditions).
-        total: the sum of its commands, the same shape; several commands separately, shape (..., conditions, commands).
+        presented: how often each condition was presented.
+        total: the sum of its commands, each of them separately.
     """
 
     presented: Int64[np.ndarray, "*any conditions"]
-    total: Float64[np.ndarray, "*any"]
+    total: Float64[np.ndarray, "*any conditions commands"]
 
     @property
-    def mean(self) -> Float64[np.ndarray, "*any"]:
-        """The mean command of each condition, in the shape of `total`; NaN for one that was never presented."""
-        of_several = self.total.ndim > self.presented.ndim
+    def mean(self) -> Float64[np.ndarray, "*any conditions commands"]:
+        """The mean commands of each condition; NaN for one that was never presented."""
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.total / (self.presented[..., None] if of_several else self.presented))
+            return np.asarray(self.total / self.presented[..., None])
 
     def summed(self, axis: int) -> CommandSums:
         """Summed over an axis of policies or episodes."""
@@ -47,12 +49,11 @@ class SessionResponses:
 
     Attributes:
         responses: in order of time, on the session's clock, with everything that was presented between them.
-        episode: index in `returns` of each response's episode, shape (responses,).
-        late_s: lateness of its pulses, shape (responses,).
-        moved: whether it moved the robot, and was not repeated or skipped as a burst, shape (responses,).
-        command: with which it moved the robot, shape (responses,); several commands separately, shape (responses,
-            commands). NaN if it did not move the robot.
-        returns: of the episodes, in order of time, shape (episodes,).
+        episode: index in `returns` of each response's episode.
+        late_s: lateness of its pulses.
+        moved: whether it moved the robot, and was not repeated or skipped as a burst.
+        command: with which it moved the robot; NaN if it did not.
+        returns: of the episodes, in order of time.
     """
 
     responses: Responses
@@ -64,72 +65,56 @@ class SessionResponses:
 
     @property
     def commanded(self) -> CommandSums:
-        """Commands of the responses that moved the robot in each episode, shape (episodes, conditions)."""
-        shape, moved = (len(self.returns), len(self.responses.conditions)), self.moved
-        presented, total = np.zeros(shape, np.int64), np.zeros((*shape, *self.command.shape[1:]))
-        at = self.episode[moved], self.responses.condition[moved]
+        """Commands of the responses that moved the robot in each episode, shape (episodes, conditions, ...)."""
+        shape, command = (len(self.returns), len(self.responses.conditions)), np.atleast_2d(self.command.T).T
+        presented, total = np.zeros(shape, np.int64), np.zeros((*shape, command.shape[1]))
+        at = self.episode[self.moved], self.responses.condition[self.moved]
         np.add.at(presented, at, 1)
-        np.add.at(total, at, self.command[moved])
+        np.add.at(total, at, command[self.moved])
         return CommandSums(presented, total)
-
-    @property
-    def span_min(self) -> float:
-        """Minutes from the first response to the last."""
-        time_s = self.responses.time_s
-        return 0.0 if time_s is None or not len(time_s) else float(time_s[-1] - time_s[0]) / 60
 
 
 def read_responses(session: Session, loop: Loop, policies: Collection[str]) -> SessionResponses:
-    """Read the responses to policies from the log of a session that has ended.
-
-    Args:
-        policies: their names among the agents.
-    """
+    """Read the responses to policies, by their names, from the log of a session that has ended."""
     whole = [each for each in session.episodes if each.agent in policies and each.is_whole]
     place = {each.number: row for row, each in enumerate(whole)}
-    presented: list[tuple[int, float, bool, float, float]] = []
-    acted: list[tuple[int, int, float, float, bool]] = []
     shape = loop.decoder.percentiles_shape[:-1]
-    no_command, commands = np.full(shape, np.nan).tolist(), []
-    read_hz: list[Sequence[float]] = []
-    for record in session.log.records.fields():
+    no_command, commands, read_hz, rows = np.full(shape, np.nan).tolist(), [], [], []
+    for record in session.log.fields():
         tick = record.get("tick")
         if not tick or not tick["pulse_time_s"]:
             continue
-        if tick["iteration"] >= 0 and tick["episode"] in place:
-            moved = tick["handled"] == "used"
+        episode, moved = place.get(tick["episode"], -1) if tick["iteration"] >= 0 else -1, tick["handled"] == "used"
+        values = (tick[name] for name in ("delivered", "rate_hz", "is_burst", "active_ratio", "read_after_s", "late_s"))
+        rows.append((*values, tick["pulse_time_s"][0], episode, moved))
+        if episode >= 0:
             read_hz.append(tick.get("readout_hz") or [tick["rate_hz"]])
             commands.append(tick["command"] if moved else no_command)
-            acted.append((place[tick["episode"]], len(presented), tick["late_s"], tick["active_ratio"], moved))
-        presented.append(
-            (tick["delivered"], tick["rate_hz"], tick["is_burst"], tick["pulse_time_s"][0], tick["read_after_s"])
-        )
-    condition, rate_hz, is_burst, first_s, read_s = _columns(presented, 5)
-    episode, at, late_s, active_ratio, moved = _columns(acted, 5)
-    at = at.astype(np.int64)
+    every = np.array(rows, _TICK)
+    at = np.flatnonzero(every["episode"] >= 0)
+    acted = every[at]
     x_hz = loop.readouts.squeeze(np.array(read_hz, np.float64).reshape(-1, len(loop.readouts)))
-    is_rested = first_s - np.concatenate([[-np.inf], read_s[:-1]]) > SILENCE_S
-    presentations = Trials(condition.astype(np.int64), rate_hz, is_burst.astype(bool), is_rested, read_s)
+    is_rested = every["first_s"] - np.concatenate([[-np.inf], every["read_s"][:-1]]) > SILENCE_S
     responses = Responses(
-        condition=presentations.condition[at],
-        rate_hz=presentations.rate_hz[at],
-        active_ratio=active_ratio,
-        is_burst=presentations.is_burst[at],
+        condition=acted["condition"],
+        rate_hz=acted["rate_hz"],
+        active_ratio=acted["active_ratio"],
+        is_burst=acted["is_burst"],
         conditions=loop.conditions,
         window_ms=loop.window_ms,
         n_channels=len(session.log.header["channels"]["label"]),
         threshold=loop.burst_threshold,
         separability=float("nan"),
         presentation=loop.presentation,
-        time_s=read_s[at],
-        presented=presentations,
+        time_s=acted["read_s"],
+        presented=Trials(every["condition"], every["rate_hz"], every["is_burst"], is_rested, every["read_s"]),
         place=at,
         readouts=loop.readouts,
         readout_hz=None if loop.readouts.are_all else x_hz,
     )
     returns = np.array([each.total for each in whole], np.float64)
     command = np.array(commands, np.float64).reshape(len(acted), *shape)
-    return SessionResponses(responses, episode.astype(np.int64), late_s, moved.astype(bool), command, returns)
+    return SessionResponses(responses, acted["episode"], acted["late_s"], acted["moved"], command, returns)
 
 
 def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:
@@ -141,7 +126,3 @@ def outcomes(robot: Robot[Any], session: Session) -> dict[int, Outcome]:
         if tick.reward is not None and tick.episode in observed:
             observed[tick.episode].append(tick.observation)
     return {number: robot.outcome_of(np.array(path, np.float32)) for number, path in observed.items()}
-
-
-def _columns(rows: Sequence[tuple[float, ...]], n: int) -> Float64[np.ndarray, "columns rows"]:
-    return np.array(rows, np.float64).reshape(-1, n).T

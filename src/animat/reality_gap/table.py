@@ -40,8 +40,6 @@ class RealityGap:
         whose_work: the policies' return with something in place of the culture; empty if it was not requested.
     """
 
-    robot: str
-    mapping: str
     loop: Loop
     calibrated_at_min: float
     optimum: float | None
@@ -70,19 +68,14 @@ class RealityGap:
 
     def verdict(self) -> str:
         """Whether the policies outperform the controls, and possible reasons for the gap."""
-        verdict, policies = self.control_verdict, self.rows[0]
+        verdict, row, share = self.control_verdict, self.rows[0], self.gap_share
         if verdict is None:
-            agent = "no control" if len(policies.measured) else "no policy"
+            agent = "no control" if len(row.measured) else "no policy"
             return f"{agent} completed an episode: the policies cannot be compared with the controls"
-        return str(verdict) + self._on_the_gap()
-
-    def _on_the_gap(self) -> str:
-        """Possible reasons for the policies' gap."""
-        row, share = self.rows[0], self.gap_share
         if not row.gap_sign and (share is None or abs(share) < LARGE_SHARE or len(row.measured) < 2):
-            return ""
+            return str(verdict)
         gap = row.gap.value
-        text = f"; their measured return is {abs(gap):.1f} {'more' if gap > 0 else 'less'} than predicted"
+        text = f"{verdict}; their measured return is {abs(gap):.1f} {'more' if gap > 0 else 'less'} than predicted"
         if not row.gap_sign:
             return (
                 f"{text}, within the uncertainty due to the number of responses in the recording ({self.responses}) "
@@ -95,8 +88,8 @@ class RealityGap:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
-            "robot": self.robot,
-            "mapping": self.mapping,
+            "robot": self.loop.robot.name,
+            "mapping": self.loop.mapping.name,
             "presentation": str(self.loop.presentation),
             "calibrated_at_min": self.calibrated_at_min,
             "optimum": self.optimum,
@@ -138,8 +131,8 @@ class RealityGap:
         head = ["", "predicted", interval, "measured", "gap", interval, *(MEANS if objectives else ()), "episodes"]
         head += ["pulses/action", "electrode pulses", *(("predicted net", "net") if cost else ()), "p value", "meaning"]
         lines = [
-            f"{self.robot}, {self.mapping}, {self.loop.presentation}; predicted from the recording at "
-            f"{in_min(self.calibrated_at_min)}",
+            f"{self.loop.robot.name}, {self.loop.mapping.name}, {self.loop.presentation}; predicted from the recording "
+            f"at {in_min(self.calibrated_at_min)}",
             *align_columns(head, cells),
         ]
         if self.rows[0].met:
@@ -153,21 +146,19 @@ class RealityGap:
             ignores = "" if self.optimum is None else "; the optimal return ignores the cost"
             lines.append(f"  electrode pulses: per episode; net: return - {cost:g} x electrode pulses{ignores}")
         lines += [f"  {finding.message}" for finding in self.findings if finding.name in ("no-optimum", "no-heuristic")]
-        outline = self.session.to_dict()
-        lines.append(f"  {self.verdict()}")
-        lines.append(
+        outline = self.session.outline
+        lines += [
+            f"  {self.verdict()}",
             "  p value: of the two-sided Mann-Whitney test of the policies' returns against this control's; electrode "
-            "pulses: per whole episode, one for each electrode of each pulse"
-        )
-        lines.append(f"  stimulation: {self.account}")
-        lines.append(
-            f"  ticks: {outline['ticks']}, bursts: {outline['bursts']}, late pulses: {outline['late_pulses']}"
-            f" (the latest {outline['latest_ms']:.1f} ms); ended: {outline['ended']}"
-        )
+            "pulses: per whole episode, one for each electrode of each pulse",
+            f"  stimulation: {self.account}",
+            f"  ticks: {outline.ticks}, bursts: {outline.bursts}, late pulses: {outline.late}"
+            f" (the latest {1000 * outline.latest_s:.1f} ms); ended: {self.session.ending.message}",
+        ]
         if self.whose_work:
             lines += intervention_lines(self.rows[0], self.whose_work)
-        if outline["unanswered_pulses"]:
+        if outline.unanswered_pulses:
             lines.append(f"  {unanswered_message(self.session)}")
-        if self.session.outline.left_out:
-            lines.append(f"  left out: {describe_left_out(self.session.outline.left_out)}")
+        if outline.left_out:
+            lines.append(f"  left out: {describe_left_out(outline.left_out)}")
         return "\n".join(lines)

@@ -49,7 +49,7 @@ def scene_of_session(path: str | os.PathLike[str], span_s: tuple[float, float] |
     with expect_session_log(file):
         seed, window_s = int(fields["seed"]), float(fields["loop"]["window_ms"][1]) * 1e-3
         reading = _Reading(header.conditions, window_s)
-        for record in session.log.records:
+        for record in session.log:
             is_past = is_found and record.fields["kind"] == "seen" and record.fields.get("start_s", 0.0) >= to_s
             # In a pause before the first trial nothing moves yet; the robot's state is known from that trial.
             if is_past and reading.moments:
