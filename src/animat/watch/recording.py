@@ -74,10 +74,10 @@ class RecordingView(View):
                 ("verdict", inspection.verdict),
                 ("stimuli", inspection.n_stimuli),
                 ("spikes", inspection.n_spikes),
-                ("channels", inspection.n_channels),
+                ("channels", inspection.responses.n_channels),
                 ("seconds", inspection.duration_s),
                 ("bursts", inspection.n_bursts),
-                ("presented", inspection.presentation or "not known"),
+                ("presented", str(inspection.responses.presentation or "not known")),
             ]
         return rows
 
@@ -113,7 +113,7 @@ class RecordingView(View):
 
     def _keep(self, file: Path, inspection: Inspection | None) -> None:
         shares = {} if inspection is None else {text(c.label): c.share_above_median for c in inspection.conditions}
-        self._shares[file] = (float("nan") if inspection is None else inspection.start_min), shares
+        self._shares[file] = (float("nan") if inspection is None else inspection.responses.start_min), shares
 
 
 def _message(whole: int, newest: Path, recording: Recording | None, *, running: bool, is_broken: bool) -> str:
