@@ -449,9 +449,13 @@ BAD = {
     "a misspelt setting": (
         nothing,
         [*TRAIN, "{folder}/none", "--sac", "tau=0.01", "discuont=0.98"],
-        ["--sac", "'discuont'", "did you mean discount?"],
+        ["--sac: discuont: no such setting", "did you mean discount?"],
     ),
-    "a setting of no name": (nothing, [*TRAIN, "{folder}/none", "--sac", "x=1"], ["--sac", "'x'", "learning_rate"]),
+    "a setting of no name": (
+        nothing,
+        [*TRAIN, "{folder}/none", "--sac", "x=1"],
+        ["--sac: x: no such", "learning_rate"],
+    ),
     "a setting out of bounds": (nothing, [*TRAIN, "{folder}/none", "--sac", "discount=2"], ["--sac: discount", "1"]),
     "a setting of another kind": (nothing, [*TRAIN, "{folder}/none", "--sac", "batch=1.5"], ["--sac: batch", "whole"]),
     "a setting twice": (nothing, [*TRAIN, "{folder}/none", "--sac", "tau=0.1", "tau=0.2"], ["--sac", "tau once"]),

@@ -28,7 +28,6 @@ class ClusterCommand:
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Run it until Ctrl-C."""
         from animat.execution.local_cluster import local_cluster
 
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers

@@ -69,7 +69,6 @@ class Live(StimulationOptions):
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Record, train and run."""
         from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget

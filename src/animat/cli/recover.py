@@ -19,7 +19,6 @@ class Recover:
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Recover."""
         from animat.closed_loop.session import lost_message, recover_session, unanswered_message
         from animat.progress import Bar
 

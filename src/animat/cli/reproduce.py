@@ -31,7 +31,6 @@ class Reproduce(JobOptions, StudyOptions):
     """The paper's study on a virtual culture: record, train, evaluate, compare, report. Resumes where it stopped."""
 
     def run(self) -> dict[str, Any]:
-        """Run it."""
         from animat.studies.paper import paper_study
         from animat.studies.source import read_seeds
 

@@ -18,7 +18,6 @@ class Robots:
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """List them."""
         from animat.errors import InvalidArgument
         from animat.robots.registry import REGISTRY
 

@@ -23,7 +23,6 @@ class Watch:
     """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Serve it."""
         from animat.watch.serving import serve
 
         if not self.folder.is_dir():
