@@ -102,10 +102,7 @@ class Linear(Mapping):
     Source: prepared by the authors of Sawada et al. 2022 and left out of the paper.
     """
 
-    @property
-    def name(self) -> str:
-        """`linear`."""
-        return "linear"
+    name = "linear"
 
     def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
         """The position of `x` between the extremes of the measured responses (see `Mapping.command`)."""
