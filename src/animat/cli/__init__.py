@@ -14,13 +14,14 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Union
 
 import tyro
 from tyro import constructors
 from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
 
 from animat.cli.cluster import ClusterCommand
+from animat.cli.command import Command, FolderCommand
 from animat.cli.convert import Convert
 from animat.cli.evaluate import Evaluate
 from animat.cli.inspect import Inspect
@@ -41,28 +42,25 @@ from animat.devices import stay_on_cores
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 from animat.plain_file import is_folder
 
-Command = (
-    Annotated[Record, subcommand("record")]
-    | Annotated[Inspect, subcommand("inspect")]
-    | Annotated[Validate, subcommand("validate")]
-    | Annotated[Convert, subcommand("convert")]
-    | Annotated[Train, subcommand("train")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Reproduce, subcommand("reproduce")]
-    | Annotated[StudyFile, subcommand("study")]
-    | Annotated[TuneFile, subcommand("tune")]
-    | Annotated[ClusterCommand, subcommand("cluster")]
-    | Annotated[Run, subcommand("run")]
-    | Annotated[Live, subcommand("live")]
-    | Annotated[Recover, subcommand("recover")]
-    | Annotated[Replay, subcommand("replay")]
-    | Annotated[Watch, subcommand("watch")]
-    | Annotated[Robots, subcommand("robots")]
-)
-
-Watched = Record | Train | Reproduce | StudyFile | TuneFile | Run | Live
-"""Commands that leave work in a folder as they go."""
-COMMANDS = {command.__metadata__[0].name: command.__origin__ for command in get_args(Command)}
+COMMANDS: dict[str, type[Command]] = {
+    "record": Record,
+    "inspect": Inspect,
+    "validate": Validate,
+    "convert": Convert,
+    "train": Train,
+    "evaluate": Evaluate,
+    "reproduce": Reproduce,
+    "study": StudyFile,
+    "tune": TuneFile,
+    "cluster": ClusterCommand,
+    "run": Run,
+    "live": Live,
+    "recover": Recover,
+    "replay": Replay,
+    "watch": Watch,
+    "robots": Robots,
+}
+_SUBCOMMANDS: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in COMMANDS.items())]  # noqa: UP007
 
 _MEMORY_REMEDIES: dict[type, str] = {
     Evaluate: "ask for fewer episodes (--episodes {episodes})",
@@ -151,8 +149,7 @@ def _message(command: Command, error: BaseException) -> str | None:
 
 def _what_is_left(command: Command) -> str:
     """What an interrupted command has kept, and how to go on."""
-    # The others finish their work only at their end.
-    if not isinstance(command, Watched) or not is_folder(command.out) or not any(command.out.iterdir()):
+    if not isinstance(command, FolderCommand) or not is_folder(command.out) or not any(command.out.iterdir()):
         return ""
     if isinstance(command, Run) and (command.out / "session.log").exists():
         recover = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}"
@@ -187,7 +184,7 @@ def _name_option(command: Command, message: str) -> str:
 
 def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
     """The live page of a command with `--watch`, served while the command runs or the page is open."""
-    if not isinstance(command, Watched) or not command.watch:
+    if not isinstance(command, FolderCommand) or not command.watch:
         return contextlib.nullcontext()
     from animat.watch.serving import watching
 
@@ -208,10 +205,11 @@ def _parse(arguments: list[str]) -> Command:
     options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
     see = f"; see animat {name} --help" if name in COMMANDS else "; see animat --help"
     output = io.StringIO()
+    command: Command
     try:
         with contextlib.redirect_stderr(output):
             command, unknown = tyro.cli(
-                Command,
+                _SUBCOMMANDS,
                 prog="animat",
                 description="Drive a robot with a living neuronal culture.",
                 args=arguments,
@@ -264,14 +262,16 @@ def _options() -> constructors.ConstructorRegistry:
     @registry.struct_rule
     def rule(command: constructors.StructTypeInfo) -> constructors.StructConstructorSpec | None:
         nonlocal within
-        if within or not dataclasses.is_dataclass(command.type):
+        if within or not (isinstance(command.type, type) and issubclass(command.type, Command)):
             return None
         within = True  # The lookup below would otherwise call this rule again.
         spec = constructors.ConstructorRegistry.get_struct_spec(command)
         within = False
         if not isinstance(spec, constructors.StructConstructorSpec):
             return None
-        return dataclasses.replace(spec, fields=tuple(map(_option, spec.fields)))
+        last = {name: place for place, name in enumerate(command.type.last)}
+        fields = sorted(map(_option, spec.fields), key=lambda option: last.get(option.name, -1))
+        return dataclasses.replace(spec, fields=tuple(fields))
 
     return registry
 

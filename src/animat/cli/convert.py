@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.command import Command
 from animat.errors import InvalidArgument, InvalidFile
 from animat.writing import expect_writable
 
@@ -15,7 +16,7 @@ DETECTION_OPTIONS = ("band_hz", "threshold", "dead_time_ms", "blank_ms")
 
 
 @dataclass(frozen=True)
-class Convert:
+class Convert(Command):
     """Write a recording of any rig as NWB, with its metadata; optionally find the spikes in raw traces."""
 
     recording: Positional[Path]
@@ -66,8 +67,6 @@ class Convert:
     """Of two negative peaks within this time, the deeper one is the spike"""
     blank_ms: tuple[float, float] = (0.5, 1.5)
     """Time before and after each stimulus in which no spikes are sought"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.progress import Bar

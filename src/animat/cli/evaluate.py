@@ -47,8 +47,6 @@ class Evaluate(SimulatorOptions):
     """Decides every random draw"""
     out: Path | None = None
     """JSON file for all results; the live page of a training shows evaluation.json of the policies' folder"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.compilation import keep_compilations

@@ -35,8 +35,6 @@ class Inspect(ResponseOptions):
     """Folder for figures; default: none are drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
     """Format of the figures"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.reading import list_recordings, read_source

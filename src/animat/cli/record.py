@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from animat.cli.command import FolderCommand
 from animat.errors import InvalidArgument, Mismatch, in_min
 from animat.folder_kinds import expect_no_other
 
@@ -18,7 +19,7 @@ _PRESENTED = ("order", "pulses", "trials", "places")
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(FolderCommand):
     """Record a culture: one NWB file per recording. Resumes where it stopped."""
 
     culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
@@ -52,10 +53,6 @@ class Record:
     what it leaves out has its default"""
     out: Path = Path("recordings")
     """Folder for the files"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.cultures.kinds import culture_of

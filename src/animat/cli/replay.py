@@ -33,8 +33,6 @@ class Replay(SimulatorOptions):
     """For policies: decides every random draw"""
     out: Path = Path("film.gif")
     """The film: .gif, or .mp4, which needs animat[film]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.closed_loop.session import lost_message

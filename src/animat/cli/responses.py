@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from animat.cli.command import Command
 from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.findings import Finding, warnings_once
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ResponseOptions:
+class ResponseOptions(Command):
     """How responses are read from recordings; the same in every command that reads them."""
 
     conditions: str | None = None

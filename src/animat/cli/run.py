@@ -79,10 +79,6 @@ class Run(StimulationOptions):
     """Decides every random draw, except what a living culture does"""
     out: Path = Path("session")
     """Folder for the session's log and recording"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.closed_loop.loop import Loop

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.jobs import JobOptions
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import SimulatorOptions, print_warnings
 from animat.errors import InvalidArgument, UnusableData, in_min
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Train(SimulatorOptions):
+class Train(SimulatorOptions, JobOptions):
     """Train policies for a robot on the simulators of a culture's recordings. Resumes where it stopped."""
 
     robot: Positional[str] = "cartpole"
@@ -75,25 +76,13 @@ class Train(SimulatorOptions):
     assess: int | None = None
     """Episodes of an assessment after each sixtieth of the training; the best policies so far are kept in OUT/best;
     default: none, but 20 where lessons say when to advance"""
-    workers: int | None = None
-    """Processes, each on its own core; default: one per core"""
-    cluster: str | None = None
-    """Run on other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
-    shared_folder: bool = True
-    """With --cluster: workers do not see --out at the same path, so files are passed through this process"""
     tensorboard: Path | None = None
     """Folder for TensorBoard: live learning curves, one run per policy; needs animat[tensorboard]"""
     out: Path = Path("policies")
     """Folder for the policies"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        from animat.execution.cluster import on_cluster
         from animat.execution.training import train
-        from animat.progress import Bar
         from animat.report.tensorboard import TensorBoard
         from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
 
@@ -115,17 +104,15 @@ class Train(SimulatorOptions):
             print(_controllability(timeline))
         # A resumed training has reported it before.
         random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
-        with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
+        with self.executing("training") as execution, board as on_row:
             trained = train(
                 training,
                 timeline,
                 self.out,
-                workers=self.workers,
-                executor=executor,
-                progress=progress,
                 sources=[str(path) for path in self.recordings],
                 random_return=random,
                 callbacks=() if on_row is None else (on_row,),
+                **execution,
             )
         if was_finished:
             print(f"this training is already finished; the policies in {self.out} are unchanged")

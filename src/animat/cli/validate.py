@@ -31,8 +31,6 @@ class Validate(ResponseOptions):
     """Format of the figures"""
     seed: int = 1
     """Decides every random draw"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
         from animat.compilation import keep_compilations
