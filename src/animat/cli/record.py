@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.cli.command import FolderCommand
-from animat.errors import InvalidArgument, Mismatch, in_min
+from animat.errors import InvalidArgument, Mismatch, in_min, some_of
 from animat.folder_kinds import expect_no_other
 
 if TYPE_CHECKING:
@@ -133,8 +133,8 @@ def _expect_no_others(folder: Path) -> None:
     expect_no_other(folder, "recording")
     others = sorted(file.name for file in folder.glob("[!.]*.nwb") if not file.name.startswith("recording_"))
     if others:
-        shown = f"{', '.join(others[:3])}{' ...' if len(others) > 3 else ''}"
-        raise Mismatch(f"{folder}: expected only recordings of this series, got {shown}; choose another --out")
+        got = some_of(others, 3)
+        raise Mismatch(f"{folder}: expected only recordings of this series, got {got}; choose another --out")
 
 
 def _warn_too_fast(protocol: Protocol) -> None:

@@ -33,6 +33,8 @@ def seconds(name: str, value: Any) -> float:
 
     Raises InvalidArgument for less precise types: float32 is 1 ms off after 10,000 s.
     """
+    if type(value) is float:
+        return value
     if isinstance(value, float) or (type(value) is not bool and isinstance(value, Integral)):
         return number(name, value)
     raise InvalidArgument(
