@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from animat.cli import main
 from animat.cli.record import Record
+from animat.cultures.series import Series
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
@@ -147,7 +148,7 @@ def test_the_command_records_places(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_the_command_says_how_to_train_on_places(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(Record, "_series", lambda *_: [])
+    monkeypatch.setattr("animat.cultures.series.record_series", lambda *_, **__: Series([], []))
     assert main(["record", "--places", "halves"]) == 0
     assert "each place is a condition; --conditions frequency pools the places" in capsys.readouterr().out
     assert main(["record"]) == 0
@@ -162,7 +163,7 @@ def test_places_are_the_default_conditions(hz: tuple[float, ...], by: str) -> No
     responses = extract_responses(recording, burst_threshold=1.0)
     assert responses.by == by and len(responses.conditions) == 2 * len(hz)
     inspection = inspect_recording(recording, burst_threshold=1.0)
-    assert (inspection.by, inspection.by_default) == (by, True)
+    assert (inspection.responses.by, inspection.by_default) == (by, True)
     assert extract_responses(recording, conditions_named("frequency"), burst_threshold=1.0).by == "frequency"
 
 

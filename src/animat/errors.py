@@ -89,11 +89,7 @@ def some_of(names: Sequence[object], most: int = 8) -> str:
 
 
 def expect_kind(what: str, given: object, kind: Any, words: str) -> None:
-    """Refuse an argument of the wrong type, such as a path in place of the recording that it holds.
-
-    Raises:
-        InvalidArgument: naming the argument, what was expected (`words`) and what came.
-    """
+    """Raise InvalidArgument for an argument of the wrong type, such as a path in place of the recording it holds."""
     if not isinstance(given, kind):
         raise InvalidArgument(f"{what}: expected {words}, got {shown(given)}")
 

@@ -7,7 +7,6 @@ import sys
 import threading
 import time
 from collections import deque
-from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 if TYPE_CHECKING:
@@ -41,16 +40,12 @@ class Silent:
 
 
 class Part:
-    """A part of longer work, as a progress: `units` of the whole's total, after the `before` ones before it.
-
-    `note` is shown when the part itself has none.
-    """
+    """A part of longer work, `units` of the whole's total after `before`; its `note` is for reports without one."""
 
     def __init__(self, whole: Progress, before: float, units: float, total: float, note: str = "") -> None:
         self._whole, self._before, self._units, self._total, self._note = whole, before, units, total, note
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Advance the whole by the same amount."""
         self._whole.update(self._before + self._units * done / total, self._total, note or self._note)
 
 
@@ -67,7 +62,6 @@ class EqualPhases:
         self._has_reported = False
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Advance the whole by the phase's share."""
         self._has_reported = True
         self._whole.update(self._phase + done / total, self._last + 1, note)
 
@@ -76,13 +70,8 @@ def in_phase(progress: Progress | None, title: str, amount: float = 0.0, unit: s
     """The progress of the next phase of the work, whose length says nothing about that of the others.
 
     A `Bar` shows each phase separately, one below the other, and for `EqualPhases` each is a part of the whole; any
-    other progress receives the reports of all phases one after the other.
-
-    Args:
-        progress: of the whole work; None: silent.
-        title: a word or two.
-        amount: how much is done in the phase, if a number says more than a share; 0: none.
-        unit: of the amount, in the plural.
+    other progress receives the reports of all phases one after the other. `amount` is how much is done in the phase,
+    if a number says more than a share, and `unit` its unit in the plural.
     """
     if isinstance(progress, Bar):
         progress.begin(title, amount, unit)
@@ -95,10 +84,7 @@ class Speed:
     """The speed of work, over the later two thirds of the time since it first moved.
 
     What came before, such as compilation and the work loaded from a checkpoint, says nothing about the rest. Work is
-    measured as a share of the whole, or in larger units.
-
-    Args:
-        most_s: the longest time it is measured over, in seconds.
+    measured as a share of the whole, or in larger units, over `most_s` seconds at the most.
     """
 
     def __init__(self, most_s: float = math.inf) -> None:
@@ -145,22 +131,19 @@ class Phase:
         self.title, self.share, self.note = title, 0.0, ""
         self.has_reported = False
         self._amount, self._unit = amount, unit
-        self._began_s, self._ended_s = time.monotonic(), float("inf")
+        self._began_s, self._ended_s = time.monotonic(), math.inf
         self._speed = Speed()
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Record a report."""
         # Sums of parts may pass either end by a rounding error.
         self.share, self.note, self.has_reported = min(1.0, max(0.0, done / total)), note, True
         self._speed.see(self.share)
 
     def end(self) -> None:
-        """Mark it as done."""
         self.share, self.note, self._ended_s = 1.0, "", time.monotonic()
 
     @property
     def passed_s(self) -> float:
-        """Seconds it has taken."""
         return min(time.monotonic(), self._ended_s) - self._began_s
 
     def counted(self) -> list[str]:
@@ -197,8 +180,7 @@ class Bar:
 
         training: 34 %, 81,600 of 240,000 iterations, 1,940 a second, 82 s left, return 101.2
 
-    Use it as a context manager: `with Bar("training") as progress: ...`. Each phase of the work (`in_phase`) has its
-    own bar.
+    It is a context manager. Each phase of the work (`in_phase`) has its own bar.
     """
 
     def __init__(self, title: str) -> None:
@@ -232,7 +214,6 @@ class Bar:
         self._phases = [*(phase for phase in self._phases if phase.has_reported), Phase(title, amount, unit)]
 
     def update(self, done: float, total: float, note: str = "") -> None:
-        """Move the bar to `done` of `total`."""
         self._phases[-1].update(done, total, note)
         if self._live is None:
             self._print_line()
@@ -242,7 +223,6 @@ class Bar:
             self._print_line()
 
     def _print_line(self) -> None:
-        """Print a line if the last one is old enough."""
         with self._printing:
             now_s, phase = time.monotonic(), self._phases[-1]
             if now_s - self._printed_s < LINE_EVERY_S:
@@ -272,9 +252,7 @@ class Bar:
         details = ", ".join(filter(None, [*phases[-1].counted(), phases[-1].note]))
         return Group(table, Text(details, no_wrap=True, overflow="ellipsis")) if details else table
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._is_over.set()
         if self._live is not None:
             self._live.stop()

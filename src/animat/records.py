@@ -88,10 +88,7 @@ def record(kind: type[T]) -> type[T]:
 def read_record(kind: type[T], data: Any, where: str = "") -> T:
     """A record, or any other type, from plain data as in a file; missing fields take their defaults.
 
-    `where` is the name of the whole in messages.
-
-    Raises:
-        InvalidArgument: naming the key, what was expected and what came.
+    InvalidArgument names the key (in `where`, the name of the whole), what was expected and what came.
     """
     try:
         return TypeAdapter(kind).validate_python(data)
@@ -100,11 +97,7 @@ def read_record(kind: type[T], data: Any, where: str = "") -> T:
 
 
 def json_data(text: str, what: str, like: str = "JSON") -> Any:
-    """Plain data from JSON; in messages it is called `what`, and `like` is what was expected.
-
-    Raises:
-        InvalidArgument: for text that is not JSON, with the place of the error, or a repeated name.
-    """
+    """Plain data from JSON, called `what` in messages; InvalidArgument for other text, or for a repeated name."""
     try:
         return json.loads(text, object_pairs_hook=_each_once)
     except InvalidArgument as error:

@@ -14,13 +14,14 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Union
 
 import tyro
 from tyro import constructors
 from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg, subcommand
 
 from animat.cli.cluster import ClusterCommand
+from animat.cli.command import Command, FolderCommand
 from animat.cli.convert import Convert
 from animat.cli.evaluate import Evaluate
 from animat.cli.inspect import Inspect
@@ -41,26 +42,25 @@ from animat.devices import stay_on_cores
 from animat.errors import AnimatError, InvalidArgument, did_you_mean, out_of_memory
 from animat.plain_file import is_folder
 
-Command = (
-    Annotated[Record, subcommand("record")]
-    | Annotated[Inspect, subcommand("inspect")]
-    | Annotated[Validate, subcommand("validate")]
-    | Annotated[Convert, subcommand("convert")]
-    | Annotated[Train, subcommand("train")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Reproduce, subcommand("reproduce")]
-    | Annotated[StudyFile, subcommand("study")]
-    | Annotated[TuneFile, subcommand("tune")]
-    | Annotated[ClusterCommand, subcommand("cluster")]
-    | Annotated[Run, subcommand("run")]
-    | Annotated[Live, subcommand("live")]
-    | Annotated[Recover, subcommand("recover")]
-    | Annotated[Replay, subcommand("replay")]
-    | Annotated[Watch, subcommand("watch")]
-    | Annotated[Robots, subcommand("robots")]
-)
-
-COMMANDS = {command.__metadata__[0].name: command.__origin__ for command in get_args(Command)}
+COMMANDS: dict[str, type[Command]] = {
+    "record": Record,
+    "inspect": Inspect,
+    "validate": Validate,
+    "convert": Convert,
+    "train": Train,
+    "evaluate": Evaluate,
+    "reproduce": Reproduce,
+    "study": StudyFile,
+    "tune": TuneFile,
+    "cluster": ClusterCommand,
+    "run": Run,
+    "live": Live,
+    "recover": Recover,
+    "replay": Replay,
+    "watch": Watch,
+    "robots": Robots,
+}
+_SUBCOMMANDS: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in COMMANDS.items())]  # noqa: UP007
 
 _MEMORY_REMEDIES: dict[type, str] = {
     Evaluate: "ask for fewer episodes (--episodes {episodes})",
@@ -118,45 +118,44 @@ def _run(arguments: list[str]) -> int:
     try:
         with interruptible(), _live_page(command):
             results = command.run()
-    except AnimatError as error:
-        print(f"animat: {_name_option(command, ' '.join(str(error).split()))}", file=sys.stderr)
-        _print_notes(error)
-        return 1
-    except KeyboardInterrupt as error:
-        kept = ""
-        # The others finish their work only at their end.
-        if isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile | Run | Live):
-            kept = "; finished work is kept" if is_folder(command.out) and any(command.out.iterdir()) else ""
-        again = (
-            "; run it again to resume"
-            if kept and isinstance(command, Record | Train | Reproduce | StudyFile | TuneFile)
-            else "; a session cannot be resumed: start a new one in another folder"
-            if isinstance(command, Run) and (command.out / "session.log").exists()
-            else ""
-        )
-        if isinstance(command, Run) and again and not (command.out / "session.nwb").exists():
-            kept = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}{kept}"
-        print(f"animat: interrupted{kept}{again}", file=sys.stderr)
-        _print_notes(error)
-        return 130
-    except BrokenPipeError:
-        raise
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
-            print(f"animat: {str(error.filename)[:60]}...: {error.strerror}; choose a shorter name", file=sys.stderr)
-            return 1
-        message = out_of_memory(error)
+    except BaseException as error:
+        message = _message(command, error)
         if message is None:
             raise
-        remedy = _MEMORY_REMEDIES.get(type(command), "use a machine with more memory").format(**vars(command))
-        print(f"animat: {message}: {remedy}", file=sys.stderr)
-        return 1
+        print(f"animat: {message}", file=sys.stderr)
+        # What else went wrong, such as a device that could not be switched off.
+        for note in getattr(error, "__notes__", ()):
+            print(f"animat: {' '.join(note.split())}", file=sys.stderr)
+        return 130 if isinstance(error, KeyboardInterrupt) else 1
     if command.json:
         from animat.records import as_json
 
         print(json.dumps(as_json(results)))
     # Some of several files could not be read or used; messages have already named them.
     return 1 if results.get("unreadable") or results.get("unusable") else 0
+
+
+def _message(command: Command, error: BaseException) -> str | None:
+    """What ended a command, in a line; None for an error of animat itself."""
+    if isinstance(error, AnimatError):
+        return _name_option(command, " ".join(str(error).split()))
+    if isinstance(error, KeyboardInterrupt):
+        return f"interrupted{_what_is_left(command)}"
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        return f"{str(error.filename)[:60]}...: {error.strerror}; choose a shorter name"
+    remedy = _MEMORY_REMEDIES.get(type(command), "use a machine with more memory").format(**vars(command))
+    return f"{message}: {remedy}" if (message := out_of_memory(error)) else None
+
+
+def _what_is_left(command: Command) -> str:
+    """What an interrupted command has kept, and how to go on."""
+    if not isinstance(command, FolderCommand) or not is_folder(command.out) or not any(command.out.iterdir()):
+        return ""
+    if isinstance(command, Run) and (command.out / "session.log").exists():
+        recover = f"; its recording is not written yet: animat recover {shlex.quote(str(command.out))}"
+        recover = "" if (command.out / "session.nwb").exists() else recover
+        return f"{recover}; finished work is kept; a session cannot be resumed: start a new one in another folder"
+    return f"; finished work is kept{'' if isinstance(command, Run | Live) else '; run it again to resume'}"
 
 
 _BUDGET = {"budget.pulses": "budget_pulses", "budget.pulses_per_electrode": "budget_per_electrode"}
@@ -185,7 +184,7 @@ def _name_option(command: Command, message: str) -> str:
 
 def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
     """The live page of a command with `--watch`, served while the command runs or the page is open."""
-    if not isinstance(command, Record | Train | Run | Live | Reproduce | StudyFile | TuneFile) or not command.watch:
+    if not isinstance(command, FolderCommand) or not command.watch:
         return contextlib.nullcontext()
     from animat.watch.serving import watching
 
@@ -194,12 +193,10 @@ def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
 
 def _parse(arguments: list[str]) -> Command:
     """Read the command line; raises usage errors in one line, not in a box."""
-    if not arguments:
-        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; see animat --help")
-    name = arguments[0]
+    name = arguments[0] if arguments else ""
     if name not in COMMANDS and name != "-h" and not name.startswith("--"):
-        near = did_you_mean(name, COMMANDS)
-        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {name!r}{near}")
+        got = f"got {name!r}{did_you_mean(name, COMMANDS)}" if arguments else "see animat --help"
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; {got}")
     if "" in arguments:
         # From a shell variable that is not set; as a path it would be the working folder.
         before = arguments[arguments.index("") - 1]
@@ -208,10 +205,11 @@ def _parse(arguments: list[str]) -> Command:
     options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
     see = f"; see animat {name} --help" if name in COMMANDS else "; see animat --help"
     output = io.StringIO()
+    command: Command
     try:
         with contextlib.redirect_stderr(output):
             command, unknown = tyro.cli(
-                Command,
+                _SUBCOMMANDS,
                 prog="animat",
                 description="Drive a robot with a living neuronal culture.",
                 args=arguments,
@@ -264,14 +262,16 @@ def _options() -> constructors.ConstructorRegistry:
     @registry.struct_rule
     def rule(command: constructors.StructTypeInfo) -> constructors.StructConstructorSpec | None:
         nonlocal within
-        if within or not dataclasses.is_dataclass(command.type):
+        if within or not (isinstance(command.type, type) and issubclass(command.type, Command)):
             return None
         within = True  # The lookup below would otherwise call this rule again.
         spec = constructors.ConstructorRegistry.get_struct_spec(command)
         within = False
         if not isinstance(spec, constructors.StructConstructorSpec):
             return None
-        return dataclasses.replace(spec, fields=tuple(map(_option, spec.fields)))
+        last = {name: place for place, name in enumerate(command.type.last)}
+        fields = sorted(map(_option, spec.fields), key=lambda option: last.get(option.name, -1))
+        return dataclasses.replace(spec, fields=tuple(fields))
 
     return registry
 
@@ -285,12 +285,8 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
     spec = constructors.ConstructorRegistry.get_primitive_spec(constructors.PrimitiveTypeInfo.make(kind, set()))
     if option.type is not bool and isinstance(spec, constructors.PrimitiveConstructorSpec):
         among = sorted(spec.metavar.strip("{}").split(","))
-        choices = ", ".join(among)
-        expected = (
-            (f"one of {choices}" if len(among) > 1 else choices)
-            if spec.choices
-            else _NUMBERS.get(spec.metavar.strip("{}"))
-        )
+        choices = f"one of {', '.join(among)}" if len(among) > 1 else among[0]
+        expected = choices if spec.choices else _NUMBERS.get(spec.metavar.strip("{}"))
 
         def read(words: list[str]) -> Any:
             with contextlib.suppress(ValueError):
@@ -306,9 +302,3 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
     text = option.helptext() if callable(option.helptext) else option.helptext
     # Help would start a new paragraph at an indented line of a docstring.
     return dataclasses.replace(option, type=kind, helptext=text and " ".join(text.split()))
-
-
-def _print_notes(error: BaseException) -> None:
-    """Print what else went wrong, such as a device that could not be switched off."""
-    for note in getattr(error, "__notes__", ()):
-        print(f"animat: {' '.join(note.split())}", file=sys.stderr)

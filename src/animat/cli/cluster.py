@@ -10,12 +10,13 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.command import Command
 from animat.errors import AnimatError, InvalidArgument
 from animat.writing import expect_writable
 
 
 @dataclass(frozen=True)
-class ClusterCommand:
+class ClusterCommand(Command):
     """A Dask scheduler and workers, for --cluster of train, study, reproduce and tune; until Ctrl-C."""
 
     where: Positional[Literal["local"]]
@@ -24,11 +25,8 @@ class ClusterCommand:
     """Processes, each on its own core; default: one per core"""
     file: Path = Path("cluster.json")
     """Where the scheduler writes its address; removed at the end"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Run it until Ctrl-C."""
         from animat.execution.local_cluster import local_cluster
 
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.command import Command
 from animat.errors import InvalidArgument, InvalidFile
 from animat.writing import expect_writable
 
@@ -15,7 +16,7 @@ DETECTION_OPTIONS = ("band_hz", "threshold", "dead_time_ms", "blank_ms")
 
 
 @dataclass(frozen=True)
-class Convert:
+class Convert(Command):
     """Write a recording of any rig as NWB, with its metadata; optionally find the spikes in raw traces."""
 
     recording: Positional[Path]
@@ -66,11 +67,8 @@ class Convert:
     """Of two negative peaks within this time, the deeper one is the spike"""
     blank_ms: tuple[float, float] = (0.5, 1.5)
     """Time before and after each stimulus in which no spikes are sought"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Convert."""
         from animat.progress import Bar
         from animat.recordings.conversion import Origin, convert_recording
         from animat.recordings.detection.settings import Detection
@@ -97,29 +95,20 @@ class Convert:
             recovery_ms=max(20.0, self.blank_ms[1]),
         )
         origin = Origin(**{field.name: getattr(self, field.name) for field in fields(Origin)})
+        reading = ("reader", "stimuli_path", "stimuli", "part", "start_min", "start_s")
         with Bar("converting") as progress:
             recording = convert_recording(
                 self.recording,
                 self.out,
                 origin,
                 detection=detection if finds_spikes else None,
-                reader=self.reader,
-                stimuli_path=self.stimuli_path,
-                stimuli=self.stimuli,
-                part=self.part,
-                start_min=self.start_min,
-                start_s=self.start_s,
                 progress=progress,
+                **{name: getattr(self, name) for name in reading},
             )
-        n_spikes, n_stimuli = len(recording.spike_times_s), len(recording.stimuli)
-        print(f"{self.out}: {n_spikes:,} spikes on {len(recording.channels):,} channels, {n_stimuli:,} stimuli")
+        counts = len(recording.spike_times_s), len(recording.channels), len(recording.stimuli)
+        n = dict(zip(("spikes", "channels", "stimuli"), counts, strict=True))
+        print(f"{self.out}: {n['spikes']:,} spikes on {n['channels']:,} channels, {n['stimuli']:,} stimuli")
         findings = recording_findings(recording)
         for finding in findings:
             print(f"  {finding.severity}: {finding.message}")
-        return {
-            "recording": str(self.out),
-            "spikes": n_spikes,
-            "channels": len(recording.channels),
-            "stimuli": n_stimuli,
-            "findings": [finding.name for finding in findings],
-        }
+        return {"recording": str(self.out), **n, "findings": [finding.name for finding in findings]}

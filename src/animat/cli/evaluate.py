@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,11 +47,8 @@ class Evaluate(SimulatorOptions):
     """Decides every random draw"""
     out: Path | None = None
     """JSON file for all results; the live page of a training shows evaluation.json of the policies' folder"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Evaluate."""
         from animat.compilation import keep_compilations
         from animat.evaluation.rollouts import check_at_once
         from animat.progress import Bar
@@ -90,11 +88,8 @@ def _expect_no_other(out: Path) -> None:
     """Raise for a file that is not an earlier evaluation: a recording or a policy would be lost."""
     if not out.exists():
         return
-    try:
+    with suppress(AnimatError):
         data = json_data(read_plain_text(out, _MOST_BYTES), "--out")
-    except AnimatError:
-        data = None
-    if not isinstance(data, dict) or "recorded_at_min" not in data:
-        raise InvalidArgument(
-            f"--out: expected a new file or one of an earlier evaluation, got {out}, which is neither"
-        )
+        if isinstance(data, dict) and "recorded_at_min" in data:
+            return
+    raise InvalidArgument(f"--out: expected a new file or one of an earlier evaluation, got {out}, which is neither")

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import ResponseOptions, print_warnings
+from animat.cli.responses import ResponseOptions, naming, print_warnings
 from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
+from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
-    from animat.progress import Progress
-    from animat.responses.conditions import Conditions
     from animat.responses.responses import Responses
 
 
@@ -37,16 +35,14 @@ class Inspect(ResponseOptions):
     """Folder for figures; default: none are drawn"""
     format: Literal["png", "svg", "pdf"] = "png"
     """Format of the figures"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Inspect each file."""
-        from animat.progress import Bar
-        from animat.recordings.reading import list_recordings
-        from animat.report.inspection import expect_unique_stems
+        from animat.recordings.reading import list_recordings, read_source
+        from animat.recordings.recording import Recording
+        from animat.report.inspection import draw_inspection, draw_series, expect_unique_stems, inspection_text
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
+        from animat.responses.inspection import inspect_recording
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
         from animat.robots.registry import robot_named
 
@@ -65,64 +61,51 @@ class Inspect(ResponseOptions):
         if self.out is not None:
             # The figures of the series have a name of their own.
             expect_unique_stems([file.name for file in files], "series")
-        with Bar("inspecting") as progress:
-            return self._inspect(files, by, window_ms, progress)
-
-    def _inspect(
-        self, files: Sequence[Path], by: Conditions | None, window_ms: tuple[float, float], progress: Progress
-    ) -> dict[str, Any]:
-        from animat.progress import Part
-        from animat.recordings.reading import read_source
-        from animat.recordings.recording import Recording
-        from animat.report.inspection import draw_inspection, draw_series, inspection_text
-        from animat.responses.inspection import inspect_recording
-
-        inspected, series, unreadable = [], [], []
+        inspected: list[dict[str, Any]] = []
+        series, unreadable = [], []
         # Reading is one step per file, drawing another, and the figures of the series are the last step.
         steps = 1 if self.out is None else 2
         total = steps * len(files) + (self.out is not None)
-        for number, file in enumerate(files):
-            progress.update(steps * number, total, file.name)
-            try:
-                source = read_source(file, stimuli=self.stimuli, part=self.part)
+        with Bar("inspecting") as progress:
+            for number, file in enumerate(files):
+                progress.update(steps * number, total, file.name)
                 try:
-                    inspection = inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
-                except (UnusableData, Mismatch) as error:
-                    raise type(error)(f"{file}: {error}") from error
-            except AnimatError as error:
-                if len(files) == 1:
-                    raise
-                # The others may be readable.
-                print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
-                unreadable.append(str(file))
-                continue
-            print(inspection_text(inspection), end="\n\n")
-            inspected.append(inspection.to_dict())
-            if self.optimum is not None:
-                # It takes far longer than reading.
-                part = Part(progress, steps * number, 1, total, f"{file.name}, optimal return")
-                inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
-            if self.out is not None:
-                progress.update(steps * number + 1, total, f"{file.name}, figures")
-                figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
-                print(f"figures: {', '.join(figures)}\n")
-                inspected[-1]["figures"] = figures
-                series.append((source.start_min, file, inspection.responses))
-        unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
-        results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
-        if self.out is not None and series:
-            progress.update(total - 1, total, "figures of the series")
-            first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
-            try:
-                drawn = draw_series(
-                    first if isinstance(first, Recording) else None, [one[2] for one in series], self.out, self.format
-                )
-            except Mismatch as unlike:
-                print(f"no figures of the series: {unlike}")
-            else:
-                if drawn:
-                    print(f"figures of the series: {', '.join(map(str, drawn))}")
-                results["figures"] = [str(figure) for figure in drawn]
+                    source = read_source(file, stimuli=self.stimuli, part=self.part)
+                    with naming(file):
+                        inspection = inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
+                except AnimatError as error:
+                    if len(files) == 1:
+                        raise
+                    # The others may be readable.
+                    print(f"animat: {' '.join(str(error).split())}", file=sys.stderr)
+                    unreadable.append(str(file))
+                    continue
+                print(inspection_text(inspection), end="\n\n")
+                inspected.append(inspection.to_dict())
+                if self.optimum is not None:
+                    # It takes far longer than reading.
+                    part = Part(progress, steps * number, 1, total, f"{file.name}, optimal return")
+                    inspected[-1]["optima"] = _optima(self.optimum, inspection.responses, part)
+                if self.out is not None:
+                    progress.update(steps * number + 1, total, f"{file.name}, figures")
+                    figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
+                    print(f"figures: {', '.join(figures)}\n")
+                    inspected[-1]["figures"] = figures
+                    series.append((source.start_min, file, inspection.responses))
+            unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
+            results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
+            if self.out is not None and series:
+                progress.update(total - 1, total, "figures of the series")
+                first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
+                recording = first if isinstance(first, Recording) else None
+                try:
+                    drawn = draw_series(recording, [one[2] for one in series], self.out, self.format)
+                except Mismatch as unlike:
+                    print(f"no figures of the series: {unlike}")
+                else:
+                    if drawn:
+                        print(f"figures of the series: {', '.join(map(str, drawn))}")
+                    results["figures"] = [str(figure) for figure in drawn]
         if unreadable:
             others = "; the rest were inspected" if inspected else ""
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from animat.cli.command import FolderCommand
+
 if TYPE_CHECKING:
     from animat.studies.specification import RobotSpec
 
 
 @dataclass(frozen=True)
-class JobOptions:
+class JobOptions(FolderCommand):
     """Where jobs run, and where results go; the same in every command that runs jobs."""
 
     workers: int | None = None
@@ -26,10 +28,6 @@ class JobOptions:
     """With --cluster: workers do not see --out at the same path, so files are passed through this process"""
     out: Path = Path("study")
     """Folder for all results; the report is its report.html"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def print_caveats(self, robots: Iterable[RobotSpec]) -> None:
         """Print the robots' caveats, and a warning for more workers than cores."""

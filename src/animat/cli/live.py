@@ -63,13 +63,8 @@ class Live(StimulationOptions):
     """Decides every random draw, except what the culture does and when simulators are swapped"""
     out: Path = Path("live")
     """Folder for recordings, policies, the session, and live.log"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Record, train and run."""
         from animat.coding.mapping import mapping_named
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import TYPE_CHECKING
 
-from animat.errors import InvalidArgument, did_you_mean
+from animat.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from animat.training.settings import SAC
@@ -30,11 +29,7 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     """The algorithm's settings, with `pairs` in place of its defaults; InvalidArgument for an impossible one."""
     from animat.training.settings import SAC
 
-    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]
-    for name in numbers:
-        if name not in known:
-            near = did_you_mean(name, known) or f"; there are {', '.join(known)}"
-            raise InvalidArgument(f"--sac: expected the name of a setting, got {name!r}{near}")
+    numbers = read_numbers("--sac", pairs)
     try:
         return SAC(**numbers)  # type: ignore[arg-type]
     except InvalidArgument as error:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from animat.errors import InvalidArgument, Mismatch, in_min
+from animat.cli.command import FolderCommand
+from animat.errors import InvalidArgument, Mismatch, in_min, some_of
 from animat.folder_kinds import expect_no_other
 
 if TYPE_CHECKING:
-    from animat.progress import Progress
     from animat.stimulation.protocol import Protocol
 
 
@@ -19,7 +19,7 @@ _PRESENTED = ("order", "pulses", "trials", "places")
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(FolderCommand):
     """Record a culture: one NWB file per recording. Resumes where it stopped."""
 
     culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"
@@ -53,14 +53,12 @@ class Record:
     what it leaves out has its default"""
     out: Path = Path("recordings")
     """Folder for the files"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Record."""
+        from animat.cultures.kinds import culture_of
+        from animat.cultures.series import record_series
         from animat.progress import Bar
+        from animat.recordings.reading import read_recordings
 
         # Before any device is powered.
         for option, some, kind, value in (
@@ -70,8 +68,6 @@ class Record:
             if (self.culture == kind) != (value is not None):
                 expected, got = (some, "none") if value is None else ("none", value)
                 raise InvalidArgument(f"{option}: expected {expected} for --culture {self.culture}, got {got}")
-        if self.seed < 0:
-            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
         options = [f"--{name}" for name in _PRESENTED if getattr(self, name) is not None]
         if self.protocol is not None and self.paper:
             raise InvalidArgument("--protocol: expected it without --paper, which is another protocol; leave one out")
@@ -89,34 +85,27 @@ class Record:
         _expect_no_others(self.out)
         before = set(self.out.glob("*"))
         with Bar("recording") as progress:
-            files = self._series(progress)
+            recordings = read_recordings(self.recordings) if self.recordings else []
+            series = record_series(
+                lambda: culture_of(
+                    self.culture, seed=self.seed, recordings=recordings, selection=self.selection, progress=progress
+                ),
+                # A virtual culture has the usual number of patterns.
+                protocol if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
+                self.out,
+                sessions=(15 if self.paper else 2) if self.sessions is None else self.sessions,
+                interval_min=self.interval_min,
+                seed=self.seed,
+                progress=progress,
+            )
+            for minute in series.missed_min:
+                print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
+        files = series.files
         existed = "; all existed already" if files and before.issuperset(self.out.glob("*")) else ""
         print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{existed}")
         if protocol.places:
             print("each place is a condition; --conditions frequency pools the places")
         return {"recordings": [str(file) for file in files]}
-
-    def _series(self, progress: Progress) -> list[Path]:
-        from animat.cultures.kinds import culture_of
-        from animat.cultures.series import record_series
-        from animat.recordings.reading import read_recordings
-
-        recordings = read_recordings(self.recordings) if self.recordings else []
-        series = record_series(
-            lambda: culture_of(
-                self.culture, seed=self.seed, recordings=recordings, selection=self.selection, progress=progress
-            ),
-            # A virtual culture has the usual number of patterns.
-            self._protocol() if self.culture == "virtual" else lambda culture: self._protocol(len(culture.patterns)),
-            self.out,
-            sessions=(15 if self.paper else 2) if self.sessions is None else self.sessions,
-            interval_min=self.interval_min,
-            seed=self.seed,
-            progress=progress,
-        )
-        for minute in series.missed_min:
-            print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
-        return series.files
 
     def _protocol(self, patterns: int = 100) -> Protocol:
         """The protocol of the options, with the usual values for the culture's kind and number of patterns."""
@@ -128,9 +117,10 @@ class Record:
         usual = replace(PAPER if self.paper else living, patterns=min(100, patterns), pulse=pulse_for(self.culture))
         if self.protocol is not None:
             return read_protocol(self.protocol, usual)
-        options = {name: getattr(self, name) for name in ("order", "pulses", "trials")}
-        options["places"] = None if self.places is None else read_places(self.places)
-        protocol = replace(usual, **{name: value for name, value in options.items() if value is not None})
+        given = {name: value for name in _PRESENTED if (value := getattr(self, name)) is not None}
+        if self.places is not None:
+            given["places"] = read_places(self.places)
+        protocol = replace(usual, **given)
         if self.trials is not None or self.paper:
             return protocol
         # Fewer with several pulses or more conditions: the recording takes as long, and ends before the next is due.
@@ -140,13 +130,11 @@ class Record:
 
 def _expect_no_others(folder: Path) -> None:
     """Raise for recordings of no series, which would be read as part of this one, and for other work."""
-    if not folder.is_dir():
-        return
     expect_no_other(folder, "recording")
     others = sorted(file.name for file in folder.glob("[!.]*.nwb") if not file.name.startswith("recording_"))
     if others:
-        shown = f"{', '.join(others[:3])}{' ...' if len(others) > 3 else ''}"
-        raise Mismatch(f"{folder}: expected only recordings of this series, got {shown}; choose another --out")
+        got = some_of(others, 3)
+        raise Mismatch(f"{folder}: expected only recordings of this series, got {got}; choose another --out")
 
 
 def _warn_too_fast(protocol: Protocol) -> None:

@@ -8,18 +8,17 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from animat.cli.command import Command
+
 
 @dataclass(frozen=True)
-class Recover:
+class Recover(Command):
     """Write the recording of a closed-loop session that was killed, from its log."""
 
     session: Positional[Path] = Path("session")
     """The session's folder"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Recover."""
         from animat.closed_loop.session import lost_message, recover_session, unanswered_message
         from animat.progress import Bar
 

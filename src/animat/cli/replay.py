@@ -33,14 +33,12 @@ class Replay(SimulatorOptions):
     """For policies: decides every random draw"""
     out: Path = Path("film.gif")
     """The film: .gif, or .mp4, which needs animat[film]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Film."""
         from animat.closed_loop.session import lost_message
         from animat.progress import Bar
         from animat.report.film.session import is_session, scene_of_session
+        from animat.report.film.simulated import scene_of_policies
         from animat.report.film.writing import check_film, write_film
         from animat.robots.registry import REGISTRY
 
@@ -53,12 +51,8 @@ class Replay(SimulatorOptions):
         if is_absent(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
-            for option, value in (
-                ("--recordings", self.recordings or None),
-                ("--at-min", self.at_min),
-                ("--mapping", self.mapping),
-            ):
-                if value is not None:
+            for option in ("recordings", "at_min", "mapping"):
+                if getattr(self, option) != getattr(Replay, option):
                     raise InvalidArgument(f"{option}: expected none with a session, which is shown as it was")
             scene = scene_of_session(self.source, self.span_s)
             if expected not in (None, scene.robot.name):
@@ -67,7 +61,13 @@ class Replay(SimulatorOptions):
                     "no --robot"
                 )
         else:
-            scene = self._on_simulator()
+            if self.source.is_dir() and not any(self.source.glob("*.safetensors")):
+                raise InvalidArgument(
+                    f"{self.source}: expected a session (session.log) or policies in this folder, got neither"
+                )
+            policies = policies_for(self.robot, self.mapping, self.source)
+            timeline = self.timeline_for(policies, self.recordings)
+            scene = scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)
         with Bar("drawing") as progress:
             write_film(scene, self.out, progress)
         print(f"{self.out}: {scene.title}, {scene.start_s:g} to {scene.stop_s:.1f} s")
@@ -79,14 +79,3 @@ class Replay(SimulatorOptions):
             "robot": scene.robot.name,
             "lost_bytes": scene.lost_bytes,
         }
-
-    def _on_simulator(self) -> Any:
-        from animat.report.film.simulated import scene_of_policies
-
-        if self.source.is_dir() and not any(self.source.glob("*.safetensors")):
-            raise InvalidArgument(
-                f"{self.source}: expected a session (session.log) or policies in this folder, got neither"
-            )
-        policies = policies_for(self.robot, self.mapping, self.source)
-        timeline = self.timeline_for(policies, self.recordings)
-        return scene_of_policies(policies, timeline, at_min=self.at_min, span_s=self.span_s, seed=self.seed)

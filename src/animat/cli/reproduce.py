@@ -12,8 +12,8 @@ from animat.errors import InvalidArgument
 
 
 @dataclass(frozen=True)
-class StudyOptions:
-    """Which of the studies that come with animat; a base class, so that help lists these options first."""
+class Reproduce(JobOptions):
+    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Resumes where it stopped."""
 
     study: Literal["paper", "context"] = "paper"
     """paper: the paper's comparisons; context: which tasks need more than a reflex, what the policies do beyond one,
@@ -25,13 +25,7 @@ class StudyOptions:
     seed: int = 1
     """Decides every draw of training and evaluation"""
 
-
-@dataclass(frozen=True)
-class Reproduce(JobOptions, StudyOptions):
-    """The paper's study on a virtual culture: record, train, evaluate, compare, report. Resumes where it stopped."""
-
     def run(self) -> dict[str, Any]:
-        """Run it."""
         from animat.studies.paper import paper_study
         from animat.studies.source import read_seeds
 

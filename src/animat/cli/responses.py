@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from animat.errors import InvalidArgument, Mismatch
+from animat.cli.command import Command
+from animat.errors import InvalidArgument, Mismatch, UnusableData
 from animat.recordings.findings import Finding, warnings_once
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ResponseOptions:
+class ResponseOptions(Command):
     """How responses are read from recordings; the same in every command that reads them."""
 
     conditions: str | None = None
@@ -84,12 +86,9 @@ class SimulatorOptions(ResponseOptions):
 def simulator_settings(
     trained: Mapping[str, Any], kind: str | None, bins: int | None, range_hz: float | None
 ) -> dict[str, Any]:
-    """Settings of simulators: those of the policies' training, unless a kind is requested.
+    """Settings of simulators: those of the policies' training, unless a kind is requested; bins request a histogram.
 
-    Bins request a histogram. With a kind of None the recordings decide (`fit_timeline`).
-
-    Raises:
-        InvalidArgument: for bins of a kind that has none.
+    With a kind of None the recordings decide (`fit_timeline`). Bins of a kind that has none are refused.
     """
     defaults = {"kind": None, "bins": 20, "range_hz": None}
     requested = {"kind": kind, "bins": bins, "range_hz": range_hz}
@@ -108,21 +107,23 @@ def simulator_settings(
     return settings
 
 
-def print_warnings(findings: Sequence[Finding]) -> None:
-    """Print warnings to standard error, where they are seen and do not mix with results; notes are for `inspect`.
+@contextmanager
+def naming(file: Path) -> Iterator[None]:
+    """Let errors about the data of a file, which begin with what is wrong in it, begin with its name."""
+    try:
+        yield
+    except (UnusableData, Mismatch) as error:
+        raise type(error)(f"{file}: {error}") from error
 
-    A warning about several recordings is printed once, for the worst of them, with the number of the others.
-    """
+
+def print_warnings(findings: Sequence[Finding]) -> None:
+    """Print warnings, each once, to standard error, where they do not mix with results; notes are for `inspect`."""
     for message in warnings_once(findings):
         print(f"warning: {message}", file=sys.stderr)
 
 
 def policies_for(robot: str | None, mapping: str | None, path: Path) -> dict[str, Policy]:
-    """Load the policies of a file or a folder, after importing their custom robot and mapping.
-
-    Raises:
-        Mismatch: for policies with a different robot or mapping.
-    """
+    """Load the policies of a file or a folder, after importing their custom robot and mapping, if they have these."""
     from animat.coding.checking import check_mapping
     from animat.coding.mapping import REGISTRY as MAPPINGS
     from animat.goals.robot import without_goal

@@ -7,18 +7,17 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from animat.cli.command import Command
+
 
 @dataclass(frozen=True)
-class Robots:
+class Robots(Command):
     """List the robots that can be trained: what each observes, its parameters, and what it can do."""
 
     names: Positional[tuple[str, ...]] = ()
     """Robots to list, such as cartpole or my_package.robots:Rover; default: all registered robots"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """List them."""
         from animat.errors import InvalidArgument
         from animat.robots.registry import REGISTRY
 

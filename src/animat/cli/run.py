@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,14 +16,13 @@ from animat.cli.responses import policies_for, simulator_settings
 from animat.cli.stimulation import StimulationOptions, expect_no_fault
 from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, in_min
 from animat.plain_file import expect_no_file
+from animat.progress import Bar, Progress
+from animat.recordings.findings import Finding
 from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
-    from animat.closed_loop.loop import Loop
     from animat.cultures.base import Culture
-    from animat.progress import Progress
-    from animat.reality_gap import Calibration, RealityGap
-    from animat.recordings.findings import Finding
+    from animat.reality_gap import RealityGap
     from animat.recordings.recording import Recording
     from animat.responses.conditions import Conditions
     from animat.stimulation.protocol import Protocol
@@ -80,24 +79,19 @@ class Run(StimulationOptions):
     """Decides every random draw, except what a living culture does"""
     out: Path = Path("session")
     """Folder for the session's log and recording"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Run."""
-        import numpy as np
-
         from animat.closed_loop.loop import Loop
         from animat.closed_loop.running import check_episodes
-        from animat.coding.decoder import percentiles_shape
+        from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
+        from animat.cultures.same_culture import other_culture, other_patterns
         from animat.neurons.simulator import check_binning
-        from animat.progress import Bar
-        from animat.reality_gap import check_conditions, check_policies, run_policies
+        from animat.reality_gap import Calibration, check_conditions, check_policies, run_policies
         from animat.recordings.reading import read_recordings
+        from animat.responses.series import extract_series
+        from animat.responses.windows import DEFAULT_WINDOW_MS
         from animat.robots.host import HostRobot
 
         # Everything is checked before the culture is opened.
@@ -123,48 +117,53 @@ class Run(StimulationOptions):
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         keep_compilations()
         recordings = read_recordings(self.recordings)
-        calibration = self._calibration(recordings, first, fit)
+        trained = first.fitted.get("burst_threshold")
+        series = extract_series(
+            recordings,
+            _conditions(recordings, first),
+            window_ms=first.window_ms or DEFAULT_WINDOW_MS,
+            burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
+            allow=self.allow,
+            readouts=first.readouts,
+        )
+        adaptive = self.thresholds == "adaptive"
+        calibration = Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
         check_conditions(first, calibration)
         calibrating = next(recording for recording in recordings if recording.start_min == calibration.start_min)
         protocol, unknown = self._protocol(recordings, calibrating)
         loop, _ = Loop.of_policy(
-            first,
-            # The checks need no percentiles.
-            np.zeros(percentiles_shape(first.readouts)),
-            conditions=calibration.conditions,
-            pulse=protocol.pulse,
-            **settings,
+            first, calibration.percentiles, conditions=calibration.conditions, pulse=protocol.pulse, **settings
         )
-        with (
-            ExitStack() as stack,
-            # After all checks, as it makes the folder.
-            _lock_for_session(self.out),
-            Bar("culture") as progress,
-            self._culture(recordings, calibrating, loop.pulse, progress) as culture,
-        ):
-            noticed = unknown + _differences(calibrating, culture, loop)
-            gap = run_policies(
-                policies,
-                culture,
-                calibration,
-                self.out,
-                episodes=self.episodes,
-                with_controls=self.controls != "random",
-                with_coupling=self.controls == "coupling",
-                with_interventions=self.interventions,
-                greedy=not self.drawn,
-                seed=self.seed,
-                account=account,
-                progress=progress,
-                report=partial(print, file=sys.stderr),
-                noticed=noticed,
-                pulse=loop.pulse,
-                # All, if the recordings do not state how many they used.
-                patterns=None if unknown else min(protocol.patterns, len(culture.patterns)),
-                **settings,
-            )
-            # Reported even if closing the culture fails.
-            stack.callback(self._report, gap)
+        expect_no_file(self.out, "the session")
+        # After all checks, as the lock makes the folder.
+        with ExitStack() as stack, exclusive_lock(self.out), Bar("culture") as progress:
+            expect_no_session(self.out)
+            with self._culture(recordings, calibrating, loop.pulse, progress) as culture:
+                noticed = [*unknown, other_culture(calibrating, culture)]
+                if loop.encoder.takes_patterns:
+                    noticed.append(other_patterns(calibrating, culture))
+                gap = run_policies(
+                    policies,
+                    culture,
+                    calibration,
+                    self.out,
+                    episodes=self.episodes,
+                    with_controls=self.controls != "random",
+                    with_coupling=self.controls == "coupling",
+                    with_interventions=self.interventions,
+                    greedy=not self.drawn,
+                    seed=self.seed,
+                    account=account,
+                    progress=progress,
+                    report=partial(print, file=sys.stderr),
+                    noticed=tuple(filter(None, noticed)),
+                    pulse=loop.pulse,
+                    # All, if the recordings do not state how many they used.
+                    patterns=None if unknown else min(protocol.patterns, len(culture.patterns)),
+                    **settings,
+                )
+                # Reported even if closing the culture fails.
+                stack.callback(self._report, gap)
         return gap.to_dict()
 
     def _report(self, gap: RealityGap) -> None:
@@ -181,7 +180,6 @@ class Run(StimulationOptions):
         It is that of the calibrating recording, else of --protocol, else the usual one.
         """
         from animat.cultures.kinds import pulse_for
-        from animat.recordings.findings import Finding
         from animat.stimulation.protocol import CLOSED_LOOP, read_protocol
 
         usual = replace(CLOSED_LOOP, pulse=pulse_for(self.culture))
@@ -195,12 +193,10 @@ class Run(StimulationOptions):
                 f"--recordings: expected one pulse in all, got {one} ({where}) and {other} ({elsewhere}): give those "
                 "that were recorded with the pulse that the loop is to deliver"
             )
-        protocol = calibrating.protocol or option
-        if protocol is not None and (self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind):
-            return protocol, ()
-        if protocol is not None:
+        if (protocol := calibrating.protocol or option) is not None:
             # A replay responds alike to every pulse, and its limits are those of voltages.
-            return replace(protocol, pulse=usual.pulse), ()
+            is_delivered = self.culture != "replay" or protocol.pulse.kind == usual.pulse.kind
+            return (protocol if is_delivered else replace(protocol, pulse=usual.pulse)), ()
         pulse = next(iter(pulses), usual.pulse)
         source = "as in the other recordings" if pulses else f"the usual one on a {self.culture}"
         message = (
@@ -216,8 +212,9 @@ class Run(StimulationOptions):
         from animat.cultures.safety import Guard
 
         known = recorded_culture(self.culture, [calibrating], self.recordings)
-        state = self.state or (known.get("state") if self.culture_seed is None else None)
-        seed = self.culture_seed if self.culture_seed is not None else known.get("seed", 1)
+        if self.culture_seed is not None:
+            known = {"seed": self.culture_seed}
+        state, seed = self.state or known.get("state"), known.get("seed", 1)
         culture = culture_of(
             self.culture, seed=seed, state=state, recordings=recordings, selection=self.selection, progress=progress
         )
@@ -233,44 +230,6 @@ class Run(StimulationOptions):
         if state is not None:
             print(f"the culture continues from {state}", file=sys.stderr)
         return culture
-
-    def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
-        from animat.reality_gap import Calibration
-        from animat.responses.series import extract_series
-        from animat.responses.windows import DEFAULT_WINDOW_MS
-
-        trained = first.fitted.get("burst_threshold")
-        series = extract_series(
-            recordings,
-            _conditions(recordings, first),
-            window_ms=first.window_ms or DEFAULT_WINDOW_MS,
-            burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
-            allow=self.allow,
-            readouts=first.readouts,
-        )
-        adaptive = self.thresholds == "adaptive"
-        return Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
-
-
-def _differences(recording: Recording, culture: Culture, loop: Loop) -> tuple[Finding, ...]:
-    """Where the culture differs from that of the calibrating recording."""
-    from animat.cultures.same_culture import other_culture, other_patterns
-
-    findings = [other_culture(recording, culture)]
-    if loop.encoder.takes_patterns:
-        findings.append(other_patterns(recording, culture))
-    return tuple(finding for finding in findings if finding is not None)
-
-
-@contextmanager
-def _lock_for_session(folder: Path) -> Iterator[None]:
-    """Lock a folder for a new session; the error for an unsuitable one says what is there."""
-    from animat.closed_loop.session import expect_no_session
-
-    expect_no_file(folder, "the session")
-    with exclusive_lock(folder):
-        expect_no_session(folder)
-        yield
 
 
 def _conditions(recordings: Sequence[Recording], first: Policy) -> Conditions | None:

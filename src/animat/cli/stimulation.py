@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from animat.cli.command import FolderCommand
 from animat.errors import InvalidArgument, InvalidFile, LoopEnded
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class StimulationOptions:
+class StimulationOptions(FolderCommand):
     """Which culture is stimulated, and how much; the same in every command that stimulates one."""
 
     culture: Literal["virtual", "replay", "cl1", "maxone"] = "virtual"

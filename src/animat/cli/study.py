@@ -24,7 +24,6 @@ class StudyFile(JobOptions):
     """The TOML file; animat reproduce writes one to start from in its folder"""
 
     def run(self) -> dict[str, Any]:
-        """Run it."""
         from animat.studies.toml import read_study
 
         return run_and_report(read_study(self.specification), self.specification.parent, self)
@@ -53,19 +52,15 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     cells = []
     for row in results.comparisons:
         paper = "" if row.paper_p is None else f"; the paper's p {row.paper_p:.3g}, which implies U {row.paper_u:g}"
-        means = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}"
-        cells.append(
-            [f"{row.robot}, {row.comparison}", *means, f"{row.u:g}", f"{row.p_normal:.3g}", row.outcome + paper]
-        )
+        numbers = f"{row.mean_first:.1f}", f"{row.mean_second:.1f}", f"{row.u:g}", f"{row.p_normal:.3g}"
+        cells.append([f"{row.robot}, {row.comparison}", *numbers, row.outcome + paper])
     if cells:
         print("\n".join(align_columns(["", "first", "second", "U", "p", ""], cells)))
     messages = not_outperforming(results)
     for message in messages:
         print(message)
-    if ran.done_now:
-        print(f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s; report: {ran.report}")
-    else:
-        print(f"nothing to do: all {ran.jobs} jobs are done; report: {ran.report}")
+    done = f"{len(ran.done_now)} of {ran.jobs} jobs in {time.monotonic() - began:.0f} s"
+    print(f"{done if ran.done_now else f'nothing to do: all {ran.jobs} jobs are done'}; report: {ran.report}")
     return {
         "folder": str(ran.folder),
         "report": str(ran.report),

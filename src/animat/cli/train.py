@@ -11,23 +11,22 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from animat.cli.jobs import JobOptions
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import SimulatorOptions, print_warnings
-from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_min
-from animat.records import as_json
+from animat.errors import InvalidArgument, UnusableData, in_min
+from animat.records import as_json, in_file
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
     from animat.neurons.timeline import SimulatorTimeline
     from animat.responses.readouts import Readouts
-    from animat.robots.base import Robot
-    from animat.training.lessons import Lesson
     from animat.training.policy import Policy
     from animat.training.specification import Training
 
 
 @dataclass(frozen=True)
-class Train(SimulatorOptions):
+class Train(SimulatorOptions, JobOptions):
     """Train policies for a robot on the simulators of a culture's recordings. Resumes where it stopped."""
 
     robot: Positional[str] = "cartpole"
@@ -77,26 +76,13 @@ class Train(SimulatorOptions):
     assess: int | None = None
     """Episodes of an assessment after each sixtieth of the training; the best policies so far are kept in OUT/best;
     default: none, but 20 where lessons say when to advance"""
-    workers: int | None = None
-    """Processes, each on its own core; default: one per core"""
-    cluster: str | None = None
-    """Run on other machines instead: a Dask scheduler's address, tcp://HOST:8786, or its scheduler file"""
-    shared_folder: bool = True
-    """With --cluster: workers do not see --out at the same path, so files are passed through this process"""
     tensorboard: Path | None = None
     """Folder for TensorBoard: live learning curves, one run per policy; needs animat[tensorboard]"""
     out: Path = Path("policies")
     """Folder for the policies"""
-    watch: bool = False
-    """Serve a live page for a browser on this machine; needs animat[watch]"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Train."""
-        from animat.execution.cluster import on_cluster
         from animat.execution.training import train
-        from animat.progress import Bar
         from animat.report.tensorboard import TensorBoard
         from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
 
@@ -118,17 +104,15 @@ class Train(SimulatorOptions):
             print(_controllability(timeline))
         # A resumed training has reported it before.
         random = None if (self.out / MANIFEST).exists() else _random_return(training, timeline)
-        with on_cluster(self.cluster, self.shared_folder) as executor, board as on_row, Bar("training") as progress:
+        with self.executing("training") as execution, board as on_row:
             trained = train(
                 training,
                 timeline,
                 self.out,
-                workers=self.workers,
-                executor=executor,
-                progress=progress,
                 sources=[str(path) for path in self.recordings],
                 random_return=random,
                 callbacks=() if on_row is None else (on_row,),
+                **execution,
             )
         if was_finished:
             print(f"this training is already finished; the policies in {self.out} are unchanged")
@@ -141,6 +125,7 @@ class Train(SimulatorOptions):
         from animat.goals.robot import with_goal
         from animat.responses.readouts import ALL, DEFAULT_READOUTS, count_readouts, read_readouts
         from animat.robots.registry import robot_named
+        from animat.training.lessons import expect_lessons, read_lessons
         from animat.training.specification import Training
 
         parameters = read_numbers("--parameters", self.parameters)
@@ -164,6 +149,9 @@ class Train(SimulatorOptions):
             raise InvalidArgument(f"--delivery: expected none without neurons, got {self.delivery}")
         elif self.recordings:
             raise InvalidArgument(f"--recordings: expected none without neurons, got {self.recordings[0]}")
+        lessons = () if self.lessons is None else read_lessons(self.lessons)
+        with in_file(self.lessons or ""):
+            expect_lessons(lessons, robot, draws_recordings=self.shadowing == "drawn")
         training = Training(
             robot=robot,
             mapping=None if mapping == "none" else mapping_named(mapping),
@@ -178,23 +166,10 @@ class Train(SimulatorOptions):
             algorithm=read_sac(self.sac),
             neural_observation=self.neural_observation,
             pulse_cost=self.pulse_cost,
-            lessons=self._lessons(robot),
+            lessons=lessons,
             assess=self.assess,
         )
         return training, readouts
-
-    def _lessons(self, robot: Robot[Any]) -> tuple[Lesson, ...]:
-        """Read the lessons, and check that they suit the robot."""
-        from animat.training.lessons import expect_lessons, read_lessons
-
-        if self.lessons is None:
-            return ()
-        lessons = read_lessons(self.lessons)
-        try:
-            expect_lessons(lessons, robot, draws_recordings=self.shadowing == "drawn")
-        except InvalidArgument as error:
-            raise InvalidFile(f"{self.lessons}: {error}") from error
-        return lessons
 
     def _timeline(self, readouts: str | Readouts) -> SimulatorTimeline:
         fitting = replace(self, simulator="histogram") if self.paper and self.simulator is None else self
@@ -229,7 +204,7 @@ class Train(SimulatorOptions):
             )
         assessed = {name: _assessed(policy, policy.best) for name, policy in trained.items() if policy.best is not None}
         for name, assessment in assessed.items():
-            print(_assessment_line(name, assessment))
+            print(f"{name}: {_in_words(assessment)}")
         return {
             "policies": [str(self.out / f"{name}.safetensors") for name in trained],
             "returns": dict(zip(evaluation.names, policies["mean_returns"], strict=True)),
@@ -271,13 +246,12 @@ def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
     return {"lessons": lessons, "best": as_json(dict(zip(ASSESSED, best.assessments[-1].tolist(), strict=True)))}
 
 
-def _assessment_line(name: str, assessed: dict[str, Any]) -> str:
+def _in_words(assessed: dict[str, Any]) -> str:
     best, (_, *later) = assessed["best"], assessed["lessons"]
     success = "" if best["success"] is None else f"{best['success']:.0%} succeeded, "
     lessons = "".join(f"; lesson {each['lesson']} after {each['after_iterations']:,}" for each in later)
-    return (
-        f"{name}: best after {best['iterations']:,.0f} iterations ({success}return {best['mean_return']:.1f}){lessons}"
-    )
+    after, reached = f"{best['iterations']:,.0f} iterations", f"{success}return {best['mean_return']:.1f}"
+    return f"best after {after} ({reached}){lessons}"
 
 
 def _controllability(timeline: SimulatorTimeline) -> str:
@@ -288,10 +262,10 @@ def _controllability(timeline: SimulatorTimeline) -> str:
     else:
         rows = (" ".join(f"{n} {p:.2f}" for n, p in zip(names, row, strict=True)) for row in shares)
         text = ", ".join(f"{c.label}: {row}" for c, row in zip(timeline.conditions, rows, strict=True))
-    difference = next((f.message for f in timeline.findings if f.name == "difference"), None)
     at = f"in the simulator at {in_min(timeline.start_min[0])}"
     first = f"P(x >= P50), the share of responses that reach the median, {at}: {text}"
-    return "\n".join([first, *([f"in the recording {difference}"] if difference else []), *_memories(timeline)])
+    difference = [f"in the recording {f.message}" for f in timeline.findings if f.name == "difference"][:1]
+    return "\n".join([first, *difference, *_memories(timeline)])
 
 
 def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
@@ -306,14 +280,10 @@ def _memories(timeline: SimulatorTimeline) -> Iterator[str]:
         if isinstance(simulator, MemorySimulator):
             decay, weight, _, load_s = memory = simulator.memory
             near, total = (int(np.median(counts)) for counts in (simulator.nearest, simulator.followers))
+            load = f". It also depends on the amount of stimulation in the last {load_s:g} s" if load_s else ""
             text = (
                 f"a response depends on earlier trials, where each trial counts {decay:.2g} times as much as the one "
-                f"after it, and a stimulus {weight:.2g} times as much as its response"
-            )
-            if load_s:
-                text += f". It also depends on the amount of stimulation in the last {load_s:g} s"
-            text += (
-                f". The simulator draws from the {near} responses with the most similar history, out of {total} per "
-                "condition"
+                f"after it, and a stimulus {weight:.2g} times as much as its response{load}. The simulator draws from "
+                f"the {near} responses with the most similar history, out of {total} per condition"
             )
             yield f"memory at {in_min(start_min)}: {'none was found' if memory == NO_MEMORY else text}"

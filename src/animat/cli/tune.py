@@ -22,7 +22,6 @@ class TuneFile(JobOptions):
     """Folder for all results; the best settings are in its best.toml"""
 
     def run(self) -> dict[str, Any]:
-        """Search."""
         from animat.columns import align_columns
         from animat.tuning.search import expect_optuna
         from animat.tuning.specification import read_tuning
@@ -48,13 +47,10 @@ class TuneFile(JobOptions):
         counted = "1 policy" if policies == 1 else f"{policies} policies"
         print(f"retrained, {counted} of each, in {episodes} fresh episodes per policy:")
         print("\n".join(align_columns(["", "mean return", "s.e.", "settings"], cells)))
-        if tuned.importance:
-            shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
-            print(f"importance: {shares}")
-        else:
-            print("importance: too few trials with different returns to tell")
-        pictures = [HISTORY, *([IMPORTANCE] if tuned.importance else [])]
+        shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
+        print(f"importance: {shares or 'too few trials with different returns to tell'}")
         counted = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
         print(f"{len(tuned.trials)} trials ({counted}) in {time.monotonic() - began:.0f} s")
-        print(f"best settings: {self.out / BEST}; figures: {', '.join(str(self.out / name) for name in pictures)}")
+        figures = f"{self.out / HISTORY}{f', {self.out / IMPORTANCE}' if tuned.importance else ''}"
+        print(f"best settings: {self.out / BEST}; figures: {figures}")
         return {"folder": str(tuned.folder), "best_toml": str(self.out / BEST), **tuned.to_dict()}

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import ResponseOptions, print_warnings
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.cli.responses import ResponseOptions, naming, print_warnings
+from animat.errors import InvalidArgument
 from animat.writing import expect_writable
 
 
@@ -31,11 +31,8 @@ class Validate(ResponseOptions):
     """Format of the figures"""
     seed: int = 1
     """Decides every random draw"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Validate each recording."""
         from animat.compilation import keep_compilations
         from animat.neurons.validation import correlations, validate
         from animat.progress import Bar
@@ -62,7 +59,7 @@ class Validate(ResponseOptions):
         with Bar("validating") as progress:
             for number, file in enumerate(files):
                 progress.update(number, len(files), file.name)
-                try:
+                with naming(file):
                     (responses,) = extract_series(
                         [read_source(file)],
                         by,
@@ -74,8 +71,6 @@ class Validate(ResponseOptions):
                     has_several = len(responses.readouts) > 1
                     numbers = range(len(responses.readouts)) if has_several else [None]
                     validations = [validate(responses, kind=self.simulator, seed=self.seed, readout=d) for d in numbers]
-                except (Mismatch, UnusableData) as error:
-                    raise type(error)(f"{file}: {error}") from error
                 print_warnings(responses.findings)
                 for validation, readout in zip(validations, responses.readouts.names, strict=True):
                     name, stem = file.name, f"{figure_stem(file.name)}-validation"

@@ -8,22 +8,20 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from animat.cli.command import Command
 from animat.errors import InvalidArgument
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(Command):
     """Serve a page of what runs, ran or was killed in a folder, for a browser on this machine, until Ctrl-C."""
 
     folder: Positional[Path]
     """Folder of a session, a training, a study, a tuning, recordings, or several of these"""
     port: int = 0
     """Port to listen on, on this machine only; 0: any free port"""
-    json: bool = False
-    """End with a line of JSON"""
 
     def run(self) -> dict[str, Any]:
-        """Serve it."""
         from animat.watch.serving import serve
 
         if not self.folder.is_dir():

@@ -22,22 +22,14 @@ _PERCENTILES_HZ = {
 
 
 def check_mapping(mapping: Mapping) -> None:
-    """Refuse a mapping whose results on a few responses, in numpy and under `jax.jit`, are not commands.
-
-    Args:
-        mapping: of any class.
-
-    Raises:
-        InvalidArgument: naming what was expected and what came.
-    """
+    """Raise InvalidArgument for a mapping whose results on a few responses, in numpy and JAX, are not commands."""
     if not isinstance(mapping, Mapping):
         raise InvalidArgument(f"mapping: expected a mapping or the name of one, got {shown(mapping)}")
-    kind = type(mapping).__name__
     try:
         hash(mapping)
     except Exception as error:
         raise InvalidArgument(
-            f"{kind}: expected a frozen dataclass of plain parameters ({first_line(error)})"
+            f"{type(mapping).__name__}: expected a frozen dataclass of plain parameters ({first_line(error)})"
         ) from error
     _check_commands(mapping)
 
@@ -45,62 +37,43 @@ def check_mapping(mapping: Mapping) -> None:
 @lru_cache(maxsize=64)
 def _check_commands(mapping: Mapping) -> None:
     """Cached, as each mapping is compiled."""
-    kind, compiled = type(mapping).__name__, None
+    expected, n, compiled = f"{type(mapping).__name__}.command: expected", len(_RESPONSES_HZ), jax.jit(mapping.command)
     for where, percentiles in _PERCENTILES_HZ.items():
-        u = _commands(mapping, _RESPONSES_HZ, percentiles)
-        compiled = compiled or jax.jit(mapping.command)
-        _expect_commands(kind, u, where)
+        u = _results(mapping.command, _RESPONSES_HZ, percentiles, f"{expected} commands")
+        # Also false for NaN.
+        if u.shape != (n,) or u.dtype.kind not in "fiu" or not np.all(np.abs(u) <= 1):
+            raise InvalidArgument(f"{expected} {n} commands from -1 to 1{where}, got {shown(u.tolist())}")
+        if falls := np.flatnonzero(np.diff(u) < 0).tolist():
+            i = falls[0]
+            raise InvalidArgument(
+                f"{expected} commands that never fall as the response rises{where}, got {u[i]:g} at "
+                f"{_RESPONSES_HZ[i]:g} Hz and {u[i + 1]:g} at {_RESPONSES_HZ[i + 1]:g} Hz"
+            )
         for i in (0, -1):
-            one = _commands(mapping, _RESPONSES_HZ[i], percentiles)
+            one = _results(mapping.command, _RESPONSES_HZ[i], percentiles, f"{expected} commands")
             if one.shape != () or not one == u[i]:
                 raise InvalidArgument(
-                    f"{kind}.command: expected the same command for a single response as in an array, {u[i]:g}, got "
+                    f"{expected} the same command for a single response as in an array, {u[i]:g}, got "
                     f"{shown(one.tolist())}"
                 )
-        _expect_same(kind, compiled, u, percentiles, where)
+        # Training computes commands under `jax.jit`, and a closed loop in numpy.
+        hint = ": use functions of namespace_of(x), and where in place of if"
+        same = _results(compiled, _RESPONSES_HZ, percentiles, f"{expected} it to run under jax.jit", hint)
+        if same.shape != u.shape:
+            raise InvalidArgument(f"{expected} {n} commands under jax.jit too, got {shown(same.tolist())}")
+        if not np.allclose(same, u, atol=1e-4):
+            i = int(np.argmax(np.abs(same - u)))
+            raise InvalidArgument(
+                f"{expected} the same under jax.jit as in numpy{where}, {u[i]:g} for {_RESPONSES_HZ[i]:g} Hz, got "
+                f"{same[i]:g}"
+            )
 
 
-def _commands(mapping: Mapping, x: Any, percentiles: Any) -> Any:
+def _results(command: Callable[..., Any], x: Any, percentiles: Any, expected: str, hint: str = "") -> Any:
     try:
-        # The result of a division by zero is checked below, and reported in one line.
+        # The result of a division by zero is checked, and reported in one line.
         with np.errstate(all="ignore"):
-            return np.asarray(mapping.command(x, percentiles))
+            return np.asarray(command(x, percentiles))
     except Exception as error:
         # Anything may go wrong in a third-party mapping.
-        raise InvalidArgument(
-            f"{type(mapping).__name__}.command: expected commands, got {first_line(error)}"
-        ) from error
-
-
-def _expect_commands(kind: str, u: Any, where: str) -> None:
-    n = len(_RESPONSES_HZ)
-    # Also false for NaN.
-    if u.shape != (n,) or u.dtype.kind not in "fiu" or not np.all(np.abs(u) <= 1):
-        raise InvalidArgument(f"{kind}.command: expected {n} commands from -1 to 1{where}, got {shown(u.tolist())}")
-    if falls := np.flatnonzero(np.diff(u) < 0).tolist():
-        i = falls[0]
-        raise InvalidArgument(
-            f"{kind}.command: expected commands that never fall as the response rises{where}, got {u[i]:g} at "
-            f"{_RESPONSES_HZ[i]:g} Hz and {u[i + 1]:g} at {_RESPONSES_HZ[i + 1]:g} Hz"
-        )
-
-
-def _expect_same(kind: str, compiled: Callable[..., Any], u: Any, percentiles: Any, where: str) -> None:
-    """Training computes commands under `jax.jit`, and a closed loop in numpy."""
-    try:
-        same = np.asarray(compiled(_RESPONSES_HZ, percentiles))
-    except Exception as error:
-        raise InvalidArgument(
-            f"{kind}.command: expected it to run under jax.jit, got {first_line(error)}: use functions of "
-            "namespace_of(x), and where in place of if"
-        ) from error
-    if same.shape != u.shape:
-        raise InvalidArgument(
-            f"{kind}.command: expected {u.size} commands under jax.jit too, got {shown(same.tolist())}"
-        )
-    if not np.allclose(same, u, atol=1e-4):
-        i = int(np.argmax(np.abs(same - u)))
-        raise InvalidArgument(
-            f"{kind}.command: expected the same under jax.jit as in numpy{where}, {u[i]:g} for "
-            f"{_RESPONSES_HZ[i]:g} Hz, got {same[i]:g}"
-        )
+        raise InvalidArgument(f"{expected}, got {first_line(error)}{hint}") from error

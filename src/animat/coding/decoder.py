@@ -23,30 +23,21 @@ class Decoder:
 
     @property
     def percentiles_shape(self) -> tuple[int, ...]:
-        """Shape of the percentiles that `command` takes."""
-        return percentiles_shape(self.readouts)
+        """Shape of the percentiles that `command` takes: (11,), or (readouts, 11) for several."""
+        return (N_PERCENTILES,) if len(self.readouts) == 1 else (len(self.readouts), N_PERCENTILES)
 
     def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
         """The motor command for a response (see `decode`)."""
         return decode(self.mapping, x, percentiles)
 
 
-def percentiles_shape(readouts: Readouts) -> tuple[int, ...]:
-    """Shape of the percentiles of readouts: (11,), or (readouts, 11) for several."""
-    return (N_PERCENTILES,) if len(readouts) == 1 else (len(readouts), N_PERCENTILES)
-
-
 def decode(mapping: Mapping, x: Numbers, percentiles: Numbers) -> Numbers:
-    """The motor command for a response.
+    """The motor command for a response, in [-1, 1] and in the shape of `x`.
 
     Args:
-        mapping: from the response of a readout to its command.
         x: of one readout, in Hz, any shape; of several, in the last axis, shape (..., readouts).
         percentiles: P0, P10, ..., P100 of the non-burst responses, in Hz, shape (11,); with several readouts, of each,
             shape (readouts, 11).
-
-    Returns:
-        Commands in [-1, 1], in the shape of `x`.
     """
     if percentiles.ndim == 1:
         return mapping.command(x, percentiles)

@@ -9,16 +9,9 @@ from animat.responses.condition import RESTING, Condition
 
 
 def electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...] | None:
-    """The electrode pulses of a trial of each condition: one for each electrode of each pulse.
+    """The electrode pulses of a trial of each condition; None if the electrodes of all pulses are not known for some.
 
     For a condition on one of several sets it is their mean, as they are used equally often.
-
-    Args:
-        conditions: as recorded.
-        pulses: per trial.
-
-    Returns:
-        One number per condition; None if the electrodes of all pulses are not known for some condition.
     """
     counts = []
     for each in conditions:
@@ -30,11 +23,7 @@ def electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[floa
 
 
 def expect_electrode_pulses(conditions: Sequence[Condition], pulses: int) -> tuple[float, ...]:
-    """The same where the cost is required.
-
-    Raises:
-        UnusableData: if they are not known.
-    """
+    """The same where the cost is required; raises UnusableData if they are not known."""
     counts = electrode_pulses(conditions, pulses)
     if counts is None:
         raise UnusableData(

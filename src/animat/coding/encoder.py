@@ -20,11 +20,7 @@ SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
 
 @dataclass(frozen=True)
 class Encoder:
-    """From an agent's actions to stimuli: each action is a condition, presented as trials of several pulses.
-
-    Attributes:
-        conditions: in the order of the actions.
-        pulses: per trial.
+    """From an agent's actions to stimuli: each action is a condition, presented as trials of `pulses` pulses.
 
     Raises:
         InvalidArgument: for no conditions, or trains that take too long.
@@ -74,12 +70,7 @@ class Encoder:
 
 
 class Target(NamedTuple):
-    """The electrodes of one pulse.
-
-    Attributes:
-        electrodes: pulsed together; empty if nothing is delivered.
-        pattern: the number of the culture's pattern that they form; -1: they form none; -2: nothing is delivered.
-    """
+    """The electrodes of one pulse, and the culture's pattern that they form; -1: none; -2: nothing is delivered."""
 
     electrodes: tuple[int, ...]
     pattern: int
@@ -88,13 +79,8 @@ class Target(NamedTuple):
 class Dealer:
     """Deals out the stimuli of successive trials, as the schedule of a recording does.
 
-    What a condition leaves open is drawn: patterns from a deck that is reshuffled when empty, so that all are used
-    equally often, and frequencies at random.
-
-    Args:
-        encoder: from actions to stimuli.
-        patterns: electrodes of each of the culture's patterns in use, padded with -1.
-        rng: for all draws.
+    What a condition leaves open is drawn: patterns (of the culture, padded with -1) from a deck that is reshuffled when
+    empty, so that all are used equally often, and frequencies at random.
     """
 
     def __init__(

@@ -34,13 +34,13 @@ def inspection_text(inspection: Inspection) -> str:
     spikes = "rates" if inspection.n_spikes is None else _count(inspection.n_spikes, "spike")
     duration_s = inspection.duration_s
     span = f" in {duration_s:,.1f} s ({duration_s / 60:.1f} min)" if math.isfinite(duration_s) else ""
-    start = f"from {inspection.start_min:g} min on the culture's clock"
-    trials = f" in {_count(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else ""
-    presented = f", {inspection.presentation}" if inspection.presentation else ""
+    start = f"from {responses.start_min:g} min on the culture's clock"
     lines = [
         f"{inspection.name}: {inspection.verdict}",
-        f"  {spikes} on {_count(inspection.n_channels, 'channel')}{span}, {start}",
-        f"  {_count(inspection.n_stimuli, 'stimulus', 'stimuli')}{trials}{presented}",
+        f"  {spikes} on {_count(responses.n_channels, 'channel')}{span}, {start}",
+        f"  {inspection.n_stimuli:,} {'stimulus' if inspection.n_stimuli == 1 else 'stimuli'}"
+        + (f" in {_count(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
+        + (f", {responses.presentation}" if responses.presentation else ""),
     ]
     if inspection.network_bursts is not None:
         lines += _spontaneous(inspection, inspection.network_bursts)
@@ -170,7 +170,7 @@ def _table(inspection: Inspection) -> list[str]:
     shown = conditions[:_MOST_CONDITIONS]
     width = max([len("condition"), *(len(c.label) for c in shown)])
     lines = [
-        f"  conditions: {inspection.by}{chosen}",
+        f"  conditions: {inspection.responses.by}{chosen}",
         f"  {'condition':<{width}}  responses  non-burst  median x (Hz)  P(x >= P50)",
     ]
     for c in shown:

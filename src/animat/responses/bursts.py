@@ -32,17 +32,14 @@ class BurstSeparation:
             one class. A normal distribution, which has nothing to separate, still reaches 0.64, a flat one 0.75.
         valley: how deep the density of ratios falls between the classes, from 0 (no valley: one hump, cut in two) to
             1 (an empty gap): 1 - (lowest density between the class means) / (the lower of the two classes' peaks).
-        distance: between the classes' means, in standard deviations of the lower class.
-        is_burst: shape (responses,).
         rejected: Otsu's threshold if it was rejected, to which the numbers above then belong; NaN otherwise.
     """
 
     threshold: float
     separability: float
     valley: float
-    distance: float
     is_burst: Bool[np.ndarray, " responses"]
-    rejected: float = float("nan")
+    rejected: float = math.nan
 
 
 def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
@@ -59,7 +56,7 @@ def otsu_threshold(values: Float64[np.ndarray, " values"]) -> float:
     """
     distinct, counts = np.unique(values, return_counts=True)
     if len(distinct) < 2:
-        return float(distinct[0]) if len(distinct) else float("nan")
+        return float(distinct[0]) if len(distinct) else math.nan
     # Centred, so that the sums below lose no digits when the values are far from 0.
     sums = np.cumsum(counts * (distinct - np.mean(values)))
     n0 = np.cumsum(counts)[:-1]
@@ -78,12 +75,8 @@ def separate_bursts(
     burst.
 
     Args:
-        active_ratio: the share of channels with at least one spike in the window, shape (responses,).
-        threshold: a ratio to use in any case; 1 keeps every response.
-        n_channels: the number of channels of which the ratios are shares.
-
-    Raises:
-        InvalidArgument: for a threshold that is not a ratio from 0 to 1.
+        active_ratio: the share of the `n_channels` with at least one spike in the window, shape (responses,).
+        threshold: a ratio from 0 to 1 to use in any case; 1 keeps every response.
 
     Source: the paper's burst separation (Otsu's threshold over all ratios of a recording), which always cuts.
     """
@@ -91,19 +84,16 @@ def separate_bursts(
     cut = otsu_threshold(active_ratio) if threshold is None else threshold
     is_burst = active_ratio > cut
     upper, lower = active_ratio[is_burst], active_ratio[~is_burst]
-    valley, distance = _valley(active_ratio, is_burst, n_channels), float("nan")
-    if len(upper) and len(lower):
-        with np.errstate(divide="ignore"):
-            distance = float((np.mean(upper) - np.mean(lower)) / np.std(lower))
-    apart = separability(active_ratio, is_burst)
+    valley, apart = _valley(active_ratio, is_burst, n_channels), separability(active_ratio, is_burst)
     if threshold is not None:
-        return BurstSeparation(cut, float("nan") if math.isnan(distance) else apart, valley, distance, is_burst)
-    are_two = valley >= CLEAR_VALLEY or (valley >= FAR_VALLEY and distance >= FAR)
-    if are_two and min(len(upper), len(lower)) >= LEAST_RESPONSES:
-        return BurstSeparation(cut, apart, valley, distance, is_burst)
-    kept = 1.0 if len(active_ratio) else cut
-    none = np.zeros(len(active_ratio), np.bool_)
-    return BurstSeparation(kept, apart, valley, distance, none, cut if len(upper) else float("nan"))
+        return BurstSeparation(cut, apart if len(upper) and len(lower) else math.nan, valley, is_burst)
+    if min(len(upper), len(lower)) >= LEAST_RESPONSES:
+        with np.errstate(divide="ignore"):
+            distance = (np.mean(upper) - np.mean(lower)) / np.std(lower)
+        if valley >= CLEAR_VALLEY or (valley >= FAR_VALLEY and distance >= FAR):
+            return BurstSeparation(cut, apart, valley, is_burst)
+    kept, rejected = 1.0 if len(active_ratio) else cut, cut if len(upper) else math.nan
+    return BurstSeparation(kept, apart, valley, np.zeros_like(is_burst), rejected)
 
 
 def check_threshold(threshold: float | None) -> None:

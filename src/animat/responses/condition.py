@@ -14,11 +14,11 @@ from animat.errors import InvalidArgument, shown
 from animat.records import Flag, Number, Whole, record
 from animat.stimulation.stimulus import NOTHING
 
-_LONGEST_LABEL = 10_000
-"""A condition may be a very large set of electrodes, all named in its label."""
 _LARGEST_VALUE = 2.0**63
 RESTING = ((NOTHING,),)
 """The electrodes of a condition that delivers nothing."""
+Line = Annotated[str, Field(strict=True, max_length=10_000)]
+"""A condition may be a very large set of electrodes, all named in its label."""
 _MOST_LISTED = 5
 """The most electrodes of a set that a label lists: as many as the paper's patterns have."""
 
@@ -38,33 +38,26 @@ class Condition:
         electrodes: sets of electrodes, each pulse on one of them; empty: not known; None: any of the culture's
             patterns; `RESTING`: nothing is delivered.
         only_last: only the last pulse of a trial is on these electrodes, and those before are on any pattern.
-
-    Raises:
-        InvalidArgument: for a label that is not a line of text, a value that is not a finite number, frequencies that
-            are not positive, or electrodes that are not sets of numbers from 0 on.
     """
 
-    label: Annotated[str, Field(strict=True, min_length=1, max_length=_LONGEST_LABEL)]
+    label: Annotated[Line, Field(min_length=1)]
     value: Annotated[Number, Field(ge=-_LARGEST_VALUE, le=_LARGEST_VALUE)]
-    unit: Annotated[str, Field(strict=True, max_length=_LONGEST_LABEL)] = ""
+    unit: Line = ""
     frequencies_hz: tuple[Annotated[Number, Field(le=_LARGEST_VALUE)], ...] = field(default=(), compare=False)
     electrodes: tuple[tuple[Whole, ...], ...] | None = field(default=None, compare=False)
     only_last: Flag = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name in ("label", "unit"):
-            if not (text := getattr(self, name)).isprintable():
+        for name, text in (("label", self.label), ("unit", self.unit)):
+            if not text.isprintable():
                 raise InvalidArgument(f"{name}: expected a line of text, got {shown(text)}")
         if self.unit == "Hz":
             object.__setattr__(self, "frequencies_hz", (self.value,))
         elif not all(frequency_hz > 0 for frequency_hz in self.frequencies_hz):
             raise InvalidArgument(f"frequencies_hz: expected numbers above 0, got {shown(self.frequencies_hz)}")
-        if self.electrodes != RESTING and not all(
-            one and all(0 <= e < _LARGEST_VALUE for e in one) for one in self.electrodes or ()
-        ):
-            raise InvalidArgument(
-                f"electrodes: expected sets of one or more electrode numbers, got {shown(self.electrodes)}"
-            )
+        sets = () if self.electrodes == RESTING else self.electrodes or ()
+        if not all(one and all(0 <= electrode < _LARGEST_VALUE for electrode in one) for one in sets):
+            raise InvalidArgument(f"electrodes: expected sets of one or more electrode numbers, got {shown(sets)}")
 
     @property
     def interval_s(self) -> float:
@@ -99,12 +92,7 @@ def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
 
 
 def stimulus_mismatch(conditions: Sequence[Condition], others: Sequence[Condition]) -> str | None:
-    """A message on the first of equal conditions whose stimuli differ, if both are known; None if none does.
-
-    Args:
-        conditions: the expected ones.
-        others: equal conditions of other recordings, in the same order.
-    """
+    """A message on the first of equal conditions (the expected ones, and others) whose stimuli differ, where known."""
     for expected, got in zip(conditions, others, strict=True):
         if not (expected.electrodes and got.electrodes and expected.frequencies_hz and got.frequencies_hz):
             continue

@@ -22,12 +22,7 @@ NO_CONDITION = -1
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """The condition of each stimulus.
-
-    Attributes:
-        condition: index into `conditions` of each stimulus, `NO_CONDITION` if it has none, shape (stimuli,).
-        conditions: in the order of their index.
-    """
+    """The index into `conditions` of each stimulus; `NO_CONDITION` if it has none."""
 
     condition: Int64[np.ndarray, " stimuli"]
     conditions: tuple[Condition, ...]
@@ -55,14 +50,7 @@ class All(Conditions):
 
 @dataclass(frozen=True)
 class ByFrequency(Conditions):
-    """By the stimulation frequency of the protocol (the paper).
-
-    Attributes:
-        values_hz: the frequencies to take, in the order of their index; empty for all that occur, rising.
-
-    Raises:
-        InvalidArgument: for a frequency that is not positive, or is repeated.
-    """
+    """By the stimulation frequency of the protocol (the paper): those given, or all that occur, rising."""
 
     values_hz: tuple[float, ...] = ()
 
@@ -74,13 +62,12 @@ class ByFrequency(Conditions):
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Sort pulses by frequency; unknown frequencies (NaN), and those not listed, have no condition."""
-        known = stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]
-        values_hz = np.array(self.values_hz) if self.values_hz else np.unique(known)
+        values_hz = self.values_hz or np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]).tolist()
         index = np.full(len(stimuli), NO_CONDITION)
         for i, value_hz in enumerate(values_hz):
             # 1e-6: a frequency stored in single precision is still the same frequency.
             index[np.isclose(stimuli.frequency_hz, value_hz, rtol=1e-6, atol=0.0)] = i
-        return Assignment(index, tuple(_frequency(value_hz) for value_hz in values_hz))
+        return Assignment(index, tuple(map(_frequency, values_hz)))
 
 
 @dataclass(frozen=True)
@@ -98,9 +85,6 @@ class ByInterval(Conditions):
     Attributes:
         values_hz: the frequencies, in the order of their index.
         tolerance: relative, 0.25 for 25 %.
-
-    Raises:
-        InvalidArgument: for no frequency, one that is not positive or is repeated, or a tolerance that is not positive.
     """
 
     values_hz: tuple[float, ...]
@@ -127,18 +111,14 @@ class ByInterval(Conditions):
             # 1e-9: times are rounded, so chance would decide about an interval on the edge.
             within = distance.min(axis=1) <= math.log1p(self.tolerance) + 1e-9
             index[1:][within] = nearest[within]
-        return Assignment(index, tuple(_frequency(value_hz) for value_hz in self.values_hz))
+        return Assignment(index, tuple(map(_frequency, self.values_hz)))
 
 
 @dataclass(frozen=True)
 class ByElectrode(Conditions):
-    """By the set of electrodes that were pulsed together; the order within a set does not matter.
+    """By the set of electrodes that were pulsed together: those given, or all that occur, in order of size and number.
 
-    Attributes:
-        sets: the sets to take, in the order of their index; empty for all that occur, in the order of their numbers.
-
-    Raises:
-        InvalidArgument: for a set that is empty or repeated.
+    The order within a set does not matter.
     """
 
     sets: tuple[tuple[int, ...], ...] = ()
@@ -170,14 +150,7 @@ class ByElectrode(Conditions):
 
 @dataclass(frozen=True)
 class ByPattern(Conditions):
-    """By the number of the stimulation pattern.
-
-    Attributes:
-        patterns: the patterns to take, in the order of their index; empty for all that occur, rising.
-
-    Raises:
-        InvalidArgument: for a pattern that is negative or repeated.
-    """
+    """By the number of the stimulation pattern: those given, or all that occur, rising."""
 
     patterns: tuple[int, ...] = ()
 
@@ -191,7 +164,7 @@ class ByPattern(Conditions):
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Sort pulses by pattern; unknown patterns, and those not listed, have no condition."""
         is_known = (stimuli.pattern != UNKNOWN) & ~stimuli.is_rest
-        patterns = np.array(self.patterns or np.unique(stimuli.pattern[is_known]), dtype=np.int64)
+        patterns = self.patterns or np.unique(stimuli.pattern[is_known]).tolist()
         index = np.full(len(stimuli), NO_CONDITION)
         for i, pattern in enumerate(patterns):
             index[stimuli.pattern == pattern] = i
@@ -201,12 +174,7 @@ class ByPattern(Conditions):
 
 @dataclass(frozen=True)
 class ByBoth(Conditions):
-    """By when and where pulses come: the combinations that occur, in the order of `when`, then of `where`.
-
-    Attributes:
-        when: frequencies or intervals.
-        where: electrodes or patterns.
-    """
+    """By when and where pulses come: the combinations that occur, in the order of `when`, then of `where`."""
 
     when: ByFrequency | ByInterval
     where: ByElectrode | ByPattern
@@ -217,24 +185,19 @@ class ByBoth(Conditions):
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Sort pulses by combination; a pulse that lacks either has no condition."""
         when, where = self.when.assign(stimuli), self.where.assign(stimuli)
-        both = (when.condition != NO_CONDITION) & (where.condition != NO_CONDITION)
-        number = np.where(both, when.condition * len(where.conditions) + where.condition, NO_CONDITION)
-        occurring = np.unique(number[both & stimuli.is_last_of_presentation])
+        both = np.stack([when.condition, where.condition], axis=1)
+        has_both = (both != NO_CONDITION).all(axis=1)
         index = np.full(len(stimuli), NO_CONDITION)
         conditions = []
-        for i, each in enumerate(occurring.tolist()):
-            index[number == each] = i
-            at, on = when.conditions[each // len(where.conditions)], where.conditions[each % len(where.conditions)]
+        for i, pair in enumerate(np.unique(both[has_both & stimuli.is_last_of_presentation], axis=0)):
+            index[(both == pair).all(axis=1)] = i
+            at, on = when.conditions[pair[0]], where.conditions[pair[1]]
             conditions.append(Condition(f"{at.label}, {on.label}", float(i), "", at.frequencies_hz, on.electrodes))
         return _with_stimuli(stimuli, index, conditions)
 
 
 def default_conditions(stimuli: Stimuli, protocol: Protocol | None = None) -> Conditions:
-    """The default conditions of a recording.
-
-    By place if the protocol has places, with the frequency if it has several; else by frequency if any is known; else
-    all in one.
-    """
+    """By place if the protocol has places, with the frequency if it has several; else by frequency, if any is known."""
     if protocol is not None and protocol.places:
         return ByElectrode() if len(protocol.frequencies_hz) == 1 else ByBoth(ByFrequency(), ByElectrode())
     return ByFrequency() if np.any(~np.isnan(stimuli.frequency_hz)) else All()
@@ -251,21 +214,20 @@ def conditions_named(text: str) -> Conditions:
         InvalidArgument: for anything else.
     """
     try:
-        return _parse(text)
+        parts = [_parse(part) for part in text.split(" x ")]
+        if len(parts) == 1:
+            return parts[0]
+        if len(parts) == 2:
+            when, where = parts
+            if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
+                return ByBoth(when, where)
+        raise _invalid(text, "frequency or interval before x, and electrode or pattern after it")
     except InvalidArgument as error:
         raise InvalidArgument(f"conditions: {error}") from error
 
 
 def _parse(text: str) -> Conditions:
-    first, is_product, second = text.partition(" x ")
-    if is_product and " x " not in second:
-        when, where = _parse(first), _parse(second)
-        if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
-            return ByBoth(when, where)
-    if is_product:
-        raise _invalid(text, "frequency or interval before x, and electrode or pattern after it")
-    name, _, rest = text.strip().partition(":")
-    name, rest = name.strip(), rest.strip()
+    name, _, rest = (part.strip() for part in text.partition(":"))
     if name == "all" and not rest:
         return All()
     if name == "frequency":

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from animat.errors import Mismatch, UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
-from animat.responses.bursts import BurstSeparation, separate_bursts
-from animat.responses.conditions import NO_CONDITION, Assignment, ByInterval, Conditions, default_conditions
+from animat.responses.bursts import separate_bursts
+from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, default_conditions
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses, Trials
@@ -58,83 +57,43 @@ def extract_responses(
         only where it finds two groups).
     """
     check_window(window_ms)
-    if not len(source.channels):
+    stimuli, n_channels = source.stimuli, len(source.channels)
+    if not n_channels:
         what = "recording" if isinstance(source, Recording) else "table"
         raise UnusableData(f"channels: expected at least one, got a {what} without any; x is a mean over channels")
-    if isinstance(source, ResponseTable):
-        return _of_table(source, by, window_ms, burst_threshold, readouts)
-    stimuli = source.stimuli
-    # An end that equals the time of the last stimulus or spike is rounded as that is.
-    inside = stimuli.time_s + window_ms[1] * 1e-3 <= source.stop_s + 1e-9
-    presented = np.flatnonzero(stimuli.is_last_of_presentation & inside)
-    # Trials without a condition are read too, as the history of others.
-    rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
-    responses, assignment, bursts = _sort(source, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
-    if not readouts.are_all and responses.time_s is not None:
-        members = readouts.members(source.channels)
-        readout_hz = readouts.read(source, members, responses.time_s, window_ms)
-        responses = replace(responses, readouts=readouts, readout_hz=readout_hz)
-    return replace(responses, findings=findings_on(responses, source, assignment, bursts, inside))
-
-
-def _of_table(
-    table: ResponseTable,
-    by: Conditions | None,
-    window_ms: tuple[float, float],
-    burst_threshold: float | None,
-    readouts: Readouts,
-) -> Responses:
-    """The responses of a table, which has no spike times."""
-    if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
-        raise Mismatch(
-            f"window_ms: expected {table.window_ms[0]:g} to {table.window_ms[1]:g}, in which the table's spikes were "
-            f"counted, got {window_ms[0]:g} to {window_ms[1]:g}; leave the window out"
-        )
-    if isinstance(by, ByInterval) and not table.has_times:
-        raise UnusableData("conditions: expected no intervals, as the table has no stimulus times")
-    assumed = []
-    if table.window_ms is None:
-        message = (
-            f"the table does not state the window in which its spikes were counted: {window_ms[0]:g} to "
-            f"{window_ms[1]:g} ms after the stimulus is assumed, in which a closed loop would count them; give it with "
-            "--window-ms, or in the file"
-        )
-        assumed = [Finding("window-assumed", "warning", message)]
-    window_ms = table.window_ms or window_ms
-    scale = 1.0 if table.kind == "rate_hz" else 1 / ((window_ms[1] - window_ms[0]) * 1e-3)
-    presented = np.flatnonzero(table.stimuli.is_last_of_presentation)
-    rate_hz = table.values[presented].mean(axis=1) * scale
-    active_ratio = np.mean(table.values[presented] > 0, axis=1)
-    responses, assignment, bursts = _sort(table, by, window_ms, burst_threshold, presented, rate_hz, active_ratio)
-    if not readouts.are_all:
-        members, values = readouts.members(table.channels), table.values[presented[responses.presentations[1]]]
-        readout_hz = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1) * scale
-        responses = replace(responses, readouts=readouts, readout_hz=readouts.squeeze(readout_hz))
-    return replace(responses, findings=(*assumed, *findings_on(responses, table, assignment, bursts)))
-
-
-def _sort(
-    source: Recording | ResponseTable,
-    by: Conditions | None,
-    window_ms: tuple[float, float],
-    burst_threshold: float | None,
-    presented: Int64[np.ndarray, " presentations"],
-    rate_hz: Float64[np.ndarray, " presentations"],
-    active_ratio: Float64[np.ndarray, " presentations"],
-) -> tuple[Responses, Assignment, BurstSeparation]:
-    """The responses read after the last pulses, sorted by condition, with bursts set apart; and how this was done."""
-    stimuli, n_channels = source.stimuli, len(source.channels)
     by = by or default_conditions(stimuli, source.protocol)
     assignment = by.assign(stimuli)
+    # Trials without a condition are read too, as the history of others.
+    read, inside = stimuli.is_last_of_presentation, None
+    assumed: tuple[Finding, ...] = ()
+    if isinstance(source, ResponseTable):
+        window_ms, assumed = _window_of(source, by, window_ms)
+        presented, has_times = np.flatnonzero(read), source.has_times
+        scale = 1.0 if source.kind == "rate_hz" else 1 / ((window_ms[1] - window_ms[0]) * 1e-3)
+        rate_hz = source.values[presented].mean(axis=1) * scale
+        active_ratio = np.mean(source.values[presented] > 0, axis=1)
+    else:
+        # An end that equals the time of the last stimulus or spike is rounded as that is.
+        inside = stimuli.time_s + window_ms[1] * 1e-3 <= source.stop_s + 1e-9
+        presented, has_times = np.flatnonzero(read & inside), True
+        rate_hz, active_ratio = read_windows(source, stimuli.time_s[presented], window_ms)
     condition = assignment.condition[presented]
     chosen = condition != NO_CONDITION
     bursts = separate_bursts(active_ratio[chosen], burst_threshold, n_channels=n_channels)
-    has_times = isinstance(source, Recording) or source.has_times
     # There is no silence within a trial, however long it lasts. Rows without times are taken as successive, and nothing
     # is known about what came before the first.
     silences = np.cumsum(np.diff(stimuli.time_s, prepend=-np.inf) > SILENCE_S)
     is_rested = (np.diff(silences[presented], prepend=0) > 0) & has_times
     time_s = stimuli.time_s[presented] if has_times else None
+    readout_hz = None
+    if not readouts.are_all:
+        members = readouts.members(source.channels)
+        if isinstance(source, Recording):
+            readout_hz = readouts.read(source, members, stimuli.time_s[presented[chosen]], window_ms)
+        else:
+            values = source.values[presented[chosen]]
+            of_each = np.stack([values[:, group].mean(axis=1) for group in members], axis=-1)
+            readout_hz = readouts.squeeze(of_each * scale)
     responses = Responses(
         condition=condition[chosen],
         rate_hz=rate_hz[chosen],
@@ -152,5 +111,28 @@ def _sort(
         place=np.flatnonzero(chosen),
         by=str(by),
         burst_threshold=burst_threshold,
+        readouts=readouts,
+        readout_hz=readout_hz,
     )
-    return responses, assignment, bursts
+    return replace(responses, findings=(*assumed, *findings_on(responses, source, assignment, bursts, inside)))
+
+
+def _window_of(
+    table: ResponseTable, by: Conditions, window_ms: tuple[float, float]
+) -> tuple[tuple[float, float], tuple[Finding, ...]]:
+    """The window in which a table's spikes were counted, and a finding if the table does not state it."""
+    if table.window_ms is not None and window_ms not in (DEFAULT_WINDOW_MS, table.window_ms):
+        raise Mismatch(
+            f"window_ms: expected {table.window_ms[0]:g} to {table.window_ms[1]:g}, in which the table's spikes were "
+            f"counted, got {window_ms[0]:g} to {window_ms[1]:g}; leave the window out"
+        )
+    if isinstance(by, ByInterval) and not table.has_times:
+        raise UnusableData("conditions: expected no intervals, as the table has no stimulus times")
+    if table.window_ms is not None:
+        return table.window_ms, ()
+    message = (
+        f"the table does not state the window in which its spikes were counted: {window_ms[0]:g} to "
+        f"{window_ms[1]:g} ms after the stimulus is assumed, in which a closed loop would count them; give it with "
+        "--window-ms, or in the file"
+    )
+    return window_ms, (Finding("window-assumed", "warning", message),)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.records import as_json
-from animat.responses.conditions import Conditions, default_conditions
+from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
 from animat.responses.network_bursts import NetworkBursts, find_network_bursts
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
@@ -22,17 +22,17 @@ from animat.responses.windows import DEFAULT_WINDOW_MS, count_spikes
 from animat.tables import briefly
 
 Verdict = Literal["usable", "usable with care", "not usable"]
+_VERDICTS: dict[str, Verdict] = {"refuse": "not usable", "warning": "usable with care", "note": "usable"}
+"""By the severity of the gravest finding, the gravest first."""
 
 
-@dataclass(frozen=True)
-class ConditionSummary:
+class ConditionSummary(NamedTuple):
     """The responses to one condition in a few numbers.
 
     Attributes:
         n_responses: all responses, including bursts.
-        n_non_burst: responses that are not bursts, to which the other numbers belong.
-        median_rate_hz: median of x; NaN without responses.
-        share_above_median: P(x >= P50), P50 the median of all conditions together; NaN without responses.
+        n_non_burst: responses that are not bursts, to which the other numbers belong; NaN without any.
+        share_above_median: P(x >= P50), P50 the median of all conditions together.
     """
 
     label: str
@@ -42,27 +42,26 @@ class ConditionSummary:
     share_above_median: float
 
 
+_SUMMARY_KEYS = ("label", "responses", "non_burst", "median_rate_hz", "share_above_median")
+
+
 @dataclass(frozen=True, eq=False)
 class Inspection:
     """The contents and findings of one recording.
 
     Attributes:
         name: of the recording, such as its file.
-        n_spikes, n_channels, n_stimuli: in the recording; stimuli are pulses. The number of spikes is None for a table
-            of rates.
-        n_trials: a response is read after the last pulse of each trial.
-        presentation: how stimuli were presented, as text; None if it is not known.
-        start_min: start on the culture's clock.
+        n_spikes: None for a table of rates.
+        n_stimuli: pulses; a response is read after the last pulse of each trial (`n_trials`).
         duration_s: length of the recording; NaN if it is not known.
-        by: the conditions in their text form.
-        by_default: whether these are the default conditions.
+        by_default: whether the conditions are the default ones.
         mean_spikes_per_stimulus: spikes in the window, over all trials whose window lies in the recording, with or
             without a condition, including bursts; NaN without any.
         spontaneous_rate_hz: per channel, before stimuli; NaN if stimuli leave no quiet time. Without any stimulus, over
             the whole recording.
         response: when the culture responds; None if no response was found.
         responses: from which a simulator would be made.
-        findings: all findings, the gravest first.
+        findings: the gravest first.
         network_bursts: of a recording without stimuli; None for others, whose responses are separated instead.
     """
 
@@ -70,13 +69,9 @@ class Inspection:
 
     name: str
     n_spikes: int | None
-    n_channels: int
     n_stimuli: int
     n_trials: int
-    presentation: str | None
-    start_min: float
     duration_s: float
-    by: str
     by_default: bool
     mean_spikes_per_stimulus: float
     spontaneous_rate_hz: float
@@ -88,10 +83,7 @@ class Inspection:
     @property
     def verdict(self) -> Verdict:
         """Not usable if a finding refuses it, usable with care if one warns, else usable."""
-        severities = {finding.severity for finding in self.findings}
-        if "refuse" in severities:
-            return "not usable"
-        return "usable with care" if "warning" in severities else "usable"
+        return _VERDICTS[self.findings[0].severity if self.findings else "note"]
 
     @property
     def conditions(self) -> tuple[ConditionSummary, ...]:
@@ -112,22 +104,22 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data for JSON; unknown values are None."""
-        responses = self.responses
+        responses, bursts = self.responses, self.network_bursts
         data = {
             "name": self.name,
             "verdict": self.verdict,
             "spikes": self.n_spikes,
-            "channels": self.n_channels,
+            "channels": responses.n_channels,
             "stimuli": self.n_stimuli,
             "trials": self.n_trials,
-            "presentation": self.presentation,
-            "start_min": self.start_min,
+            "presentation": None if responses.presentation is None else str(responses.presentation),
+            "start_min": responses.start_min,
             "duration_s": self.duration_s,
             "window_ms": list(responses.window_ms),
             "mean_spikes_per_stimulus": self.mean_spikes_per_stimulus,
             "spontaneous_rate_hz": self.spontaneous_rate_hz,
             "response_ms": [self.response.start_ms, self.response.end_ms] if self.response else None,
-            "by": self.by,
+            "by": responses.by,
             "by_default": self.by_default,
             "responses": len(responses),
             "median_rate_hz": responses.median_rate_hz,
@@ -135,22 +127,9 @@ class Inspection:
             "burst_separability": responses.separability,
             "bursts": self.n_bursts,
             "network_bursts": None
-            if self.network_bursts is None
-            else {
-                "bursts": len(self.network_bursts),
-                "median_s": self.network_bursts.median_s,
-                "share_of_spikes": self.network_bursts.share,
-            },
-            "conditions": [
-                {
-                    "label": c.label,
-                    "responses": c.n_responses,
-                    "non_burst": c.n_non_burst,
-                    "median_rate_hz": c.median_rate_hz,
-                    "share_above_median": c.share_above_median,
-                }
-                for c in self.conditions
-            ],
+            if bursts is None
+            else {"bursts": len(bursts), "median_s": bursts.median_s, "share_of_spikes": bursts.share},
+            "conditions": [dict(zip(_SUMMARY_KEYS, summary, strict=True)) for summary in self.conditions],
             "findings": [{**finding.to_dict(), "value": finding.value} for finding in self.findings],
         }
         return as_json(data)  # type: ignore[no-any-return]
@@ -165,28 +144,19 @@ def inspect_recording(
 ) -> Inspection:
     """Inspect a recording as training would use it: its contents, and what is wrong with it.
 
-    Args:
-        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
-        window_ms: start and end of the window that responses are read in, after the pulse.
-        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
-        name: what to call it; by default the source in its provenance.
-
-    Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus.
-        UnusableData: for a recording without channels.
-        Mismatch: for a window that differs from a table's.
+    Args and errors are those of `animat.extract_responses`; `name` is what to call the recording, by default the source
+    in its provenance.
     """
-    chosen = by or default_conditions(recording.stimuli, recording.protocol)
-    responses = extract_responses(recording, chosen, window_ms, burst_threshold)
+    responses = extract_responses(recording, by, window_ms, burst_threshold)
     stimuli, read = recording.stimuli, recording.stimuli.is_last_of_presentation
     bursts = response = None
     rate_hz = duration_s = math.nan
     if isinstance(recording, ResponseTable):
         # What takes times of spikes is not known.
-        kind = "table"
-        n_spikes = int(recording.values.sum()) if recording.kind == "count" else None
+        kind, is_counted = "table", recording.kind == "count"
+        n_spikes = int(recording.values.sum()) if is_counted else None
         width_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3
-        spikes = recording.values[read].sum(axis=1) * (1.0 if recording.kind == "count" else width_s)
+        spikes = recording.values[read].sum(axis=1) * (1.0 if is_counted else width_s)
         if recording.has_times and len(stimuli):
             duration_s = float(np.ptp(stimuli.time_s))
     else:
@@ -203,13 +173,9 @@ def inspect_recording(
     return Inspection(
         name=name or recording.provenance.get("source", kind),
         n_spikes=n_spikes,
-        n_channels=len(recording.channels),
         n_stimuli=len(stimuli),
         n_trials=int(np.count_nonzero(read)),
-        presentation=None if recording.presentation is None else str(recording.presentation),
-        start_min=recording.start_min,
         duration_s=duration_s,
-        by=str(chosen),
         by_default=by is None,
         mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
         spontaneous_rate_hz=rate_hz,
@@ -225,9 +191,8 @@ def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> t
 
     Of those with the same name, the responses' say more; but on missing stimuli the recording's does.
     """
-    in_responses = [f for f in responses.findings if f.name != "no-stimuli"]
-    names = {finding.name for finding in in_responses}
-    findings = {f.name + f.message: f for f in in_responses}
-    findings |= {f.name + f.message: f for f in recording_findings(source) if f.name not in names}
-    gravity = {"refuse": 0, "warning": 1, "note": 2}
-    return tuple(sorted(findings.values(), key=lambda finding: gravity[finding.severity]))
+    found = [finding for finding in responses.findings if finding.name != "no-stimuli"]
+    names = {finding.name for finding in found}
+    found += [finding for finding in recording_findings(source) if finding.name not in names]
+    distinct = {finding.name + finding.message: finding for finding in found}.values()
+    return tuple(sorted(distinct, key=lambda finding: list(_VERDICTS).index(finding.severity)))

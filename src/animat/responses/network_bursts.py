@@ -18,12 +18,9 @@ TIMES_MEDIAN, BY_CHANCE = 8.0, 0.01
 
 @dataclass(frozen=True, eq=False)
 class NetworkBursts:
-    """The bursts of a recording, and the counts in which they were found.
+    """The bursts of a recording, on its clock, and the spikes of all channels in the bins in which they were found.
 
     Attributes:
-        start_s, end_s: of each burst on the recording's clock, shape (bursts,).
-        edges_s: of the bins, 50 ms wide, shape (bins + 1,).
-        count: spikes of all channels in each bin, shape (bins,).
         threshold: spikes in a bin above which it belongs to a burst.
         share: the share of all spikes that are in bursts; NaN without spikes.
     """

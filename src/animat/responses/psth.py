@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.errors import InvalidArgument
 from animat.recordings.recording import Recording
-from animat.responses.windows import HALF_NS_S
+from animat.responses.windows import HALF_NS_S, count_spikes
 
 # Spikes count as spontaneous from 100 ms after a stimulus (the longest direct responses known to us are over by then;
 # a longer window delays this) until 20 ms before the next (filters smear artefacts backwards), 200 ms at most.
@@ -26,14 +26,7 @@ _BINS_MS = (1.0, 2.0, 5.0, 10.0)
 
 @dataclass(frozen=True, eq=False)
 class PostStimulusHistogram:
-    """Spikes of all channels by their time from the stimulus, summed over stimuli.
-
-    Attributes:
-        edges_ms: of the bins, from the stimulus, shape (bins + 1,).
-        count: spikes in each bin, over all stimuli, shape (bins,).
-        n_stimuli: stimuli that it is summed over.
-        n_channels: channels that it is summed over.
-    """
+    """Spikes of all channels in bins of time from the stimulus, with edges at `edges_ms`, summed over stimuli."""
 
     edges_ms: Float64[np.ndarray, " edges"]
     count: Int64[np.ndarray, " bins"]
@@ -50,14 +43,13 @@ class PostStimulusHistogram:
 
 @dataclass(frozen=True)
 class ResponseTime:
-    """When the culture responds after a stimulus.
-
-    Attributes:
-        start_ms, end_ms: the first stretch of time in which it fires clearly above its spontaneous rate.
-    """
+    """The first stretch of time after a stimulus in which the culture fires clearly above its spontaneous rate."""
 
     start_ms: float
     end_ms: float
+
+    def __str__(self) -> str:
+        return f"{self.start_ms:g} to {self.end_ms:g} ms"
 
 
 def post_stimulus_histogram(
@@ -74,9 +66,6 @@ def post_stimulus_histogram(
         bin_ms: width of the bins, which are half-open, of lags rounded to a nanosecond. So bins inside a window add
             up to the spikes of that window (`animat.responses.windows.count_spikes`), except those on its edges.
         stimuli: which pulses to take, shape (stimuli,); None for the last pulses of trials.
-
-    Raises:
-        InvalidArgument: for an empty span, or bins that are not positive.
     """
     if not (math.isfinite(from_ms) and math.isfinite(to_ms) and from_ms < to_ms):
         raise InvalidArgument(f"from_ms, to_ms: expected from_ms < to_ms, got {from_ms:g} and {to_ms:g}")
@@ -95,27 +84,20 @@ def post_stimulus_histogram(
 def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float, float]:
     """Spikes per second, on all channels together, in the quiet stretches before stimuli; and their total time in s.
 
-    A stretch is quiet from 100 ms after the previous pulse, and 20 to 220 ms before the next one. At 10 Hz and above
-    there is none: such stimuli do not count, since what precedes them is the response to the previous one. Less than a
-    second of quiet is not enough: a single burst might fill it.
-
-    Args:
-        after_ms: quiet begins this long after the previous pulse if that is more than 100 ms.
-
-    Returns:
-        The rate, NaN without a second of quiet time, and the quiet time.
+    A stretch is quiet from 100 ms (or `after_ms`, if that is more) after the previous pulse, and 20 to 220 ms before
+    the next one. At 10 Hz and above there is none: such stimuli do not count, since what precedes them is the response
+    to the previous one. Less than a second of quiet gives no rate (NaN): a single burst might fill it.
     """
     times_s = recording.stimuli.time_s
     if not len(times_s):
-        return float("nan"), 0.0
+        return math.nan, 0.0
     settled_s = np.concatenate([[recording.start_s], times_s[:-1] + max(_SETTLED_MS, after_ms) * 1e-3])
     to_s = times_s - _ARTEFACT_MS * 1e-3
     from_s = np.maximum(np.maximum(settled_s, recording.start_s), to_s - _QUIET_MS * 1e-3)
     quiet = to_s > from_s
     quiet_s = float(np.sum((to_s - from_s)[quiet]))
-    spikes = np.searchsorted(recording.spike_times_s, to_s[quiet])
-    spikes -= np.searchsorted(recording.spike_times_s, from_s[quiet])
-    return (float(spikes.sum()) / quiet_s if quiet_s >= _LEAST_QUIET_S else float("nan")), quiet_s
+    n_spikes = int(count_spikes(recording, from_s[quiet], to_s[quiet]).sum())
+    return (n_spikes / quiet_s if quiet_s >= _LEAST_QUIET_S else math.nan), quiet_s
 
 
 def find_response(recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | None = None) -> ResponseTime | None:
@@ -124,10 +106,7 @@ def find_response(recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | 
     It is the first stretch, from 2 ms on, that begins with three successive bins above b + 3 sqrt(b), b the spikes
     expected spontaneously in a bin, and ends before three successive bins that are not. Bins are 1 ms wide, or up to
     10 ms if spikes are few. Only stimuli without another pulse within the search, of 500 ms, are used; if these are
-    few, the search is shortened to the upper quartile of the intervals.
-
-    Args:
-        stimuli: which pulses to take, shape (stimuli,); None for the last pulses of trials.
+    few, the search is shortened to the upper quartile of the intervals. `stimuli` is as in `post_stimulus_histogram`.
     """
     table, up_to_ms = recording.stimuli, _SEARCH_MS
     rate_hz, _ = spontaneous_rate(recording)
@@ -136,7 +115,7 @@ def find_response(recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | 
         return None
     gap_ms = 1e3 * np.append(np.diff(table.time_s), np.inf)
     gap_ms = np.minimum(gap_ms, 1e3 * (recording.stop_s - table.time_s))
-    if int(np.count_nonzero(read & (gap_ms >= up_to_ms))) < min(20, int(np.count_nonzero(read))):
+    if (read & (gap_ms >= up_to_ms)).sum() < min(20, int(read.sum())):
         up_to_ms = min(up_to_ms, float(np.quantile(gap_ms[read], 0.75)))
     chosen = read & (gap_ms >= up_to_ms)
     per_ms = rate_hz * 1e-3 * np.count_nonzero(chosen)
@@ -148,15 +127,10 @@ def find_response(recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | 
     histogram = post_stimulus_histogram(recording, _ARTEFACT_AFTER_MS, to_ms, bin_ms, chosen)
     expected = per_ms * bin_ms
     above = histogram.count > expected + 3 * math.sqrt(max(expected, 1.0))
-    begins = np.flatnonzero(_successive(above))
+    runs = np.lib.stride_tricks.sliding_window_view(above, _SUSTAINED_BINS)
+    begins = np.flatnonzero(runs.all(axis=1))
     if not len(begins):
         return None
-    ends = np.flatnonzero(_successive(~above[begins[0] :]))
-    last = begins[0] + ends[0] if len(ends) else n_bins
+    ends = begins[0] + np.flatnonzero(~runs[begins[0] :].any(axis=1))
+    last = ends[0] if len(ends) else n_bins
     return ResponseTime(float(histogram.edges_ms[begins[0]]), float(histogram.edges_ms[last]))
-
-
-def _successive(flags: Bool[np.ndarray, " bins"]) -> Bool[np.ndarray, " starts"]:
-    """Whether a flag and the two after it are set."""
-    n = max(len(flags) - _SUSTAINED_BINS + 1, 0)
-    return np.asarray(np.logical_and.reduce([flags[i : i + n] for i in range(_SUSTAINED_BINS)]), dtype=bool)

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from pydantic import Field
 
-from animat.errors import InvalidArgument, InvalidFile, Mismatch, shown, some_of
-from animat.plain_file import is_absent, read_plain_text
+from animat.errors import InvalidArgument, Mismatch, shown, some_of
 from animat.recordings.recording import Channels
 from animat.records import in_file, json_data, read_record, record
 from animat.responses.windows import Spiking, spikes_in
-from animat.stimulation.places import CUT, count_places, electrodes_of
+from animat.stimulation.places import CUT, count_places, electrodes_of, read_groups
 from animat.stimulation.selection import Electrode
 from animat.tables import UNKNOWN
 
 CUT_NAMES = {"halves": ("left", "right"), "quadrants": ("left top", "left bottom", "right top", "right bottom")}
 """Names of the groups that `CUT` makes; left is the smaller x, top the smaller y."""
-_MOST_BYTES = 2**20
+NAMED = ("all", *CUT)
 MOST_READOUTS = 64
 DEFAULT_READOUTS = {1: "all", 2: "halves", 4: "quadrants"}
 """By the number of commands that a robot takes."""
@@ -38,9 +36,6 @@ class Readouts:
         names: of the groups, in the order of the commands.
         electrodes: of each group, rising; None: one group of all channels, whatever they read. An electrode may be in
             several groups.
-
-    Raises:
-        InvalidArgument: for invalid names or electrodes, or names without electrodes.
     """
 
     names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_READOUTS)] = ("all",)
@@ -70,11 +65,7 @@ class Readouts:
         return self.electrodes is None
 
     def members(self, channels: Channels) -> Bool[np.ndarray, "readouts channels"]:
-        """Which channels belong to each group.
-
-        Raises:
-            Mismatch: for channels that do not read all of the electrodes.
-        """
+        """Which channels belong to each group; raises Mismatch for channels that do not read all of the electrodes."""
         if self.electrodes is None:
             return np.ones((1, len(channels)), np.bool_)
         read = set(channels.electrode.tolist()) - {UNKNOWN}
@@ -100,15 +91,8 @@ class Readouts:
 
             x = S / (T N),  S: spikes of the group's N channels in a window of T
 
-        Edges are as in `animat.responses.windows.count_spikes`.
-
-        Args:
-            members: which of its channels belong to each group (`members`).
-            after_s: times of the pulses, in seconds on the clock of the spikes.
-            window_ms: start and end of the window after each.
-
-        Returns:
-            A row per window; with a single readout, without the axis of readouts.
+        Arguments and edges are as in `animat.responses.windows.read_windows`; `members` is from `self.members`. A row
+        per window; with a single readout, without the axis of readouts.
         """
         window, spike = spikes_in(recording, after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3)
         channel = recording.spike_channels[spike]
@@ -137,16 +121,16 @@ ALL = Readouts()
 
 
 def readouts_named(text: str) -> str | Readouts:
-    """Read the name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`.
+    """The name of readouts (`all`, `halves`, `quadrants`), or groups of electrodes as JSON: `{"left": [1, 2]}`.
 
     Raises:
         InvalidArgument: for anything else.
     """
-    if text == "all" or text in CUT:
+    if text in NAMED:
         return ALL if text == "all" else text
     if not text.lstrip().startswith("{"):
         raise InvalidArgument(
-            f"readouts: expected all, {', '.join(CUT)}, or groups of electrodes as JSON, "
+            f"readouts: expected {', '.join(NAMED)}, or groups of electrodes as JSON, "
             f'{{"left": [1, 2], "right": [3, 4]}}, got {shown(text)}'
         )
     groups = read_record(dict[str, Group], json_data(text, "readouts"), "readouts")
@@ -155,23 +139,14 @@ def readouts_named(text: str) -> str | Readouts:
 
 def read_readouts(text: str | os.PathLike[str]) -> str | Readouts:
     """The same, or the name of a file with such JSON; raises InvalidFile if it cannot be read."""
-    if text == "all" or text in CUT or str(text).lstrip().startswith("{"):
+    if text in NAMED or str(text).lstrip().startswith("{"):
         return readouts_named(str(text))
-    if is_absent(Path(text)):
-        raise InvalidFile(
-            f"readouts: expected all, {', '.join(CUT)} or a file of groups of electrodes, got {text}, which is not a "
-            "file"
-        )
-    try:
-        written = read_plain_text(text, _MOST_BYTES)
-    except InvalidFile as error:
-        raise InvalidFile(f"{error}; named readouts are all, {' and '.join(CUT)}") from error
+    written = read_groups("readouts", NAMED, text)
     with in_file(text):
         return readouts_named(written)
 
 
 def count_readouts(readouts: str | Readouts) -> int:
-    """The number of readouts."""
     return count_places(readouts) if isinstance(readouts, str) else len(readouts)
 
 
@@ -179,22 +154,15 @@ def readouts_on(readouts: str | Readouts, channels: Channels) -> Readouts:
     """Readouts defined by the electrodes of a recording's channels.
 
     Halves are the electrodes with the smaller and the larger x, split as evenly as possible; for quadrants each half is
-    split by y, as for places (`animat.stimulation.places`).
-
-    Args:
-        readouts: `all`, `halves`, `quadrants`, or given groups.
-        channels: of a recording.
-
-    Raises:
-        InvalidArgument: for too few channels, or channels whose electrodes or positions are not known.
-        Mismatch: for channels that do not read all electrodes of the groups.
+    split by y, as for places (`animat.stimulation.places`). For given groups, channels that do not read all of their
+    electrodes raise Mismatch.
     """
     if readouts == "all":
         return ALL
     if isinstance(readouts, str):
         if readouts not in CUT:
             raise InvalidArgument(
-                f"readouts: expected all, {', '.join(CUT)} or groups of electrodes, got {shown(readouts)}"
+                f"readouts: expected {', '.join(NAMED)} or groups of electrodes, got {shown(readouts)}"
             )
         electrodes, first = np.unique(channels.electrode, return_index=True)
         if UNKNOWN in electrodes or len(electrodes) < count_places(readouts):

@@ -23,11 +23,10 @@ class Trials:
     """All trials of a recording in the order of time, which form the history of each response.
 
     Attributes:
-        condition: index of each, `NO_CONDITION` if it has none, shape (presentations,).
-        rate_hz: x of each, shape (presentations,).
-        is_burst: whether the response was a burst, shape (presentations,).
-        is_rested: whether there was no pulse in the second before it, shape (presentations,).
-        time_s: of the pulse after which it was read, shape (presentations,); None if it is not known.
+        condition: index of each, `NO_CONDITION` if it has none.
+        rate_hz: x of each.
+        is_rested: whether there was no pulse in the second before it.
+        time_s: of the pulse after which it was read; None if it is not known.
     """
 
     __repr__ = briefly
@@ -39,11 +38,9 @@ class Trials:
     time_s: Float64[np.ndarray, " presentations"] | None = None
 
     def __post_init__(self) -> None:
-        known = () if self.time_s is None else ("time_s",)
-        for name in ("condition", "rate_hz", "is_burst", "is_rested", *known):
-            array = read_only(self, name)
-            if array.shape != (len(self.condition),):
-                raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {array.shape}")
+        for name, column in vars(self).items():
+            if column is not None and (shape := read_only(self, name).shape) != (len(self.condition),):
+                raise Mismatch(f"presented.{name}: expected {len(self.condition)} values, got {shape}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +55,7 @@ class Responses:
         conditions: from which the agent chooses, in the order of their index.
         window_ms: start and end of the window, after the last pulse of each trial.
         n_channels: the number of channels over which x is a mean.
-        threshold: of the active ratio, by Otsu's method unless given; 1 if that separates nothing, NaN without
-            responses.
-        separability: between-class over total variance of the active ratio, for Otsu's classes or those of a given
-            threshold; NaN if that leaves only one (see `animat.responses.bursts`).
+        threshold, separability: of the active ratio, see `animat.responses.bursts.BurstSeparation`.
         presentation: how stimuli were presented; None if it is not known.
         start_min: start of the recording on the culture's clock, in minutes.
         time_s: of the pulse after which each response was read, on the recording's clock, shape (responses,); None if
@@ -102,37 +96,29 @@ class Responses:
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None
 
     def __post_init__(self) -> None:
+        shape = (len(self),)
         columns = {"condition": np.int64, "rate_hz": np.float64, "active_ratio": np.float64, "is_burst": np.bool_}
-        optional = {"time_s": np.float64, "place": np.int64}
-        for name, dtype in (columns | optional).items():
-            if name in optional and getattr(self, name) is None:
-                continue
-            array = read_only(self, name, dtype)
-            if array.shape != (len(self),):
-                raise Mismatch(f"responses.{name}: expected {len(self)} values, one per response, got {array.shape}")
-        self._check_places()
+        for name, dtype in (columns | {"time_s": np.float64, "place": np.int64}).items():
+            if getattr(self, name) is not None and (got := read_only(self, name, dtype).shape) != shape:
+                raise Mismatch(f"responses.{name}: expected {len(self)} values, one per response, got {got}")
         if (self.readout_hz is None) != self.readouts.are_all:
             raise Mismatch("responses.readout_hz: expected if, and only if, readouts are groups of channels")
         if self.readout_hz is not None:
-            array = read_only(self, "readout_hz", np.float64)
-            if array.shape != (shape := (len(self),) if len(self.readouts) == 1 else (len(self), len(self.readouts))):
-                raise Mismatch(f"responses.readout_hz: expected shape {shape}, got {array.shape}")
-        if len(self) and not (self.condition.min() >= 0 and self.condition.max() < len(self.conditions)):
-            raise Mismatch(
-                f"responses.condition: expected indices of {len(self.conditions)} conditions, "
-                f"got {self.condition.min()} to {self.condition.max()}"
-            )
+            expected = shape if len(self.readouts) == 1 else (len(self), len(self.readouts))
+            if (got := read_only(self, "readout_hz", np.float64).shape) != expected:
+                raise Mismatch(f"responses.readout_hz: expected shape {expected}, got {got}")
+        if (self.presented is None) != (self.place is None):
+            raise Mismatch("responses.presented, responses.place: expected both or neither, got one")
+        if self.presented is not None:
+            n = len(self.presented.condition)
+            self._expect_within("place", n, f"rows from 0 to {n - 1}")
+        n = len(self.conditions)
+        self._expect_within("condition", n, f"indices of {n} conditions")
 
-    def _check_places(self) -> None:
-        if self.presented is None or self.place is None:
-            if (self.presented is None) != (self.place is None):
-                raise Mismatch("responses.presented, responses.place: expected both or neither, got one")
-            return
-        n = len(self.presented.condition)
-        if len(self) and not (self.place.min() >= 0 and self.place.max() < n):
-            raise Mismatch(
-                f"responses.place: expected rows from 0 to {n - 1}, got {self.place.min()} to {self.place.max()}"
-            )
+    def _expect_within(self, name: str, n: int, words: str) -> None:
+        index = getattr(self, name)
+        if len(index) and not (index.min() >= 0 and index.max() < n):
+            raise Mismatch(f"responses.{name}: expected {words}, got {index.min()} to {index.max()}")
 
     def __len__(self) -> int:
         return len(self.condition)
@@ -213,15 +199,13 @@ class Responses:
     def at_rows(self, rows: Int64[np.ndarray, " rows"]) -> Responses:
         """Some of the responses; their history is kept."""
         presented, place = self.presentations
-        columns: dict[str, Any] = {
-            name: getattr(self, name)[rows] for name in ("condition", "rate_hz", "active_ratio", "is_burst")
-        }
-        for name in ("time_s", "readout_hz"):
-            columns[name] = None if getattr(self, name) is None else getattr(self, name)[rows]
+        names = ("condition", "rate_hz", "active_ratio", "is_burst", "time_s", "readout_hz")
+        known = {name: column for name in names if (column := getattr(self, name)) is not None}
+        columns: dict[str, Any] = {name: column[rows] for name, column in known.items()}
         return replace(self, **columns, presented=presented, place=place[rows])
 
     def shares_above_median(self) -> Float64[np.ndarray, " conditions"]:
         """P(x >= P50) of every condition's non-burst responses; NaN for a condition without any."""
         median_hz = self.median_rate_hz
-        rates_hz = (self.rates_of(i) for i in range(len(self.conditions)))
-        return np.array([np.mean(x >= median_hz) if len(x) else np.nan for x in rates_hz], dtype=np.float64)
+        rates_hz = map(self.rates_of, range(len(self.conditions)))
+        return np.array([np.mean(x >= median_hz) if len(x) else np.nan for x in rates_hz], np.float64)

@@ -54,8 +54,7 @@ def extract_series(
     Raises:
         UnusableData: if a finding refuses a recording, or simulated recordings have different seeds, unless `allow`
             names it.
-        InvalidArgument: for a name in `allow` that is not a refusing finding, or readouts that the channels do not
-            have.
+        InvalidArgument: for a name in `allow` that is not a refusing finding, or channels that do not form readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings returns"

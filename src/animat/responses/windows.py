@@ -20,13 +20,7 @@ errors would decide about lags on an edge, which are common with times on a samp
 
 
 class Spiking(Protocol):
-    """Spikes on channels, in the order of time: a `Recording`, or the piece of one that a closed loop has just seen.
-
-    Attributes:
-        spike_times_s: rising.
-        spike_channels: of each spike.
-        channels: the channel table.
-    """
+    """Spikes on channels, in the order of time: a `Recording`, or the piece of one that a closed loop has just seen."""
 
     @property
     def spike_times_s(self) -> Float64[np.ndarray, " spikes"]: ...
@@ -44,12 +38,7 @@ def read_windows(
         x = S / (T N)
 
     This function defines a response, both offline and in a closed loop. For the same times the result is the same to
-    the bit, from a piece of a recording as from the whole.
-
-    Args:
-        recording: the spikes, on at least one channel.
-        after_s: times of the pulses, in seconds on the clock of the spikes.
-        window_ms: start and end of the window after each.
+    the bit, from a piece of a recording as from the whole. Times of the pulses are on the clock of the spikes.
     """
     from_s, to_s = after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3
     n_channels = len(recording.channels)
@@ -64,17 +53,13 @@ def read_windows(
 
 
 def check_window(window_ms: tuple[float, float]) -> None:
-    """Refuse a window that is not a stretch of time after the stimulus.
-
-    Raises:
-        InvalidArgument: unless 0 <= start < end, both finite.
-    """
+    """Raise InvalidArgument for a window that is not a stretch of time after the stimulus: 0 <= start < end."""
     words = "two numbers of milliseconds, start and end"
     several = expect_several("window_ms", window_ms, Real, words)
     if len(several) != 2:
         raise InvalidArgument(f"window_ms: expected {words}, got {shown(window_ms)}")
     start_ms, end_ms = several
-    if not (math.isfinite(start_ms) and math.isfinite(end_ms) and 0 <= start_ms < end_ms):
+    if not 0 <= start_ms < end_ms < math.inf:
         raise InvalidArgument(
             f"window_ms: expected 0 <= start < end in milliseconds after the stimulus, got {start_ms:g} to {end_ms:g}"
         )
@@ -88,9 +73,6 @@ def count_spikes(
     Windows are half-open, so that adjacent windows share no spike. Times are compared in double precision. Those on a
     sampling grid can lie exactly on an edge; there the rounding of the sum of stimulus time and window edge decides,
     one sample (0.05 ms at 20 kHz) either way.
-
-    Args:
-        from_s, to_s: the windows, in seconds on the recording's clock, shape (windows,).
     """
     return _first_and_count(recording, from_s, to_s)[1]
 

@@ -21,14 +21,9 @@ class ElectrodeArray:
     """A grid of electrodes numbered row by row: electrode = row x columns + column, from 0.
 
     Attributes:
-        name: its display name.
-        columns, rows: of the grid.
         pitch_um: distance between neighbours, in both directions.
         channels: electrodes that can be recorded at once.
         stimulation_units: electrodes that can be stimulated at once.
-
-    Raises:
-        InvalidArgument: for counts that are not whole numbers above 0, or a pitch that is not a number above 0.
     """
 
     name: str
@@ -44,11 +39,7 @@ class ElectrodeArray:
     def position_um(
         self, electrode: Int64[np.ndarray, " electrodes"] | int
     ) -> tuple[Float64[np.ndarray, " electrodes"], Float64[np.ndarray, " electrodes"]]:
-        """x and y of electrodes, in micrometres from electrode 0.
-
-        Raises:
-            InvalidArgument: for a number that is not on the array.
-        """
+        """x and y of electrodes, in micrometres from electrode 0; InvalidArgument for a number not on the array."""
         electrode = np.atleast_1d(np.asarray(electrode, dtype=np.int64))
         outside = (electrode < 0) | (electrode >= len(self))
         if np.any(outside):
@@ -60,25 +51,13 @@ class ElectrodeArray:
     def distance_um(
         self, electrodes: Int64[np.ndarray, " electrodes"] | int, others: Int64[np.ndarray, " others"] | int
     ) -> Float64[np.ndarray, "electrodes others"]:
-        """The distance from each of `electrodes` to each of `others`."""
         x_um, y_um = self.position_um(electrodes)
         other_x_um, other_y_um = self.position_um(others)
-        return np.asarray(np.hypot(x_um[:, None] - other_x_um[None, :], y_um[:, None] - other_y_um[None, :]))
+        return np.asarray(np.hypot(x_um[:, None] - other_x_um, y_um[:, None] - other_y_um))
 
-    def scan_blocks(self, size: int | None = None) -> list[Int64[np.ndarray, " electrodes"]]:
-        """All electrodes, in order, in as few blocks as possible, each of which can be recorded at once.
-
-        Args:
-            size: most electrodes in a block; by default as many as can be recorded at once.
-
-        Raises:
-            InvalidArgument: for a block that is empty or larger than what can be recorded at once.
-        """
-        size = self.channels if size is None else size
-        if not 1 <= size <= self.channels:
-            raise InvalidArgument(f"size: expected 1 to {self.channels} electrodes per block, got {size}")
-        blocks = -(-len(self) // size)
-        return [np.asarray(block) for block in np.array_split(np.arange(len(self), dtype=np.int64), blocks)]
+    def scan_blocks(self) -> list[Int64[np.ndarray, " electrodes"]]:
+        """All electrodes, in order, in as few blocks as possible, each of which can be recorded at once."""
+        return np.array_split(np.arange(len(self), dtype=np.int64), -(-len(self) // self.channels))
 
 
 MAXONE = ElectrodeArray("MaxOne", columns=220, rows=120, pitch_um=17.5, channels=1024, stimulation_units=32)

@@ -27,15 +27,11 @@ def draw_patterns(
     Every set that keeps the distance is equally likely.
 
     Args:
-        array: where the electrodes are.
         electrodes: to choose from.
         seed: of the draw; 0 or more.
         patterns: how many, no two of them the same set.
-        size: electrodes in each.
+        size: electrodes in each, in ascending order.
         spacing_um: the distance that every pair must exceed.
-
-    Returns:
-        Electrodes of each pattern, in ascending order.
 
     Raises:
         InvalidArgument: if too few were found, with how many and what to relax; for a seed below 0.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,11 +31,7 @@ Places = str | tuple[tuple[int, ...] | Literal["none"], ...]
 
 
 def check_places(given: Any) -> Places:
-    """Check places and return them with lists as tuples.
-
-    Raises:
-        InvalidArgument: for an unknown name, or anything but a list of distinct groups of electrodes.
-    """
+    """Places with lists as tuples; raises InvalidArgument for anything but a name or a list of distinct groups."""
     if isinstance(given, str) and given in NAMED:
         return given
     groups = [place for place in given if place != NONE] if isinstance(given, list | tuple) else None
@@ -51,21 +48,10 @@ def check_places(given: Any) -> Places:
 
 
 def read_places(text: str | os.PathLike[str]) -> Places:
-    """One of `NAMED`, or the places in a JSON file: a list of lists of electrodes.
-
-    Raises:
-        InvalidFile: naming the file, what was expected and what came.
-    """
+    """One of `NAMED`, or the places in a JSON file, a list of lists of electrodes; raises InvalidFile for another."""
     if text in NAMED:
         return str(text)
-    if is_absent(Path(text)):
-        raise InvalidFile(
-            f"places: expected {', '.join(NAMED)} or a file of groups of electrodes, got {text}, which is not a file"
-        )
-    try:
-        written = read_plain_text(text, _MOST_BYTES)
-    except InvalidFile as error:
-        raise InvalidFile(f"{error}; named places are {', '.join(NAMED)}") from error
+    written = read_groups("places", NAMED, text)
     with in_file(text):
         places = check_places(json_data(written, "places", "JSON such as [[1, 2], [3, 4]]"))
         if not places:
@@ -73,8 +59,19 @@ def read_places(text: str | os.PathLike[str]) -> Places:
         return places
 
 
+def read_groups(what: str, names: Sequence[str], path: str | os.PathLike[str]) -> str:
+    """The text of a file of groups of electrodes, given in place of one of the `names`; else raises InvalidFile."""
+    if is_absent(Path(path)):
+        raise InvalidFile(
+            f"{what}: expected {', '.join(names)} or a file of groups of electrodes, got {path}, which is not a file"
+        )
+    try:
+        return read_plain_text(path, _MOST_BYTES)
+    except InvalidFile as error:
+        raise InvalidFile(f"{error}; named {what} are {', '.join(names)}") from error
+
+
 def count_places(places: Places) -> int:
-    """How many places there are."""
     return (int(np.prod(CUT[places])) if places in CUT else 4) if isinstance(places, str) else len(places)
 
 
@@ -84,25 +81,17 @@ def electrodes_of(
     x_um: Float64[np.ndarray, " electrodes"],
     y_um: Float64[np.ndarray, " electrodes"],
 ) -> tuple[tuple[int, ...], ...]:
-    """The electrodes of each place on an array; for `NONE`, no electrodes.
+    """The electrodes of each place, of those that can be stimulated; for `NONE`, no electrodes.
 
     Halves have the smaller and the larger x; quadrants divide each half by y. Electrodes at the same x (or y) are
     ordered by number. Corners drive two commands, read from the halves, into all four corners: `SITES` electrodes
     spread over the left half, as many over the right half, both together, and one electrode of the left.
-
-    Args:
-        electrodes: those that can be stimulated.
-
-    Raises:
-        InvalidArgument: for named places if there are too few electrodes, or positions are not known.
     """
     if not isinstance(places, str):
         return tuple(() if place == NONE else place for place in places)
-    known = np.isfinite(x_um) & np.isfinite(y_um)
-    if not np.all(known) or len(electrodes) < count_places(places):
-        missing = (
-            f"{np.count_nonzero(~known)} of them unknown" if not np.all(known) else f"{len(electrodes)} electrodes"
-        )
+    unknown = np.count_nonzero(~np.isfinite(x_um + y_um))
+    if unknown or len(electrodes) < count_places(places):
+        missing = f"{unknown} of them unknown" if unknown else f"{len(electrodes)} electrodes"
         raise InvalidArgument(
             f"places: expected positions of {count_places(places)} stimulation electrodes or more to cut into "
             f"{places}, got {missing}: list the electrodes of each place"

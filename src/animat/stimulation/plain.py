@@ -9,15 +9,8 @@ from animat.errors import InvalidArgument
 
 
 def number(name: str, value: Any) -> float:
-    """A number of any type as a float, including NaN and infinity.
-
-    Raises:
-        InvalidArgument: naming the argument, for anything else, including True and False.
-    """
-    if type(value) is float:
-        return value
-    if getattr(value, "ndim", None) == 0:
-        value = value.item()
+    """A number of any type as a float, including NaN and infinity; InvalidArgument for anything else, such as True."""
+    value = value.item() if getattr(value, "ndim", None) == 0 else value
     if type(value) is bool or not isinstance(value, Real):
         raise InvalidArgument(f"{name}: expected a number, got {_kind(value)}")
     try:
@@ -27,18 +20,10 @@ def number(name: str, value: Any) -> float:
 
 
 def whole_number(name: str, value: Any) -> int:
-    """A whole number of any type as an int.
-
-    Raises:
-        InvalidArgument: naming the argument, for anything else, including True and False.
-    """
-    if type(value) is int:
-        return value
-    if getattr(value, "ndim", None) == 0:
-        value = value.item()
-    if type(value) is not bool and isinstance(value, Integral):
-        return int(value)
-    if isinstance(value, float) and value.is_integer():
+    """A whole number of any type as an int; InvalidArgument for anything else, including True and False."""
+    value = value.item() if getattr(value, "ndim", None) == 0 else value
+    is_whole = isinstance(value, Integral) or (isinstance(value, float) and value.is_integer())
+    if type(value) is not bool and is_whole:
         return int(value)
     raise InvalidArgument(f"{name}: expected a whole number, got {value if isinstance(value, Real) else _kind(value)}")
 
@@ -46,8 +31,7 @@ def whole_number(name: str, value: Any) -> int:
 def seconds(name: str, value: Any) -> float:
     """A time in seconds as a float, from a float64 or a whole number; including NaN and infinity.
 
-    Raises:
-        InvalidArgument: naming the argument, for less precise types: float32 is 1 ms off after 10,000 s.
+    Raises InvalidArgument for less precise types: float32 is 1 ms off after 10,000 s.
     """
     if type(value) is float:
         return value

@@ -18,7 +18,6 @@ from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 Order = Literal["blocked", "mixed"]
 
 _MOST_PULSES = 10_000_000
-_LONGEST_S = 86_400
 _LONGEST_RECORDING_S = 7 * 86_400
 _MOST_BYTES = 2**20
 _FORMER = {"presentations": "trials"}
@@ -26,7 +25,7 @@ _FORMER = {"presentations": "trials"}
 
 Count = Annotated[Whole, Field(ge=1, le=1_000_000)]
 Pulses = Annotated[Whole, Field(ge=1, le=_MOST_PULSES)]
-Seconds = Annotated[Number, Field(ge=0, le=_LONGEST_S)]
+Seconds = Annotated[Number, Field(ge=0, le=86_400)]
 Frequency = Annotated[Number, Field(gt=0, le=10_000)]
 
 
@@ -41,9 +40,6 @@ class Presentation:
         order: `"blocked"`, all stimuli of a frequency together (the paper), or `"mixed"`, a frequency drawn at random
             for each trial (as a closed loop presents them).
         pulses: pulses 1/f apart in one trial; the response is read after the last one (the paper: 1).
-
-    Raises:
-        InvalidArgument: for an unknown order, or fewer than one pulse.
     """
 
     order: Order
@@ -105,7 +101,6 @@ class Protocol:
                 f"pulses: expected at most {_MOST_PULSES:,} in a recording (frequencies x places x trials x "
                 f"pulses), got {pulses:,}"
             )
-
         stimulated_s = sum(of_each / f for f in self.frequencies_hz)
         if stimulated_s > _LONGEST_RECORDING_S:
             raise InvalidArgument(
@@ -138,19 +133,12 @@ class Protocol:
 
     @staticmethod
     def from_json(text: str, defaults: Protocol | None = None) -> Protocol:
-        """From the output of `to_json`.
+        """From the output of `to_json`; raises InvalidArgument for anything else, naming the key.
 
-        Args:
-            text: a JSON object whose keys are the attributes.
-            defaults: values for keys that are left out; None: the defaults above, except that the pulse is required.
-
-        Raises:
-            InvalidArgument: for anything else, naming the key, what was expected and what came.
+        `defaults` are for keys that are left out; None: the defaults above, except that the pulse is required.
         """
         data = json_data(text, "protocol")
-        if not isinstance(data, dict):
-            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, got {text[:80]!r}")
-        if defaults is None and "pulse" not in data:
+        if not isinstance(data, dict) or (defaults is None and "pulse" not in data):
             raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
         if "trials" not in data:
             data = {_FORMER.get(name, name): value for name, value in data.items()}
@@ -158,10 +146,7 @@ class Protocol:
 
 
 def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
-    """Read a protocol from a JSON file, as `Protocol.to_json` writes it.
-
-    Args:
-        defaults: values for keys that are left out; None: the defaults of `Protocol`.
+    """Read a protocol from a JSON file, as `Protocol.to_json` writes it; keys left out take the `defaults`.
 
     Raises:
         InvalidFile: naming the file, the key, what was expected and what came.

@@ -16,14 +16,7 @@ Kind = Literal["voltage", "current"]
 
 @record
 class Phase:
-    """A phase of constant voltage or current: exactly one of the two amplitudes is given.
-
-    Numbers of any type are copied as floats.
-
-    Attributes:
-        duration_us: above 0.
-        amplitude_mv: of a voltage phase; negative is cathodic.
-        amplitude_ua: of a current phase; negative is cathodic.
+    """A phase of constant voltage or current: exactly one of the two amplitudes is given; negative is cathodic.
 
     Raises:
         InvalidArgument: for both amplitudes or neither, a number that is not finite, or no duration.
@@ -100,11 +93,7 @@ class Pulse:
 
     @staticmethod
     def from_list(phases: Pulse | Sequence[Mapping[str, Any]]) -> Pulse:
-        """From the output of `to_list`; a pulse is returned as it is.
-
-        Raises:
-            InvalidArgument: for anything else.
-        """
+        """From the output of `to_list`, or a pulse as it is; raises InvalidArgument for anything else."""
         return phases if isinstance(phases, Pulse) else Pulse(phases)  # type: ignore[arg-type]
 
     def __str__(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -32,7 +32,8 @@ class ScannedActivity:
     recovery_ms: Float64[np.ndarray, " electrodes"]
 
     def __post_init__(self) -> None:
-        freeze(self, "the scan", electrode=np.int64, **dict.fromkeys(_MEASURED, np.float64))
+        measured = (field.name for field in fields(self) if field.name != "electrode")
+        freeze(self, "the scan", electrode=np.int64, **dict.fromkeys(measured, np.float64))
         if len(np.unique(self.electrode)) != len(self.electrode):
             raise UnusableData("scan.electrode: expected each electrode once, got some twice or more")
 
@@ -62,8 +63,5 @@ class ScannedActivity:
     @staticmethod
     def from_blocks(blocks: list[ScannedActivity]) -> ScannedActivity:
         """The blocks of a scan as one table."""
-        names = ("electrode", *_MEASURED)
-        return ScannedActivity(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})
-
-
-_MEASURED = ("rate_hz", "amplitude_uv", "noise_uv", "trough_to_peak_ms", "recovery_ms")
+        columns = zip(*(vars(block).values() for block in blocks), strict=True)
+        return ScannedActivity(*map(np.concatenate, columns))

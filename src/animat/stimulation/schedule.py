@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -22,12 +22,9 @@ _GAP_S = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Continuous stimulation without a break.
+    """Continuous stimulation without a break: set-up, which is not recorded, then `duration_s`, which is.
 
-    Attributes:
-        setup_s: unrecorded time before it.
-        duration_s: recorded time.
-        stimuli: with times from the block's recorded start, and trials numbered through all blocks.
+    Times of its stimuli are from the recorded start, and trials are numbered through all blocks.
     """
 
     setup_s: float
@@ -35,34 +32,24 @@ class Block:
     stimuli: Stimuli
 
     def stretches(self, least_s: float) -> tuple[Block, ...]:
-        """The block cut between trials into consecutive stretches without set-up.
-
-        Args:
-            least_s: shortest stretch except for the last; each is cut in the next gap between pulses.
-        """
+        """The block cut between trials into consecutive stretches without set-up, of `least_s` or more but the last."""
         time_s, presentation = self.stimuli.time_s, self.stimuli.presentation
         begins = 1 + np.flatnonzero((np.diff(presentation) != 0) & (np.diff(time_s) >= _GAP_S))
-        rows, ends_s = [0], [0.0]
+        cuts = [(0, 0.0)]
         for row, end_s in zip(begins.tolist(), on_ticks((time_s[begins - 1] + time_s[begins]) / 2), strict=True):
-            if end_s - ends_s[-1] >= least_s:
-                rows.append(row)
-                ends_s.append(float(end_s))
-        rows, ends_s = [*rows, len(time_s)], [*ends_s, self.duration_s]
-        return tuple(
-            Block(0.0, end_s - start_s, _between(self.stimuli, first, last, start_s))
-            for (first, last), (start_s, end_s) in zip(pairwise(rows), pairwise(ends_s), strict=True)
-        )
+            if end_s - cuts[-1][1] >= least_s:
+                cuts.append((row, float(end_s)))
+        blocks = []
+        for (first, start_s), (last, end_s) in pairwise([*cuts, (len(time_s), self.duration_s)]):
+            columns = {name: column[first:last] for name, column in vars(self.stimuli).items()}
+            stimuli = Stimuli(**columns | {"time_s": on_ticks(columns["time_s"] - start_s)})
+            blocks.append(Block(0.0, end_s - start_s, stimuli))
+        return tuple(blocks)
 
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """All stimuli of one recording, block by block.
-
-    Attributes:
-        protocol: the protocol it follows.
-        seed: of every draw.
-        blocks: in order of time.
-    """
+    """All stimuli of one recording, block by block: the protocol, and the seed of every draw."""
 
     protocol: Protocol
     seed: int
@@ -91,12 +78,6 @@ class Schedule:
         ]
 
 
-def _between(stimuli: Stimuli, first: int, last: int, start_s: float) -> Stimuli:
-    """Rows of a table, with times relative to `start_s`."""
-    columns = {field.name: getattr(stimuli, field.name)[first:last] for field in fields(Stimuli)}
-    return Stimuli(**columns | {"time_s": on_ticks(columns["time_s"] - start_s)})
-
-
 def make_schedule(
     protocol: Protocol,
     patterns: Int64[np.ndarray, "patterns size"],
@@ -104,17 +85,12 @@ def make_schedule(
     *,
     places: Sequence[tuple[int, ...]] = (),
 ) -> Schedule:
-    """Draw the order of conditions and patterns of one recording.
+    """Draw the order of conditions and patterns of one recording, from a seed of zero or more.
 
     Args:
-        protocol: what to do.
-        patterns: the electrodes of each of the culture's patterns, padded with -1.
-        seed: zero or more.
+        patterns: the electrodes of each of the culture's patterns, at least as many as the protocol uses; padded
+            with -1.
         places: the electrodes of each of the protocol's places, if it has any; empty for `"none"`.
-
-    Raises:
-        InvalidArgument: if the culture has fewer patterns than the protocol uses, if the number of places is not the
-            protocol's, or for a negative seed.
     """
     if len(places) != protocol.n_places:
         raise InvalidArgument(f"places: expected electrodes of {protocol.n_places}, got those of {len(places)}")
@@ -152,8 +128,14 @@ def make_schedule(
             row = np.repeat(place, protocol.pulses)
         else:
             row = np.concatenate([_train(rng, protocol, next(left[f])) for f in frequency.tolist()])
-        frequency_hz = np.array(protocol.frequencies_hz)[frequency]
-        blocks.append(_block(protocol, frequency_hz, electrodes[row], number[row], i * len(order)))
+        frequency_hz = np.repeat(np.array(protocol.frequencies_hz)[frequency], protocol.pulses)
+        since_s = 1 / frequency_hz
+        since_s[0] = protocol.pause_s
+        time_s = on_ticks(np.cumsum(since_s))
+        end_s = float(on_ticks(time_s[-1:] + protocol.tail_s)[0])
+        trial = np.repeat(i * len(order) + np.arange(len(order)), protocol.pulses)
+        stimuli = Stimuli(time_s, frequency_hz, number[row], electrodes[row], trial)
+        blocks.append(Block(protocol.setup_s, end_s, stimuli))
     return Schedule(protocol, seed, tuple(blocks))
 
 
@@ -163,31 +145,12 @@ def on_ticks(time_s: Float64[np.ndarray, " times"]) -> Float64[np.ndarray, " tim
     return np.asarray(np.rint(time_s / TICK_S) / round(1 / TICK_S))
 
 
-def _block(
-    protocol: Protocol,
-    frequency_hz: Float64[np.ndarray, " trials"],
-    electrodes: Int64[np.ndarray, "pulses size"],
-    pattern: Int64[np.ndarray, " pulses"],
-    first: int,
-) -> Block:
-    """A block of trials, numbered from `first`."""
-    presentation = np.repeat(first + np.arange(len(frequency_hz)), protocol.pulses)
-    frequency_hz = np.repeat(frequency_hz, protocol.pulses)
-    since_s = 1 / frequency_hz
-    since_s[0] = protocol.pause_s
-    time_s = on_ticks(np.cumsum(since_s))
-    end_s = on_ticks(time_s[-1:] + protocol.tail_s)[0]
-    stimuli = Stimuli(time_s, frequency_hz, pattern, electrodes, presentation)
-    return Block(protocol.setup_s, float(end_s), stimuli)
-
-
 def _train(rng: np.random.Generator, protocol: Protocol, last: int) -> Int64[np.ndarray, " pulses"]:
     """The patterns of a trial's pulses, different ones as far as possible, ending with `last`."""
-    before = protocol.pulses - 1
     if protocol.patterns == 1:
         return np.full(protocol.pulses, last)
     others = np.delete(np.arange(protocol.patterns), last)
     drawn: list[int] = []
-    while len(drawn) < before:
-        drawn.extend(rng.permutation(others)[: before - len(drawn)].tolist())
-    return np.array([*drawn, last], dtype=np.int64)
+    while len(drawn) < protocol.pulses - 1:
+        drawn.extend(rng.permutation(others).tolist())
+    return np.array([*drawn[: protocol.pulses - 1], last], dtype=np.int64)

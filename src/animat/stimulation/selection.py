@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from dataclasses import dataclass, field
@@ -69,7 +70,6 @@ class Selection:
     """Recording sites, stimulation sites and patterns on an array, to save, plot and pass to hardware.
 
     Attributes:
-        array: to which the electrode numbers refer.
         recording: electrodes that are recorded, channel by channel, shape (channels,).
         stimulation: electrodes that stimulate, shape (sites,).
         patterns: electrodes pulsed together, all of them stimulation sites, shape (patterns, size).
@@ -92,14 +92,11 @@ class Selection:
 
     def __post_init__(self) -> None:
         for name, dimensions in (("recording", 1), ("stimulation", 1), ("patterns", 2)):
-            values = read_only(self, name, np.int64)
-            if values.ndim != dimensions:
-                raise InvalidArgument(f"selection.{name}: expected {dimensions} dimensions, got {values.shape}")
-            if values.size:
-                self.array.position_um(values.ravel())
-        for name in ("recording", "stimulation"):
-            electrodes = getattr(self, name)
-            if len(np.unique(electrodes)) != len(electrodes):
+            electrodes = read_only(self, name, np.int64)
+            if electrodes.ndim != dimensions:
+                raise InvalidArgument(f"selection.{name}: expected {dimensions} dimensions, got {electrodes.shape}")
+            self.array.position_um(electrodes.ravel())
+            if name != "patterns" and len(np.unique(electrodes)) != len(electrodes):
                 raise InvalidArgument(f"selection.{name}: expected each electrode once, got some twice or more")
         others = self.patterns[~np.isin(self.patterns, self.stimulation)]
         if others.size:
@@ -123,21 +120,14 @@ class Selection:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Selection:
-        """From the output of `to_dict`.
-
-        Raises:
-            InvalidArgument: for anything else.
-        """
+        """From the output of `to_dict`; raises InvalidArgument for anything else."""
         saved = read_record(_Saved, data, "selection")
         if len(set(map(len, saved.patterns))) > 1:
             raise InvalidArgument(
                 "selection.patterns: expected the same number of electrodes in each, got different ones"
             )
-        columns = saved.recording, saved.stimulation, saved.patterns or np.empty((0, 0))
-        recording, stimulation, patterns = (np.array(electrodes, np.int64) for electrodes in columns)
-        return Selection(
-            saved.array, recording, stimulation, patterns, saved.rule, saved.seed, saved.scanned, saved.passed
-        )
+        fields: dict[str, Any] = {name: value for name, value in vars(saved).items() if name != "format"}
+        return Selection(**fields | {"patterns": saved.patterns or np.empty((0, 0))})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; the file is complete or absent."""
@@ -145,11 +135,7 @@ class Selection:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Selection:
-        """Read a file written by `save`.
-
-        Raises:
-            InvalidFile: if the file is missing, damaged, or not a selection.
-        """
+        """Read a file written by `save`; raises InvalidFile if it is missing, damaged, or not a selection."""
         with in_file(path):
             return Selection.from_dict(json_data(read_plain_text(path, _MOST_BYTES), "selection"))
 
@@ -211,17 +197,13 @@ def _is_best_nearby(
     spacing_um: float,
 ) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Whether no electrode within the spacing has a higher ratio; of two equal ones the lower number wins."""
-    column, row = electrode % array.columns, electrode // array.columns
-    grid = np.full((array.rows, array.columns), -np.inf)
-    grid[row, column] = ratio
     reach = int(spacing_um / array.pitch_um)
-    padded = np.pad(grid, reach, constant_values=-np.inf)
+    row, column = electrode // array.columns + reach, electrode % array.columns + reach
+    grid = np.full((array.rows + 2 * reach, array.columns + 2 * reach), -np.inf)
+    grid[row, column] = ratio
     is_best = np.ones(len(electrode), dtype=bool)
-    for up in range(-reach, reach + 1):
-        for right in range(-reach, reach + 1):
-            if (up, right) == (0, 0) or array.pitch_um * np.hypot(up, right) > spacing_um:
-                continue
-            neighbour = padded[row + reach + up, column + reach + right]
-            comes_first = (up, right) < (0, 0)
-            is_best &= (neighbour <= ratio) if not comes_first else (neighbour < ratio)
+    for up, right in itertools.product(range(-reach, reach + 1), repeat=2):
+        if (up, right) != (0, 0) and array.pitch_um * np.hypot(up, right) <= spacing_um:
+            neighbour = grid[row + up, column + right]
+            is_best &= (neighbour < ratio) if (up, right) < (0, 0) else (neighbour <= ratio)
     return is_best

@@ -28,15 +28,14 @@ class Stimulus:
 
     Attributes:
         time_s: its start, relative to the start of its delivery; float64 or a whole number.
-        electrodes: numbers on the array.
         pulse: what each electrode delivers.
         frequency_hz: the frequency at which it is presented, NaN if it has none.
         pattern: index of the pattern that the electrodes form, -1 if they form none; `NOTHING` if nothing is delivered.
         presentation: number of its trial.
 
     Raises:
-        InvalidArgument: for numbers of the wrong type, including a time in float32, a pulse that is not a `Pulse`, or
-            electrodes where nothing is delivered.
+        InvalidArgument: for values of another type, including a time in float32, or electrodes where nothing is
+            delivered.
     """
 
     time_s: float
@@ -71,11 +70,7 @@ class Stimulus:
 
 
 def plain_stimuli(stimuli: Iterable[Stimulus]) -> tuple[Stimulus, ...]:
-    """A tuple of stimuli that cannot change; those of a subclass are copied as plain `Stimulus`.
-
-    Raises:
-        InvalidArgument: for anything that is not a stimulus.
-    """
+    """A tuple of stimuli that cannot change, as those of a subclass are copied; InvalidArgument for anything else."""
     if not isinstance(stimuli, Iterable):
         raise InvalidArgument(f"stimuli: expected several Stimulus, got {type(stimuli).__name__}")
     return tuple([stimulus if type(stimulus) is Stimulus else _plain_stimulus(stimulus) for stimulus in stimuli])
@@ -102,11 +97,9 @@ class Stimuli:
     Attributes:
         time_s: start of each pulse on the recording's clock, shape (stimuli,).
         frequency_hz: the frequency at which it was presented, NaN if not known, shape (stimuli,).
-        pattern: index of the stimulation pattern, `UNKNOWN` if not known, `NOTHING` if nothing was delivered, shape
-            (stimuli,).
+        pattern: index of the pattern, `UNKNOWN`, or `NOTHING` where nothing was delivered, shape (stimuli,).
         electrodes: electrodes pulsed together, padded with `UNKNOWN`, shape (stimuli, electrodes).
-        presentation: number of each pulse's trial; a response is read after the last pulse of a trial, shape
-            (stimuli,).
+        presentation: number of its trial, after whose last pulse a response is read, shape (stimuli,).
     """
 
     __repr__, __reduce__ = briefly, reduce_dataclass

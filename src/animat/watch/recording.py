@@ -90,10 +90,10 @@ def _facts(inspection: Inspection | None, n_whole: int, newest: Path) -> list[tu
             ("verdict", inspection.verdict),
             ("stimuli", inspection.n_stimuli),
             ("spikes", inspection.n_spikes),
-            ("channels", inspection.n_channels),
+            ("channels", inspection.responses.n_channels),
             ("seconds", inspection.duration_s),
             ("bursts", inspection.n_bursts),
-            ("presented", inspection.presentation or "not known"),
+            ("presented", str(inspection.responses.presentation or "not known")),
         ]
     return rows
 
@@ -111,7 +111,7 @@ def _read(file: Path) -> _Content:
 def _shares_of(inspection: Inspection | None) -> _Shares:
     if inspection is None:
         return math.nan, {}
-    return inspection.start_min, {text(c.label): c.share_above_median for c in inspection.conditions}
+    return inspection.responses.start_min, {text(c.label): c.share_above_median for c in inspection.conditions}
 
 
 def _raster(recording: Recording, to_s: float | None, span_s: float) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -24,15 +24,12 @@ def memory_findings(responses: Responses) -> Iterator[Finding]:
     the weights w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count as memory. Its standard
     error is that of independent responses, sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0).
 
-    Args:
-        responses: in the order of time.
-
     Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
     """
-    last_hz, is_burst = responses.last_hz, responses.is_burst
+    last_hz = responses.last_hz
     tables = []
     for stretch in np.array_split(np.arange(len(responses)), max(1, len(responses) // STRETCH)):
-        usable = stretch[~is_burst[stretch] & ~np.isnan(last_hz[stretch])]
+        usable = stretch[~responses.is_burst[stretch] & ~np.isnan(last_hz[stretch])]
         if not len(usable):
             continue
         median_hz = np.median(responses.rate_hz[usable])

@@ -21,10 +21,6 @@ def resolution_findings(recording: Recording, window_ms: tuple[float, float]) ->
 
     The step is the shortest interval between different spike times, if nearly all intervals are whole multiples of it.
     Only the later half is examined, as times in single precision grow coarser.
-
-    Args:
-        recording: with any spikes.
-        window_ms: of the responses.
     """
     time_s = np.unique(recording.spike_times_s[len(recording.spike_times_s) // 2 :])
     if len(recording.spike_times_s) < ENOUGH_SPIKES or len(time_s) <= ENOUGH_STEPS:

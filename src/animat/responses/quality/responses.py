@@ -16,13 +16,7 @@ from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import LEAST_RESPONSES, BurstSeparation
 from animat.responses.condition import RESTING
 from animat.responses.conditions import NO_CONDITION, Assignment, conditions_named
-from animat.responses.psth import (
-    PostStimulusHistogram,
-    ResponseTime,
-    find_response,
-    post_stimulus_histogram,
-    spontaneous_rate,
-)
+from animat.responses.psth import ResponseTime, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.quality.drift import drift_findings
 from animat.responses.quality.memory import memory_findings
 from animat.responses.quality.resolution import resolution_findings
@@ -54,11 +48,9 @@ def findings_on(
     bursts: BurstSeparation,
     inside: Bool[np.ndarray, " stimuli"] | None = None,
 ) -> tuple[Finding, ...]:
-    """All findings on how far responses can be trusted.
+    """All findings on how far responses can be trusted; those that need spike times are left out for a table.
 
-    Args:
-        source: of the responses; findings that need spike times are left out for a table.
-        inside: whether a pulse's window ends within the recording, shape (stimuli,); None: all do.
+    `inside` says whether each pulse's window ends within the recording; None: all do.
     """
     if isinstance(source, ResponseTable):
         message = (
@@ -73,7 +65,7 @@ def findings_on(
         )
         return (Finding("no-stimuli", "refuse", message, 0.0),)
     else:
-        response = None if source.stimuli.is_rest.all() else find_response(source)
+        response = find_response(source)
         found = [*_timing(responses, source, assignment, response)]
         # Only one window is recommended: if the response is elsewhere, that is the one around it.
         outside = any(finding.name in ("dead-window", "response-elsewhere") for finding in found)
@@ -120,11 +112,12 @@ def _timing(
     responses: Responses, recording: Recording, assignment: Assignment, response: ResponseTime | None
 ) -> Iterator[Finding]:
     start_ms, end_ms = responses.window_ms
+    window = f"window from {start_ms:g} to {end_ms:g} ms"
     stimuli = recording.stimuli
     if stimuli.is_rest.all():
         message = (
-            f"nothing was delivered: all {len(stimuli)} stimuli are rests, so the window from {start_ms:g} to "
-            f"{end_ms:g} ms holds no response; record places with electrodes"
+            f"nothing was delivered: all {len(stimuli)} stimuli are rests, so the {window} holds no response; record "
+            "places with electrodes"
         )
         yield Finding("dead-window", "refuse", message)
         return
@@ -138,8 +131,8 @@ def _timing(
         )
         yield Finding("stimuli-too-close", "warning", message, float(overlapping))
     rate_hz, _ = spontaneous_rate(recording, after_ms=end_ms)
-    parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS)
-    if math.isnan(rate_hz) and parts.count.any():
+    n_stimuli, n_all, spikes = _spikes_in_window(responses, recording)
+    if math.isnan(rate_hz) and n_all:
         message = (
             "stimuli follow each other too fast to see how the culture fires without them (less than a second in all "
             "lies 100 ms or more after a pulse and before the next), so it is not known whether the window holds a "
@@ -147,42 +140,42 @@ def _timing(
         )
         yield Finding("window-not-tested", "note", message)
         return
-    spikes = _without_artefact(parts)
     per_stimulus = 0.0 if math.isnan(rate_hz) else rate_hz * (end_ms - start_ms) * 1e-3 * (1 - 1 / _WINDOW_PARTS)
-    expected = per_stimulus * parts.n_stimuli
-    elsewhere = response is not None and (response.start_ms >= end_ms or response.end_ms <= start_ms)
+    expected = per_stimulus * n_stimuli
     if spikes <= expected:
+        where = "no response was found elsewhere either: these stimuli do not make the culture fire"
+        if response:
+            where = f"the response is at {response}: use --window-ms {response.start_ms:g} {response.end_ms:g}"
         message = (
-            f"the window from {start_ms:g} to {end_ms:g} ms is dead: {spikes / max(parts.n_stimuli, 1):.2f} spikes per "
-            f"stimulus (without an eighth at its start, where an artefact may be) against {per_stimulus:.2f} in as "
-            f"much time before the stimulus"
-            + (
-                f"; the response is at {response.start_ms:g} to {response.end_ms:g} ms: "
-                f"use --window-ms {response.start_ms:g} {response.end_ms:g}"
-                if response
-                else "; no response was found elsewhere either: these stimuli do not make the culture fire"
-            )
+            f"the {window} is dead: {spikes / max(n_stimuli, 1):.2f} spikes per stimulus (without an eighth at "
+            f"its start, where an artefact may be) against {per_stimulus:.2f} in as much time before the stimulus; "
+            f"{where}"
         )
         yield Finding("dead-window", "refuse", message, spikes / expected if expected else 0.0)
         return
     yield from _dead_conditions(responses, recording, assignment, per_stimulus)
-    if response and elsewhere:
+    if response and (response.start_ms >= end_ms or response.end_ms <= start_ms):
         message = (
-            f"the response is at {response.start_ms:g} to {response.end_ms:g} ms after a stimulus, outside the window "
-            f"from {start_ms:g} to {end_ms:g} ms: use --window-ms {response.start_ms:g} {response.end_ms:g}"
+            f"the response is at {response} after a stimulus, outside the {window}: use --window-ms "
+            f"{response.start_ms:g} {response.end_ms:g}"
         )
         yield Finding("response-elsewhere", "warning", message, response.start_ms)
     elif response:
         message = (
-            f"the culture fires above its spontaneous rate from {response.start_ms:g} to {response.end_ms:g} ms after "
-            f"a stimulus; the window is {start_ms:g} to {end_ms:g} ms"
+            f"the culture fires above its spontaneous rate from {response} after a stimulus; the window is "
+            f"{start_ms:g} to {end_ms:g} ms"
         )
         yield Finding("response-time", "note", message, response.start_ms)
 
 
-def _without_artefact(parts: PostStimulusHistogram) -> int:
-    """Spikes in the window without the busier of its first two parts, into which an artefact may reach."""
-    return int(parts.count.sum() - parts.count[:2].max())
+def _spikes_in_window(
+    responses: Responses, recording: Recording, stimuli: Bool[np.ndarray, " stimuli"] | None = None
+) -> tuple[int, int, int]:
+    """Stimuli, all spikes, and those without the busier of the first two parts, into which an artefact may reach."""
+    start_ms, end_ms = responses.window_ms
+    parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS, stimuli)
+    n_all = int(parts.count.sum())
+    return parts.n_stimuli, n_all, n_all - int(parts.count[:2].max())
 
 
 def _dead_conditions(
@@ -195,13 +188,12 @@ def _dead_conditions(
         if condition.electrodes == RESTING:
             continue
         of = recording.stimuli.is_last_of_presentation & (assignment.condition == i)
-        parts = post_stimulus_histogram(recording, start_ms, end_ms, (end_ms - start_ms) / _WINDOW_PARTS, of)
-        if parts.n_stimuli and _without_artefact(parts) <= per_stimulus * parts.n_stimuli:
-            spikes = _without_artefact(parts) / parts.n_stimuli
+        n_stimuli, _, spikes = _spikes_in_window(responses, recording, of)
+        if n_stimuli and spikes <= per_stimulus * n_stimuli:
             later = find_response(recording, stimuli=of)
-            at = f"; its response is at {later.start_ms:g} to {later.end_ms:g} ms" if later else ""
-            dead.append(f"{condition.label} ({spikes:.2f}{at})")
-            worst = min(worst, spikes)
+            at = f"; its response is at {later}" if later else ""
+            dead.append(f"{condition.label} ({spikes / n_stimuli:.2f}{at})")
+            worst = min(worst, spikes / n_stimuli)
     if dead:
         listed = ", ".join(dead[:8]) + (f" and {len(dead) - 8} more" if len(dead) > 8 else "")
         message = (
@@ -229,25 +221,22 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
 
 
 def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:
-    n_bursts = int(np.count_nonzero(responses.is_burst))
+    n, n_bursts = len(responses), int(np.count_nonzero(responses.is_burst))
     values = f"separability {bursts.separability:.2f}, valley {bursts.valley:.2f}"
+    if not n_bursts and not math.isnan(bursts.rejected):
+        above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
+        why = "as the ratios of active channels do not form two groups"
+        if 0 < min(above, n - above) < LEAST_RESPONSES:
+            why = f"as one of two groups would have fewer than {LEAST_RESPONSES}"
+        message = (
+            f"no response is set apart as a burst, {why}: Otsu's threshold, {bursts.rejected:.3f}, would set apart "
+            f"{above} of {n} responses ({values})"
+        )
+        yield Finding("bursts-not-separable", "note", message, bursts.separability)
     if not n_bursts:
-        if not math.isnan(bursts.rejected):
-            above = int(np.count_nonzero(responses.active_ratio > bursts.rejected))
-            fewest = min(above, len(responses) - above)
-            why = (
-                f"as one of two groups would have fewer than {LEAST_RESPONSES}"
-                if 0 < fewest < LEAST_RESPONSES
-                else "as the ratios of active channels do not form two groups"
-            )
-            message = (
-                f"no response is set apart as a burst, {why}: Otsu's threshold, {bursts.rejected:.3f}, would set apart "
-                f"{above} of {len(responses)} responses ({values})"
-            )
-            yield Finding("bursts-not-separable", "note", message, bursts.separability)
         return
-    share = n_bursts / len(responses)
-    dropped = f"{n_bursts} of {len(responses)} responses ({100 * share:.1f} %) are set apart as bursts"
+    share = n_bursts / n
+    dropped = f"{n_bursts} of {n} responses ({100 * share:.1f} %) are set apart as bursts"
     if share > MANY_BURSTS:
         message = (
             f"{dropped}; bursts should be rare, so these may be the responses themselves, and the rest failed stimuli: "
@@ -265,23 +254,23 @@ def _difference(responses: Responses) -> Iterator[Finding]:
     n = np.array([len(responses.rates_of(i)) for i in range(len(shares))])
     enough = n >= FEW_SAMPLES if np.count_nonzero(n >= FEW_SAMPLES) >= 2 else n > 0
     known = [(c.label, float(p)) for c, p, ok in zip(responses.conditions, shares, enough, strict=True) if ok]
+    if len(responses.conditions) == 1:
+        message = (
+            "there is only one condition, so an agent has nothing to choose: to train, sort the stimuli by "
+            "frequency, interval, electrode or pattern"
+        )
+        yield Finding("one-condition", "warning", message, 1.0)
     if len(known) < 2:
-        if len(responses.conditions) == 1:
-            message = (
-                "there is only one condition, so an agent has nothing to choose: to train, sort the stimuli by "
-                "frequency, interval, electrode or pattern"
-            )
-            yield Finding("one-condition", "warning", message, 1.0)
         return
-    lowest, highest = min(known, key=lambda item: item[1]), max(known, key=lambda item: item[1])
-    spread = highest[1] - lowest[1]
+    lowest, highest = min(p for _, p in known), max(p for _, p in known)
+    spread = highest - lowest
     listed = some_of([f"{p:.2f} for {label}" for label, p in known])
-    reach = (
-        f"with one threshold the choice of a condition moves the mean command from {2 * lowest[1] - 1:+.2f} to "
-        f"{2 * highest[1] - 1:+.2f} on a scale from -1 to +1, and the rest is chance"
-    )
     differ = "hardly differ" if spread < SMALL_DIFFERENCE else f"differ by {spread:.2f} at most"
-    message = f"the conditions {differ} in P(x >= P50): {listed}; {reach}"
+    message = (
+        f"the conditions {differ} in P(x >= P50): {listed}; with one threshold the choice of a condition moves the "
+        f"mean command from {2 * lowest - 1:+.2f} to {2 * highest - 1:+.2f} on a scale from -1 to +1, and the rest is "
+        "chance"
+    )
     if spread < SMALL_DIFFERENCE:
         message += ", so no policy can steer a robot much better than at random: stimulate in ways that differ more"
         yield Finding("no-difference", "warning", message, spread)
@@ -318,12 +307,9 @@ def _readouts(responses: Responses) -> Iterator[Finding]:
             alike.append((spread, f"{names[a]} and {names[b]}", " to ".join(ends)))
     if alike:
         spread, pair, between = min(alike)
-        is_known = spread < LITTLE_DIFFERENCE
-        does = (
-            "the conditions hardly separate"
-            if is_known
-            else "there are too few responses to know if the conditions separate"
-        )
+        does = "there are too few responses to know if the conditions separate"
+        if spread < LITTLE_DIFFERENCE:
+            does = "the conditions hardly separate"
         message = (
             f"{does} the readouts {pair}: P(x >= P50) of the first less that of the second is {between}, and a policy "
             "needs them separated to give one command without the other: record more, or at places that differ "

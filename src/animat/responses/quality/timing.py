@@ -47,36 +47,41 @@ def artefact_findings(
     in it. The blank is the run of bins around 0, artefact aside, in which b is below a fifth of the spontaneous rate;
     it is sought if 10 spikes or more would be in it.
 
-    Args:
-        recording: with stimuli.
-        window_ms: of the responses.
-        is_elsewhere: whether they lie outside the window; another finding then gives the window to use.
+    Where responses lie outside the window (`is_elsewhere`), another finding gives the window to use.
     """
     stimuli = recording.stimuli
     read = stimuli.is_last_of_presentation & ~stimuli.is_rest
     if not read.any():
         return
-    gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
-    before_ms = 1e3 * np.concatenate([[np.inf], np.diff(stimuli.time_s)])
+    gap_ms = 1e3 * np.diff(stimuli.time_s, prepend=-np.inf, append=np.inf)
     # Bins must not hold spikes that belong to a neighbouring pulse.
-    apart = read & (gap_ms >= SPAN_MS[1]) & (before_ms >= -SPAN_MS[0] + SPAN_MS[1])
+    apart = read & (gap_ms[1:] >= SPAN_MS[1]) & (gap_ms[:-1] >= -SPAN_MS[0] + SPAN_MS[1])
     chosen = apart if int(apart.sum()) >= min(20, int(read.sum())) else read
     histogram = post_stimulus_histogram(recording, *SPAN_MS, BIN_MS, chosen)
+    edges_ms, count, n_stimuli = histogram.edges_ms, histogram.count, histogram.n_stimuli
     rate_hz, quiet_s = spontaneous_rate(recording)
-    spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * histogram.n_stimuli
-    later = histogram.count[_centre_ms(histogram) > 3.0]
+    spontaneous = 0.0 if math.isnan(rate_hz) else rate_hz * BIN_MS * 1e-3 * n_stimuli
+    later = count[edges_ms[:-1] >= 3.0]
     usual = max(spontaneous, float(np.median(later)), 1.0)
     # Responses can begin before 2 ms: spikes no sharper than the later response belong to it.
     usual = max(usual, TIMES_RESPONSE / TIMES * float(np.quantile(later, 0.75)))
     artefact = _artefact(histogram, usual, max(spontaneous, 1.0), recording.spike_times_s, stimuli.time_s[chosen])
-    if artefact is not None:
-        yield _artefact_finding(histogram, artefact, usual, len(recording.spike_times_s), window_ms, is_elsewhere)
+    if artefact.any():
+        from_ms, to_ms = edges_ms[:-1][artefact][0], edges_ms[1:][artefact][-1]
+        spikes, reaches = float(count[artefact].sum()), to_ms > window_ms[0] + 1e-9
+        remedy = f"the window from {window_ms[0]:g} ms on does not contain them"
+        if reaches:
+            begin = "" if is_elsewhere else f": begin it at {to_ms:g} ms or later (--window-ms)"
+            remedy = f"the window begins at {window_ms[0]:g} ms, inside it{begin}"
+        message = (
+            f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
+            f"{spikes / (usual * artefact.sum()):.3g} times as many as is usual in as much time: an artefact counted "
+            f"as spikes{'' if from_ms < 0 else ', or neurons fired directly by the pulse'} "
+            f"({100 * spikes / max(len(recording.spike_times_s), 1):.1f} % of all); {remedy}"
+        )
+        yield Finding("artefact-spikes", "warning" if reaches else "note", message, spikes / n_stimuli)
     if quiet_s > 0 and spontaneous > 0:
         yield from _blank(histogram, artefact, spontaneous, window_ms, is_elsewhere)
-
-
-def _centre_ms(histogram: PostStimulusHistogram) -> Float64[np.ndarray, " bins"]:
-    return histogram.edges_ms[:-1] + BIN_MS / 2
 
 
 def _artefact(
@@ -85,95 +90,66 @@ def _artefact(
     spontaneous: float,
     spike_times_s: Float64[np.ndarray, " spikes"],
     stimulus_s: Float64[np.ndarray, " stimuli"],
-) -> tuple[int, int] | None:
-    """First and last bin of the artefact; None if there is none."""
-    centre_ms, count = _centre_ms(histogram), histogram.count
-    above = (count > TIMES * usual) & (centre_ms > LOOKED_AT_MS[0]) & (centre_ms < LOOKED_AT_MS[1])
-    early = np.flatnonzero(above & (centre_ms < ARTEFACT_UNTIL_MS))
+) -> Bool[np.ndarray, " bins"]:
+    """The bins of the artefact; none if there is none."""
+    edges_ms, count = histogram.edges_ms, histogram.count
+    from_ms = edges_ms[:-1]
+    above = (count > TIMES * usual) & (from_ms >= LOOKED_AT_MS[0]) & (from_ms < LOOKED_AT_MS[1])
+    early = np.flatnonzero(above & (from_ms < ARTEFACT_UNTIL_MS))
     for largest in early[np.argsort(-count[early], kind="stable")].tolist():
-        first, last = _run(above, largest)
+        run = _run(above, largest)
+        last = int(np.flatnonzero(run)[-1])
         height, after = count[largest], count[largest : last + 1]
         top, low = int(np.argmax(after)), np.flatnonzero(after < height / 3)
         if after[top] >= TIMES_RESPONSE * height and after[: top + 1].min() >= height / 2:
             # Artefacts are largest at first; this is how a response begins.
             continue
         rises_again = len(low) > 0 and after[low[0] :].max() >= height / 2
-        edges_s = stimulus_s[:, None] + 1e-3 * (centre_ms[largest] + np.array([-0.5, 0.5]) * BIN_MS)
-        of_each = np.sort(np.diff(np.searchsorted(spike_times_s, edges_s), axis=1)[:, 0])
+        of_each = np.diff(np.searchsorted(spike_times_s, stimulus_s[:, None] + 1e-3 * edges_ms[largest : largest + 2]))
         left_out = max(LEFT_OUT, round(LEFT_OUT_SHARE * len(of_each)))
-        if of_each[: max(len(of_each) - left_out, 0)].sum() <= TIMES * usual:
+        if np.sort(of_each[:, 0])[: max(len(of_each) - left_out, 0)].sum() <= TIMES * usual:
             continue
         if rises_again or np.mean(count[last + 1 : last + 1 + AFTERWARDS]) > spontaneous:
             # A response may follow immediately: the artefact ends where its spikes fall to a third of its height.
-            first, last = _run(above & (count >= height / 3), largest)
-        return first, last
-    return None
+            return _run(above & (count >= height / 3), largest)
+        return run
+    return np.zeros(len(count), np.bool_)
 
 
-def _run(flags: Bool[np.ndarray, " bins"], start: int, gap: int = 1) -> tuple[int, int]:
-    """First and last of the run of set flags around `start`, across gaps of up to `gap` flags."""
+def _run(flags: Bool[np.ndarray, " bins"], start: int, gap: int = 1) -> Bool[np.ndarray, " bins"]:
+    """The bins from the first to the last of the set flags around `start`, across gaps of up to `gap` flags."""
     first = last = start
     while first > 0 and flags[max(first - 1 - gap, 0) : first].any():
         first -= 1
     while last + 1 < len(flags) and flags[last + 1 : last + 2 + gap].any():
         last += 1
-    return first, last
-
-
-def _artefact_finding(
-    histogram: PostStimulusHistogram,
-    artefact: tuple[int, int],
-    usual: float,
-    n_spikes: int,
-    window_ms: tuple[float, float],
-    is_elsewhere: bool,
-) -> Finding:
-    first, last = artefact
-    centre_ms, count = _centre_ms(histogram), histogram.count[first : last + 1]
-    from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
-    spikes, n_stimuli = float(count.sum()), histogram.n_stimuli
-    reaches = to_ms > window_ms[0] + 1e-9
-    remedy = (
-        f"the window begins at {window_ms[0]:g} ms, inside it"
-        + ("" if is_elsewhere else f": begin it at {to_ms:g} ms or later (--window-ms)")
-        if reaches
-        else f"the window from {window_ms[0]:g} ms on does not contain them"
-    )
-    message = (
-        f"from {from_ms:g} to {to_ms:g} ms there are {spikes / n_stimuli:.1f} spikes per stimulus, "
-        f"{spikes / (usual * len(count)):.3g} times as many as is usual in as much time: an artefact counted "
-        f"as spikes{'' if from_ms < 0 else ', or neurons fired directly by the pulse'} "
-        f"({100 * spikes / max(n_spikes, 1):.1f} % of all); {remedy}"
-    )
-    return Finding("artefact-spikes", "warning" if reaches else "note", message, spikes / n_stimuli)
+    return (np.arange(len(flags)) >= first) & (np.arange(len(flags)) <= last)
 
 
 def _blank(
     histogram: PostStimulusHistogram,
-    artefact: tuple[int, int] | None,
+    artefact: Bool[np.ndarray, " bins"],
     spontaneous: float,
     window_ms: tuple[float, float],
     is_elsewhere: bool,
 ) -> Iterator[Finding]:
-    centre_ms, is_blank = _centre_ms(histogram), histogram.count < spontaneous / TIMES
-    if artefact is not None:
-        is_blank[artefact[0] : artefact[1] + 1] = True
-    zero = int(np.searchsorted(centre_ms, 0.0))
+    is_blank = (histogram.count < spontaneous / TIMES) | artefact
+    zero = int(np.searchsorted(histogram.edges_ms, 0.0))
     if not is_blank[zero]:
         return
-    first, last = _run(is_blank, zero, gap=0)
-    silent = last - first + 1 - (0 if artefact is None else artefact[1] - artefact[0] + 1)
-    from_ms, to_ms = centre_ms[first] - BIN_MS / 2, centre_ms[last] + BIN_MS / 2
-    if silent * spontaneous < ENOUGH or last == len(is_blank) - 1:
+    run = _run(is_blank, zero, gap=0)
+    from_ms, to_ms = histogram.edges_ms[:-1][run][0], histogram.edges_ms[1:][run][-1]
+    if (run.sum() - artefact.sum()) * spontaneous < ENOUGH or run[-1]:
         return
-    lost = (min(to_ms, window_ms[1]) - window_ms[0]) / (window_ms[1] - window_ms[0])
+    start_ms, end_ms = window_ms
     found = f"from {from_ms:g} to {to_ms:g} ms around a stimulus next to nothing was recorded (blanked, or saturated)"
+    lost = (min(to_ms, end_ms) - start_ms) / (end_ms - start_ms)
     if lost <= 1e-9:
-        yield Finding("blanked-window", "note", f"{found}; the window from {window_ms[0]:g} ms on is after it", 0.0)
+        yield Finding("blanked-window", "note", f"{found}; the window from {start_ms:g} ms on is after it", 0.0)
         return
-    remedy = f": use --window-ms {to_ms:g} {window_ms[1]:g}" if lost < 1 else ": use a window after it"
+    remedy = f": use --window-ms {to_ms:g} {end_ms:g}" if lost < 1 else ": use a window after it"
     message = (
-        f"{found}: {100 * min(lost, 1):.0f} % of the window from {window_ms[0]:g} to {window_ms[1]:g} ms is lost, and "
-        f"rates are too low by as much{'' if is_elsewhere else remedy}"
+        f"{found}: {100 * min(lost, 1):.0f} % of the window from {start_ms:g} to {end_ms:g} ms is lost, and rates are "
+        f"too low by as much{'' if is_elsewhere else remedy}"
     )
     yield Finding("blanked-window", "note" if lost <= 0.15 else "warning", message, min(lost, 1.0))
