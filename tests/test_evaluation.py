@@ -15,7 +15,7 @@ import pytest
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
@@ -136,7 +136,7 @@ def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> No
 
 def test_jax_does_not_take_actors_without_numbers_for_each_other() -> None:
     """If it did, it could run the program of one for the other, depending on where classes lie in memory."""
-    assert jax.tree.structure(Uniform()) != jax.tree.structure(Heuristic())
+    assert jax.tree.structure(Uniform()) != jax.tree.structure(HeuristicPolicy())
     assert jax.tree.structure(Uniform()) == jax.tree.structure(Uniform())
 
 

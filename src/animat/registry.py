@@ -98,7 +98,6 @@ class Registry(Generic[Thing]):
         Args:
             name: registered, or announced by an installed package (entry points `animat.robots`, `animat.mappings`); or
                 the place to import it from, `my_package.robots:Rover`, which also registers it.
-            parameters: fields of its class.
 
         Raises:
             InvalidArgument: for an unknown name or parameter, a refused value, or a class that cannot be imported or
@@ -175,10 +174,9 @@ class Registry(Generic[Thing]):
             or ":" in str(data["name"])
         ):
             raise InvalidArgument(f'{noun}: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
-        if "import" in data and not _PLACE.fullmatch(str(data["import"])):
+        if "import" in data and not _PLACE.fullmatch(place := str(data["import"])):
             raise InvalidArgument(f"{noun}: expected an import from module:Class, got {shown(data['import'])}")
         if "import" in data and self._kind(data["name"]) is None:
-            place = str(data["import"])
             raise InvalidArgument(
                 f"{noun}: expected a registered one, got {shown(data['name'])}: import {place.partition(':')[0]} "
                 f"first (on the command line: --{noun} {place})"

@@ -23,11 +23,7 @@ Delivery = Literal["chosen", "shuffled"]
 
 @dataclass(frozen=True)
 class Wrapper(Environment[RobotState]):
-    """An environment that passes everything on to another; each subclass changes something.
-
-    Attributes:
-        inside: the other environment.
-    """
+    """An environment that passes everything on to another, `inside`; each subclass changes something."""
 
     inside: Environment[RobotState]
 
@@ -249,11 +245,7 @@ class ReversedMapping(Animat[RobotState]):
 @final
 @dataclass(frozen=True)
 class IdealActuator(Animat[RobotState]):
-    """Moves the robot by a fixed command per condition in place of the response.
-
-    Attributes:
-        commands: one per condition; for a robot with several commands, a tuple of them.
-    """
+    """Moves the robot by the `commands` of the condition (several: a tuple) in place of the response."""
 
     commands: tuple[float | tuple[float, ...], ...]
 
@@ -280,8 +272,7 @@ def other_goal(robot: Robot[RobotState], own: RobotState, key: PRNGKeyArray) -> 
     starts = jax.vmap(robot.reset)(jax.random.split(key, STARTS))
     switched = jax.vmap(capability(robot, "with_goal_of"), (None, 0))(own, starts)
     is_other = jnp.any(jax.vmap(robot.observe)(switched) != robot.observe(own), axis=-1)
-    first: RobotState = jax.tree.map(lambda x: x[jnp.argmax(is_other)], starts)
-    return first
+    return jax.tree.map(lambda x: x[jnp.argmax(is_other)], starts)  # type: ignore[no-any-return]
 
 
 _OTHER, _START, _GOAL, _COST = "other_episode", "other_start", "other_goal", "cost"

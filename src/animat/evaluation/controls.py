@@ -1,8 +1,4 @@
-"""Controls and interventions that test whether the culture contributes to the return of trained policies.
-
-Each is defined once: on a simulator it is run as defined here, and a closed loop makes an agent from it
-(`animat.closed_loop.agents.agent_of`).
-"""
+"""Controls and interventions that test whether the culture contributes to policies' returns, for simulator and loop."""
 
 from __future__ import annotations
 
@@ -66,10 +62,8 @@ class Control:
     ) -> tuple[Environment[Any], NeuronSimulator | None]:
         """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
-            animat = unwrapped(environment)
-            assert isinstance(animat, Animat)
-            through = animat.robot, animat.mapping, animat.n_conditions
-            changed = ReversedMapping(*through) if self.commands is None else IdealActuator(*through, self.commands)
+            of: Any = vars(unwrapped(environment))
+            changed = ReversedMapping(**of) if self.commands is None else IdealActuator(**of, commands=self.commands)
             environment = replace_innermost(environment, lambda _: changed)
         if self.delivery == "shuffled":
             environment = ShuffledDelivery(environment)
@@ -149,18 +143,11 @@ def interventions_of(
     def control(name: str, meaning: str, **change: Any) -> Control:
         return Control(name, meaning, policies, n_policies, **change)
 
+    by_means = "each condition's mean command, stretched to the full range, in place of the response"
+    at_random = "no pulse; a random recorded response in place of the neurons' own"
     changed = [
-        control(
-            "ideal actuator",
-            "each condition's mean command, stretched to the full range, in place of the response",
-            commands=ideal,
-        ),
-        control(
-            "random spikes",
-            "no pulse; a random recorded response in place of the neurons' own",
-            delivery="silent",
-            is_drawn=True,
-        ),
+        control("ideal actuator", by_means, commands=ideal),
+        control("random spikes", at_random, delivery="silent", is_drawn=True),
         *_without_influence(policies, n_policies),
     ]
     if not isinstance(environment.robot, HostRobot):

@@ -79,13 +79,12 @@ def optimal_returns(
         # The mapping's thresholds are those of all responses, even if some of them are left out.
         return replace(simulator, percentiles=pooled_percentiles(all_responses)) if left_out else simulator
 
-    simulator = fit(responses)
-    cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
+    simulator, environments = fit(responses), [Animat(robot, of, len(responses.conditions)) for of in mappings]
+    cases = [(environment, simulator) for environment in environments]
     solving, resampling, searching = (Part(progress or Silent(), third, 1, 3) for third in range(3))
-    best = best_returns(cases, resolution=resolution, episodes=episodes, seed=seed, progress=solving)
-    environments = [environment for environment, _ in cases]
-    options: dict[str, Any] = {"resolution": resolution, "resamples": resamples, "seed": seed}
-    best = with_intervals(best, environments, responses, fit, progress=resampling, **options)
+    options: dict[str, Any] = {"resolution": resolution, "seed": seed}
+    best = best_returns(cases, episodes=episodes, progress=solving, **options)
+    best = with_intervals(best, environments, responses, fit, resamples=resamples, progress=resampling, **options)
     optima: list[OptimalReturn] = []
     for mapping, case, optimum in zip(mappings, cases, best, strict=True):
         random = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]

@@ -34,9 +34,7 @@ class WellSampled:
     """The conditions of a recording with enough responses for an optimal return.
 
     Attributes:
-        environment: with only these conditions.
-        simulator: of these responses.
-        responses: to these conditions.
+        environment, simulator, responses: with only these conditions.
         left_out: the other conditions, with the number of their responses.
         fit: makes a simulator of bootstrapped responses.
     """
@@ -82,7 +80,7 @@ class WellSampled:
 
 
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
-    """Responses to the conditions with 30 or more non-burst responses, and the labels of the other conditions.
+    """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
     The best of several values is likely a lucky one, so a condition with three responses promises too much. With 30 or
     more, nine of ten intervals contain the true optimum, with 10 three of four (docs/evidence/optimal-return.md).

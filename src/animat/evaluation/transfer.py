@@ -1,7 +1,4 @@
-"""Findings known beforehand that keep a closed loop on the culture from reaching the returns that a simulator predicts.
-
-Training, evaluation and the closed loop report them in the same words.
-"""
+"""Findings known beforehand that keep a closed loop on the culture from reaching a simulator's returns."""
 
 from __future__ import annotations
 
@@ -81,12 +78,7 @@ _LABELS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz":
 
 
 def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Finding]:
-    """A warning if the predicting recording is old.
-
-    Args:
-        recorded_at_min: time of the recording on the culture's clock.
-        culture_min: the culture's time, or that of its newest recording.
-    """
+    """A warning if the predicting recording is old at the time of the culture or its newest recording."""
     age_min = culture_min - recorded_at_min
     if age_min > OLD_MIN:
         message = (

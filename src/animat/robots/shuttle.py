@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
-from animat.robots.base import Iterations, Quantity, Robot, Size
+from animat.robots.base import Advanced, Iterations, Quantity, Robot, Size, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
@@ -103,9 +103,7 @@ class Shuttle(Robot[ShuttleState]):
         zero = jnp.zeros((), jnp.float32)
         return ShuttleState(zero, zero, jnp.where(jax.random.uniform(key) < 0.5, 1.0, -1.0).astype(jnp.float32))
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: ShuttleState, u: Float[Array, ""]
-    ) -> tuple[ShuttleState, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: ShuttleState, u: Float[Array, ""]) -> Advanced[ShuttleState]:
         kept = math.exp(-self.step_s / self.time_constant_s)
         final = self.speed_m_per_s * u
         moved = final * self.step_s + (state.velocity_m_per_s - final) * self.time_constant_s * (1 - kept)
