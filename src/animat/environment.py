@@ -52,7 +52,8 @@ class State(NamedTuple):
         reward: in the task's units.
         info: by name. `delivered`: the condition that reached the neurons (the action itself, without neurons).
             `rate_hz`: the response x, Hz per channel (NaN without neurons); with several readouts, shape (readouts,).
-            `command`: the motor command u in [-1, 1]; with several, shape (commands,). Wrappers add what they remember.
+            `command`: the motor command u in [-1, 1]; with several, shape (commands,). Wrappers add what they remember,
+            which `advance` passes on.
     """
 
     robot: Any
@@ -125,7 +126,7 @@ class Environment(abc.ABC, Generic[RobotState]):
         """
         delivered, answer, command = self.respond(uniforms, state, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
-        info = {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
+        info = state.info | {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
         return State(robot, state.iteration + 1, answer.history, reward, Ended(terminated, jnp.bool_(False)), info)
 
     @final

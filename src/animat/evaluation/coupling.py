@@ -10,7 +10,7 @@ from typing import Any, Literal, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import differential_evolution
 from scipy.stats import t as student_t
 
@@ -63,7 +63,7 @@ class Coupling(Actor):
     """
 
     weights: Float[Array, "*actors commands seen+1"]
-    actions: Float[Array, "*actors actions"] | None
+    actions: Int[Array, "*actors actions"] | None
     means: Float[Array, "*actors actions *commands"] | None
     kind: Kind
     seen: tuple[int, ...]

@@ -31,10 +31,9 @@ NEAREST, FARTHEST = 0.3, 0.95
 
 
 class ArmState(NamedTuple):
-    """Angles and velocities of the joints, and the target, seen from above: x to the right, y down.
+    """Joints and target, seen from above with the shoulder at (0, 0): x to the right, y down.
 
-    The shoulder is at (0, 0). Angles increase clockwise, as y points down, and are not wrapped: the shoulder's is 0 to
-    the right, the elbow's is 0 for a straight arm.
+    Angles increase clockwise and are not wrapped: the shoulder's is 0 to the right, the elbow's for a straight arm.
     """
 
     shoulder_rad: Float[Array, ""]
@@ -232,10 +231,8 @@ class TwoLinkArm(Robot[ArmState]):
 
     @property
     def _inertias_kg_m2(self) -> tuple[float, float]:
-        """The smallest and the largest eigenvalue of M in any position.
-
-        They are those of a straight arm, where the trace is largest and the determinant smallest.
-        """
+        """The smallest and the largest eigenvalue of M in any position."""
+        # Those of a straight arm, where the trace is largest and the determinant smallest.
         m11, m12, m22, coupling = self._inertia
         trace, determinant = m11 + 2 * coupling + m22, (m11 + 2 * coupling) * m22 - (m12 + coupling) ** 2
         largest = (trace + math.sqrt(max(trace**2 - 4 * determinant, 0.0))) / 2

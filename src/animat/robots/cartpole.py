@@ -45,9 +45,6 @@ class Cartpole(Robot[CartpoleState]):
     and w its angular velocity. Integration is explicit Euler: positions move with the velocities from before the
     iteration. An episode starts at rest, upright, in the middle of the track.
 
-    The paper's table prints a pole of 0.55 kg and an end at 12 "rad"; the open simulator that it used has 0.055 kg and
-    12 degrees, the defaults here. `Cartpole.as_printed()` takes the table literally.
-
     Attributes:
         force_noise: largest error of a push, as a fraction of `force_n`.
         track_length_m: the episode fails if the cart's centre is more than half of it from the middle.

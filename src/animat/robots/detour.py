@@ -30,9 +30,8 @@ _POSTS = tuple((x, y, 0.015) for x1, y1, x2, y2 in _SCREENS for x, y in ((x1, y1
 class Detour(Wheeled):
     """A wheeled robot in an arena where the straight path from the start to the goal is always blocked.
 
-    A goal is drawn from the places that the robot can reach but cannot drive straight to, because its body would touch
-    a wall or an obstacle on the straight path. By default the start is in the middle of four screens with a post at
-    both ends of each, and goals are behind the screens.
+    A goal is drawn from the places that the robot can reach but not by driving straight. By default the start is in the
+    middle of four screens, and goals are behind them.
 
     Raises:
         InvalidArgument: as `Wheeled`, and for surroundings in which no straight path is blocked.

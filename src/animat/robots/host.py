@@ -203,7 +203,7 @@ class Bodies:
         return call_body(self.robot, "render", self._bodies[0].picture)
 
     def restore(self, snapshot: Snapshot) -> bool:
-        """Bring new bodies to the state of others; returns whether that succeeded, else each begins its next episode."""
+        """Bring new bodies to the state of others; returns whether that succeeded: if not, each begins another."""
         for part, kept in zip(self._now, snapshot, strict=True):
             part[...] = kept
         if snapshot.commands.shape[1] and snapshot.episodes.all():

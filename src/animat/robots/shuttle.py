@@ -42,9 +42,6 @@ class Shuttle(Robot[ShuttleState]):
     reaches an end of the track stops there. An episode starts at rest in the middle and is never terminated. Its cue is
     drawn, right and left with equal probability.
 
-    What is right at one place is wrong at the other, and position and velocity do not show which is which: without the
-    cue, no rule has a mean return above 0.
-
     Attributes:
         place_m: distance of both places from the middle.
         place_radius_m: within which the cart counts as being at a place.
@@ -132,10 +129,7 @@ class Shuttle(Robot[ShuttleState]):
         return xp.clip((cue * self.place_m - position - BRAKE_S * velocity) / self.place_radius_m, -1.0, 1.0)
 
     def value_grid(self) -> Grid:
-        """Cue by position by velocity; of the cue's nodes, only those of its two values are ever visited.
-
-        Computed for every command, as a command may decide whether an iteration is rewarded.
-        """
+        """Cue by position by velocity, for every command, as a command may decide whether an iteration is rewarded."""
         half_m, fastest = self.track_length_m / 2, self.speed_m_per_s
         return Grid(
             Axis("cue", "1", -1.0, 1.0, TAPS),

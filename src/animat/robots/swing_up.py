@@ -141,13 +141,10 @@ class SwingUp(Robot[SwingUpState]):
         return xp.where((cosine > 0) & (xp.abs(falling) < held), catching, pumping)
 
     def value_grid(self) -> Grid:
-        """Angle by angular velocity, computed for every command, as a command may decide whether a step is rewarded.
-
-        Each of the two affects how the other moves, but a grid needs a first coordinate that does not affect the
-        others: here it is a dummy with the fewest nodes.
-        """
+        """Angle by angular velocity, computed for every command, as a command may decide whether a step is rewarded."""
         fastest = self.speed_limit_rad_per_s
         return Grid(
+            # Each of the two affects how the other moves, as a grid's first coordinate may not.
             Axis("nothing", "1", 0.0, 1.0, TAPS),
             (
                 Axis("angle", "rad", -math.pi, math.pi, 180, periodic=True),

@@ -45,10 +45,7 @@ ARENA = ((0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.0, 1.0), (0.0,
 
 
 class WheelsState(NamedTuple):
-    """Position and heading of the robot, and its goal, seen from above: x to the right, y down.
-
-    The heading is 0 to the right and increases clockwise, as y points down; it lies in (-pi, pi].
-    """
+    """Position (x to the right, y down), heading (clockwise from the right, in (-pi, pi]), and the goal."""
 
     x_m: Float[Array, ""]
     y_m: Float[Array, ""]
@@ -84,8 +81,7 @@ class Wheeled(Robot[WheelsState]):
         InvalidArgument: for a parameter that is not finite or makes no sense, a start without room or without goals
             within reach, walls that do not close, or a step so long that the robot could pass through a wall.
 
-    Source: Mondada et al. 2009, the e-puck (body, wheels and sensors). Its sensors measure reflected infrared light,
-    which falls with distance less evenly, depends on the reflecting surface, and is noisy; here they measure distance.
+    Source: Mondada et al. 2009, the e-puck (body, wheels and sensors, which here measure distance).
     """
 
     body_radius_m: Size = 0.035
@@ -166,10 +162,7 @@ class Wheeled(Robot[WheelsState]):
         return after, reward, terminated
 
     def observe(self, state: WheelsState) -> Float[Array, " observations"]:
-        """The eight sensors (1 at the body's edge, 0 out of range), distance (m) and bearing (rad) of the goal.
-
-        The bearing is 0 straight ahead and positive to the right, in [-pi, pi].
-        """
+        """The sensors (1 at the body's edge, 0 out of range), distance of the goal, bearing (positive to the right)."""
         x_m, y_m, heading, goal_x_m, goal_y_m = state
         directions = heading + jnp.radians(jnp.asarray(SENSORS_DEG, x_m.dtype))
         free_m = self._around.along_rays_m(x_m, y_m, directions) - self.body_radius_m
@@ -185,10 +178,7 @@ class Wheeled(Robot[WheelsState]):
     def draw(
         self, observation: np.ndarray, command: np.ndarray, earlier: Sequence[np.ndarray], height_px: int
     ) -> Picture:
-        """Sensors, goal and wheels, centred on the robot with its heading upwards, as its position is not observed.
-
-        A sensor's line ends where it meets something, or at its range (see `animat.robots.drawing`).
-        """
+        """Sensors, goal and wheels, centred on the robot with its heading upwards, as its position is not observed."""
         body, reach_m = self.body_radius_m, self.body_radius_m + self.sensor_range_m
         half_m = 1.4 * reach_m
         canvas = Canvas(height_px, height_px, (height_px / 2, height_px / 2), height_px / 2 / half_m)
