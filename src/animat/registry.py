@@ -53,11 +53,7 @@ class Registry(Generic[Thing]):
         return _registry_of, (self._base,)
 
     def register(self, kind: type[Thing]) -> None:
-        """Register a class under its name.
-
-        Raises:
-            InvalidArgument: for a class of another kind, one that lacks a method, or a name already taken.
-        """
+        """Register a class under its name; InvalidArgument for a wrong kind, a missing method, or a name taken."""
         noun = self.noun
         if not (isinstance(kind, type) and issubclass(kind, self._base)):
             raise InvalidArgument(f"{noun}: expected a subclass of animat.{self._base.__name__}, got {shown(kind)}")
@@ -87,8 +83,7 @@ class Registry(Generic[Thing]):
         Args:
             name: the prefix of their names, before a colon; in files it is the name of all of them.
             family: their class. `family.import_module(own_name)` imports the module that defines a thing;
-                `family.named(own_name, **parameters)` looks it up. Called with all parameters, as files have them, the
-                class creates it without any look-up.
+                `family.named(own_name, **parameters)` looks it up; all parameters, as in files, need no look-up.
         """
         self._families[name] = family
 
@@ -190,15 +185,7 @@ class Registry(Generic[Thing]):
         return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:
-        """Refuse a thing that a file could name but that could not be loaded again.
-
-        Args:
-            thing: of any class.
-            in_workers: whether worker processes have to import it.
-
-        Raises:
-            InvalidArgument: if it is not registered, or no worker could import it.
-        """
+        """Refuse a thing that could not be loaded again from a file, or imported (`in_workers`) by a worker process."""
         noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
         if (name in self._ours and self._ours[name] == thing) or self._family_of(name) is not None:
             return

@@ -93,10 +93,7 @@ def controls_of(
     robot's `heuristic`, if it has one; and, through neurons, with policies: *silent*, on a culture without stimuli;
     *shuffled*, with the delivered condition drawn at random in each iteration, whatever they choose.
 
-    Args:
-        environment, simulator: what the policies are evaluated in (no simulator without neurons).
-        labels: of discrete actions.
-        policies: several side by side; None leaves out the controls that need them.
+    `labels` are those of discrete actions; without `policies`, the controls that need them are left out.
     """
     controls = [RANDOM]
     for i, label in enumerate(labels):
@@ -130,9 +127,7 @@ def interventions_of(
     spikes*, the culture's rates, whatever is chosen; *silent* and *shuffled*, as in the controls; *yoked*, the stimuli
     of another episode; *turned round*, the opposite command; *goal switched*, a different goal in mid-episode.
 
-    Args:
-        environment, simulator: what the policies are evaluated in.
-        switch_at: the iteration at which the goal is switched; None leaves it out, as does a robot with one goal.
+    Without `switch_at`, the iteration of the goal's switch, that one is left out, as for a robot with one goal.
     """
     # Mean commands stretched to -1 to 1, each dimension separately; 0 where all are equal.
     means = mean_commands(environment, simulator)[1]

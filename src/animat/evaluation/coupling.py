@@ -72,7 +72,7 @@ class Coupling(Actor):
         drive = observation[:, jnp.array(self.seen, jnp.int32)] @ self.weights[:, :-1].T + self.weights[:, -1]
         wanted = jnp.tanh(drive) if self.kind == "graded" else jnp.sign(drive)
         wanted = wanted if environment.robot.n_commands > 1 else wanted[:, 0]
-        return wanted if self.actions is None else nearest_action(self.actions, self.means, wanted)
+        return nearest_action(self.actions, self.means, wanted)
 
 
 def best_coupling(
@@ -185,8 +185,7 @@ class ContextGap:
     Attributes:
         coupling: mean return of the best coupling.
         standard_error: of `coupling`.
-        gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and for the
-            optimum's grid or the episodes of the agent that replaces it. None if the optimum is not above random
+        gap: with its interval for the episodes and the optimum's grid. None if the optimum is not above random
             stimuli, or with one episode.
         best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.
         highest: if it is not, the highest possible return of an episode.
@@ -210,11 +209,7 @@ class ContextGap:
 
         An unknown optimum is between the best known agent and the highest possible return of an episode. The lower
         bound of the score then uses the latter, or the former if the policies are below the coupling. None if the task
-        is not known to need context, or with a single policy.
-
-        Args:
-            returns: mean return of each policy.
-            optimum: on the same simulator; None if it is not known.
+        is not known to need context, or with a single policy; `returns` are the policies' means.
         """
         if not self.needs_context or len(returns) < 2:
             return None

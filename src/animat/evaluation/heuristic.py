@@ -34,7 +34,7 @@ class HeuristicPolicy(Actor):
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
         wanted: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
-        return wanted if self.actions is None else nearest_action(self.actions, self.means, wanted)
+        return nearest_action(self.actions, self.means, wanted)
 
 
 def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:

@@ -31,10 +31,9 @@ a command acts smoothly and never decides whether an episode ends: its quantiles
 
 @dataclass(frozen=True, eq=False)
 class WellSampled:
-    """The conditions of a recording with enough responses for an optimal return.
+    """Environment, simulator and responses with only the conditions that have enough responses for an optimal return.
 
     Attributes:
-        environment, simulator, responses: with only these conditions.
         left_out: the other conditions, with the number of their responses.
         fit: makes a simulator of bootstrapped responses.
     """
@@ -47,14 +46,9 @@ class WellSampled:
 
     @classmethod
     def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_fixed: bool) -> Self:
-        """Select the conditions of one recording of a timeline.
+        """Select the conditions of one recording of a timeline; UnusableData if none has enough responses.
 
-        Args:
-            environment: with all conditions.
-            are_fixed: whether the mapping's percentiles are those of the first recording.
-
-        Raises:
-            UnusableData: if no condition has enough responses.
+        `are_fixed`: whether the mapping's percentiles are those of the first recording.
         """
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
         simulator = (timeline.with_first_percentiles() if are_fixed else timeline).at(minute)

@@ -87,9 +87,11 @@ class Constant(Actor):
 
 
 def nearest_action(
-    actions: Array, means: Float[Array, "actions *commands"], wanted: Float[Array, "episodes *commands"]
+    actions: Array | None, means: Float[Array, "actions *commands"] | None, wanted: Float[Array, "episodes *commands"]
 ) -> Array:
-    """The action whose mean command is nearest to the wanted one; with several commands by Euclidean distance."""
+    """The action whose mean command is nearest (Euclidean) to the wanted one; without actions, the wanted command."""
+    if actions is None or means is None:
+        return wanted
     apart = means - wanted[:, None]
     distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
     return actions[jnp.argmin(distance, axis=1)]
@@ -180,17 +182,10 @@ def roll_out(
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
-    returns, lengths, presented, commanded, terminated, outcome = _roll_out(
-        environment, episodes, simulator, actors, keys
-    )
-    return Episodes(
-        np.asarray(returns, np.float64),
-        np.asarray(lengths, np.int64),
-        np.asarray(terminated),
-        np.asarray(presented, np.int64),
-        np.asarray(commanded, np.float64),
-        None if outcome is None else Outcome(*(np.asarray(each) for each in outcome)),  # type: ignore[arg-type]
-    )
+    *counted, terminated, outcome = jax.device_get(_roll_out(environment, episodes, simulator, actors, keys))
+    kinds = (np.float64, np.int64, np.int64, np.float64)
+    returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))
+    return Episodes(returns, lengths, terminated, presented, commanded, outcome)
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)

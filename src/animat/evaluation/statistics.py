@@ -76,8 +76,7 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
 
         V(t) = t (1 - t) (1 + k ((1 - t) / (2 - t) + t / (1 + t))) / n_1 n_2,    k = (n_1 + n_2) / 2 - 1
 
-    As V is that of the assumed share, not of the observed one, the interval has a width even if all pairs are won; a
-    bootstrap, which can only repeat the observations, has none there.
+    As V is that of the assumed share, the interval has a width even if all pairs are won.
 
     Args:
         first, second: one number per policy, such as its mean return.
@@ -139,8 +138,7 @@ def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-ma
 
         t_(h-1) s sqrt((n - 1) / (h (h - 1)))
 
-    Its coverage is right for few samples too, where a bootstrap of the middle ones is too narrow. With fewer than two
-    samples in the middle it is infinite.
+    With fewer than two samples in the middle it is infinite.
 
     Args:
         samples: numbers, shape (samples,).

@@ -1,19 +1,4 @@
-"""A robot with a goal in place of its own task: the same body, with the rewards and ends that follow from the goal.
-
-An episode fails in an iteration that enters a region to avoid, or in which `within` is exceeded. It succeeds in one
-that enters a region to reach. With w the n weights, and c = 1 if there is anything to reach, else 0, the reward of an
-iteration is
-
-    failed:     -100 n w_i / sum w - c episode_limit    with i the objective that failed, the largest of several
-    succeeded:  50 n w_i / sum w                        with i the objective that was reached, the largest of several
-    otherwise:  sum (w_i r_i) / sum w - c
-
-    r_i:  avoid 1,  reach 0,  drive 1 in its region and 0 outside,  minimize and maximize (1 + m_i) / 2
-
-with m_i the margin in [-1, 1]: how far inside the region the robot is, in scales of the quantity. So only the ratios of
-weights matter. Continuing pays if there is nothing to reach, and costs otherwise, so that sooner is better. Failing
-never pays, as it costs more than a whole episode.
-"""
+"""A robot with a goal in place of its own task: the same body, with the rewards and ends that follow from the goal."""
 
 from __future__ import annotations
 
@@ -56,6 +41,16 @@ class GoalState(NamedTuple):
 @dataclass(frozen=True)
 class RobotWithGoal(Robot[GoalState]):
     """A robot with a goal in place of its own rewards and ends; it keeps the robot's other abilities.
+
+    An episode fails in an iteration that enters a region to avoid, or exceeds `within`. It succeeds in one that enters
+    a region to reach. With w the n weights, and c = 1 if there is anything to reach, else 0, an iteration's reward is
+
+        failed:     -100 n w_i / sum w - c episode_limit    with i the objective that failed, the largest of several
+        succeeded:  50 n w_i / sum w                        with i the objective that was reached, likewise
+        otherwise:  sum (w_i r_i) / sum w - c
+        r_i:        avoid 1,  reach 0,  drive 1 in its region and 0 outside,  minimize and maximize (1 + m_i) / 2
+
+    with m_i the margin in [-1, 1]: how far inside the region the robot is, in scales of the quantity.
 
     Raises:
         InvalidArgument: for a robot that is stepped on the host or already has a goal, and for a goal with quantities

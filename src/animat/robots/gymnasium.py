@@ -166,7 +166,7 @@ class GymnasiumRobot(HostRobot):
             raise InvalidArgument(f"robot: expected gymnasium: and an environment's id, got {shown(f'{FAMILY}:{id}')}")
         cls.import_module(id)
         items = tuple(settings.items())
-        with time_limit(cls(id, items, 1, (0.0,), (1.0,), 0, (1.0,), False), "being made"):
+        with time_limit(f"{FAMILY}:{id}", "being made"):
             body = _Environment(id, items)
         limit = body.limit if episode_limit is None else episode_limit
         if limit is None:

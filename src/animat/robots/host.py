@@ -241,7 +241,7 @@ class Bodies:
 def call_body(robot: HostRobot, what: str, function: Callable[..., Answer], *arguments: Any) -> Answer:
     """Call external code; whatever it raises becomes a one-line BodyFailed that names the robot."""
     try:
-        with time_limit(robot, what):
+        with time_limit(robot.name, what):
             return function(*arguments)
     except AnimatError:
         # Ours already have a one-line message.
@@ -255,7 +255,7 @@ class _TooLongError(BaseException):
 
 
 @contextmanager
-def time_limit(robot: HostRobot, what: str) -> Iterator[None]:
+def time_limit(name: str, what: str) -> Iterator[None]:
     """Raise BodyFailed if external code takes longer than `PATIENCE_S`, when it returns to Python.
 
     This works only in a process's main thread, the only one to receive signals.
@@ -273,7 +273,7 @@ def time_limit(robot: HostRobot, what: str) -> Iterator[None]:
     try:
         yield
     except _TooLongError:
-        raise BodyFailed(f"{robot.name}: expected {what} within {PATIENCE_S:g} s, got no response: it hangs") from None
+        raise BodyFailed(f"{name}: expected {what} within {PATIENCE_S:g} s, got no response: it hangs") from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL if before is None else before)

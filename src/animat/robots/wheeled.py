@@ -119,12 +119,9 @@ class Wheeled(Robot[WheelsState]):
     @property
     def return_range(self) -> tuple[float, float]:
         """From the worst reward in each iteration to reaching the goal immediately."""
-        worst = min(-1.0, self.reward_bump)
-        best = max(0.0, self.reward_bump)
-        last = (self.episode_limit - 1) * worst
-        return min(last + worst, last + self.reward_goal, self.reward_goal), max(
-            self.episode_limit * best, (self.episode_limit - 1) * best + self.reward_goal
-        )
+        worst, best, last = min(-1.0, self.reward_bump), max(0.0, self.reward_bump), self.episode_limit - 1
+        lowest = min(last * worst + worst, last * worst + self.reward_goal, self.reward_goal)
+        return lowest, max(self.episode_limit * best, last * best + self.reward_goal)
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
