@@ -17,7 +17,7 @@ from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.goals.text import read_goal
 from animat.lazy import Array, jax, jnp
-from animat.robots.base import WITHOUT, Advanced, Quantity, Robot, Uniforms, capability
+from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms, capability
 from animat.robots.grid import Grid
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
@@ -146,7 +146,7 @@ class RobotWithGoal(Robot[GoalState]):
     def observe(self, state: GoalState) -> Float[Array, " observations"]:
         return self.robot.observe(state.robot)
 
-    def advance(self, uniforms: Uniforms, state: GoalState, u: Float[Array, "*commands"]) -> Advanced[GoalState]:
+    def advance(self, uniforms: Uniforms, state: GoalState, u: Float[Array, "*commands"]) -> Transition[GoalState]:
         robot, _, _ = self.robot.advance(uniforms, state.robot, u)
         outside, tally, reward, ended = self._judge(self.robot.observe(robot), state.outside, state.tally)
         return GoalState(robot, outside, tally), reward, ended

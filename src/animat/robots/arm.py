@@ -12,7 +12,7 @@ from jaxtyping import Float
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import record
-from animat.robots.base import Advanced, Amount, Iterations, Quantity, Robot, Size, Uniforms
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, draw_over_time
 from animat.robots.motion import cost_of_distance, runge_kutta
 from animat.robots.registry import register_robot
@@ -138,7 +138,7 @@ class TwoLinkArm(Robot[ArmState]):
         x_m, y_m = distance_m * jnp.cos(direction), distance_m * jnp.sin(direction)
         return ArmState(zero, jnp.float32(math.pi / 2), zero, zero, x_m, y_m)
 
-    def advance(self, uniforms: Uniforms, state: ArmState, u: Float[Array, " n_commands"]) -> Advanced[ArmState]:
+    def advance(self, uniforms: Uniforms, state: ArmState, u: Float[Array, "2"]) -> Transition[ArmState]:
         m11, m12, m22, coupling = self._inertia
         torques = self.torque_n_m * jnp.asarray(u)
 

@@ -20,7 +20,7 @@ State = TypeVar("State")
 """A robot's state: a NamedTuple of float32 scalars; `jax.vmap` makes batches of robots."""
 
 Uniforms: TypeAlias = "Float[Array, ' noise_size']"
-Advanced: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]
+Transition: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]
 """The state after an iteration, the reward in the task's own units, and whether the task ended."""
 
 LONGEST_EPISODE = 1_000_000
@@ -135,7 +135,7 @@ class Robot(abc.ABC, Generic[State]):
         """The state at the start of an episode."""
 
     @abc.abstractmethod
-    def advance(self, uniforms: Uniforms, state: State, u: Float[Array, "*commands"]) -> Advanced[State]:
+    def advance(self, uniforms: Uniforms, state: State, u: Float[Array, "*commands"]) -> Transition[State]:
         """One iteration from given random numbers: no random generator runs inside.
 
         Args:
@@ -152,7 +152,7 @@ class Robot(abc.ABC, Generic[State]):
         """The observation of `state`, in the units of `observation_spec`, float32, shape (observations,)."""
 
     @final
-    def step(self, key: Array, state: State, u: Float[Array, "*commands"]) -> Advanced[State]:
+    def step(self, key: Array, state: State, u: Float[Array, "*commands"]) -> Transition[State]:
         """One iteration with random numbers drawn from `key`; arguments and results as in `advance`."""
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, u)
 

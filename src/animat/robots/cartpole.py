@@ -12,7 +12,7 @@ from jaxtyping import Float
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
-from animat.robots.base import Advanced, Amount, Iterations, Quantity, Robot, Size, Uniforms
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
@@ -103,7 +103,7 @@ class Cartpole(Robot[CartpoleState]):
         zero = jnp.zeros((), jnp.float32)
         return CartpoleState(zero, zero, zero, zero)
 
-    def advance(self, uniforms: Uniforms, state: CartpoleState, u: Float[Array, ""]) -> Advanced[CartpoleState]:
+    def advance(self, uniforms: Uniforms, state: CartpoleState, u: Float[Array, ""]) -> Transition[CartpoleState]:
         position, velocity, angle, angular_velocity = state
         pole_mass, half_length = self.pole_mass_kg, self.pole_length_m / 2
         total_mass = self.cart_mass_kg + pole_mass

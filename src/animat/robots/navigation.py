@@ -13,7 +13,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
-from animat.robots.base import Advanced, Amount, Iterations, Quantity, Robot, Size, Uniforms
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, AIM, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
@@ -111,7 +111,7 @@ class Navigation(Robot[NavigationState]):
         zero = jnp.zeros((), jnp.float32)
         return NavigationState(zero, zero, zero)
 
-    def advance(self, uniforms: Uniforms, state: NavigationState, u: Float[Array, ""]) -> Advanced[NavigationState]:
+    def advance(self, uniforms: Uniforms, state: NavigationState, u: Float[Array, ""]) -> Transition[NavigationState]:
         heading = within_half_a_turn(state.heading_rad + self.turn_rad * u)
         x = jnp.clip(state.x_m + self.stride_m * jnp.cos(heading), 0.0, self.arena_width_m)
         y = jnp.clip(state.y_m + self.stride_m * jnp.sin(heading), 0.0, self.arena_height_m)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
-from animat.robots.base import Advanced, Iterations, Quantity, Robot, Size, Uniforms
+from animat.robots.base import Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
@@ -100,7 +100,7 @@ class Shuttle(Robot[ShuttleState]):
         zero = jnp.zeros((), jnp.float32)
         return ShuttleState(zero, zero, jnp.where(jax.random.uniform(key) < 0.5, 1.0, -1.0).astype(jnp.float32))
 
-    def advance(self, uniforms: Uniforms, state: ShuttleState, u: Float[Array, ""]) -> Advanced[ShuttleState]:
+    def advance(self, uniforms: Uniforms, state: ShuttleState, u: Float[Array, ""]) -> Transition[ShuttleState]:
         kept = math.exp(-self.step_s / self.time_constant_s)
         final = self.speed_m_per_s * u
         moved = final * self.step_s + (state.velocity_m_per_s - final) * self.time_constant_s * (1 - kept)

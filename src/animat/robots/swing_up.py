@@ -13,7 +13,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
-from animat.robots.base import Advanced, Amount, Iterations, Quantity, Robot, Size, Uniforms
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, Canvas, Picture, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.motion import runge_kutta, within_half_a_turn
@@ -97,7 +97,7 @@ class SwingUp(Robot[SwingUpState]):
         """At rest, hanging; `key` is not used."""
         return SwingUpState(jnp.float32(math.pi), jnp.zeros((), jnp.float32))
 
-    def advance(self, uniforms: Uniforms, state: SwingUpState, u: Float[Array, ""]) -> Advanced[SwingUpState]:
+    def advance(self, uniforms: Uniforms, state: SwingUpState, u: Float[Array, ""]) -> Transition[SwingUpState]:
         def rates(state: SwingUpState) -> SwingUpState:
             angle, angular_velocity = state
             return SwingUpState(angular_velocity, self._gravity_per_s2 * jnp.sin(angle) + self._push_per_s2 * u)

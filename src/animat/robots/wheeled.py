@@ -12,7 +12,7 @@ from jaxtyping import Float
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
-from animat.robots.base import Advanced, Iterations, Quantity, Robot, Size, Uniforms
+from animat.robots.base import Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.surroundings import MOST_PLACES, Obstacles, Surroundings, Walls, places_within_reach
@@ -141,7 +141,7 @@ class Wheeled(Robot[WheelsState]):
         heading = math.pi * (1 - 2 * jax.random.uniform(for_heading))
         return WheelsState(jnp.float32(self.start_x_m), jnp.float32(self.start_y_m), heading, goal[0], goal[1])
 
-    def advance(self, uniforms: Uniforms, state: WheelsState, u: Float[Array, " n_commands"]) -> Advanced[WheelsState]:
+    def advance(self, uniforms: Uniforms, state: WheelsState, u: Float[Array, "2"]) -> Transition[WheelsState]:
         left_m, right_m = self.max_speed_m_per_s * self.step_s * jnp.asarray(u)
         turn = (left_m - right_m) / self.wheel_distance_m
         # The arc's chord points half way between the headings at its ends; jnp.sinc includes a factor pi.
