@@ -121,7 +121,7 @@ class Registry(Generic[Thing]):
     def names(self) -> tuple[str, ...]:
         """All known names: ours, the registered ones, then those announced by packages."""
         announced = importlib.metadata.entry_points(group=self.entry_points)
-        return tuple(dict.fromkeys([*self._ours, *self._registered, *(point.name for point in announced)]))
+        return tuple(dict.fromkeys([*self._ours, *sorted(self._registered), *(point.name for point in announced)]))
 
     def name_of(self, name: str) -> str:
         """The registered name for any form of `name` that `named` accepts; raises as `named` does."""
