@@ -108,13 +108,13 @@ def best_coupling(
     n_commands = environment.robot.n_commands
     stimuli: Any = (None, None)
     if environment.n_actions is not None:
-        actions, means = mean_commands(environment, simulator)
-        stimuli = jnp.asarray(actions), jnp.asarray(means, jnp.float32)
+        actions, commands = mean_commands(environment, simulator)
+        stimuli = jnp.asarray(actions), jnp.asarray(commands, jnp.float32)
 
     def actor(kind: Kind, weights: Float64[np.ndarray, "actors weights"]) -> Coupling:
-        of_each = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(weights), *x.shape)), stimuli)
+        inputs, means = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(weights), *x.shape)), stimuli)
         shaped = weights.reshape(len(weights), n_commands, len(seen) + 1)
-        return Coupling(jnp.asarray(shaped, jnp.float32), *of_each, kind, seen)
+        return Coupling(jnp.asarray(shaped, jnp.float32), inputs, means, kind, seen)
 
     def mean_returns(coupling: Coupling, episodes: int, seed: int) -> Float64[np.ndarray, " actors"]:
         n = len(coupling.weights)

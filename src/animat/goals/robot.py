@@ -223,12 +223,13 @@ class RobotWithGoal(Robot[GoalState]):
         if any(objective.within is not None for objective in self._objectives):
             raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
         grid: Grid = capability(self.robot, "value_grid")()
-        undecided = {} if self._is_decided(grid) else {"end_is_known": False, "smooth_commands": None}
+        is_decided = self._is_decided(grid)
         return replace(
             grid,
             to_coordinates=lambda state: grid.to_coordinates(state.robot),
             to_state=lambda coordinates: self.started(grid.to_state(coordinates)),
-            **undecided,
+            end_is_known=grid.end_is_known and is_decided,
+            smooth_commands=grid.smooth_commands if is_decided else None,
         )
 
     def _is_decided(self, grid: Grid) -> bool:

@@ -188,7 +188,7 @@ def _expect_same_structure(what: str, after: Any, before: Any) -> None:
         ", ".join(f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in jax.tree.leaves(state))
         for state in (before, after)
     ]
-    if jax.tree.structure(before) != jax.tree.structure(after) or leaves[0] != leaves[1]:
+    if (jax.tree.structure(before), leaves[0]) != (jax.tree.structure(after), leaves[1]):
         raise InvalidArgument(
             f"{what}: expected the state's structure from reset ({leaves[0]}), got another ({leaves[1]})"
         )

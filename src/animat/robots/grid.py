@@ -161,8 +161,8 @@ class Grid:
             row += first * stride
             places.append(place)
             positions.append(first + place)
-        stacked = (jnp.stack(each) if each else jnp.zeros(0, jnp.float32) for each in (places, positions))
-        return Located(row, *stacked, *self.along.locate(along))
+        row_places, at = (jnp.stack(each) if each else jnp.zeros(0, jnp.float32) for each in (places, positions))
+        return Located(row, row_places, at, *self.along.locate(along))
 
     def state_at(self, row: Array, node: Array) -> Any:
         """The robot's state at a node of a row."""
