@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import Heuristic
+from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.robots import ArmState, TwoLinkArm
 from animat.robots.drawing import BODY, GOAL_FILL, draw_robot
@@ -162,7 +162,7 @@ def test_links_that_reach_nothing_and_too_long_steps_are_refused() -> None:
 @pytest.mark.oracle
 def test_the_heuristic_brings_the_tip_to_the_target() -> None:
     environment = WithoutNeurons(TwoLinkArm(), None)
-    by_rule = roll_out(environment, None, Heuristic(), 1, episodes=100, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=100, seed=1).returns
     at_random = roll_out(environment, None, Uniform(), 1, episodes=100, seed=1).returns
     assert by_rule.mean() > -40 and at_random.mean() < -80
     robot, state = TwoLinkArm(), TwoLinkArm().reset(jax.random.key(5))

@@ -427,7 +427,7 @@ def test_a_body_that_cuts_itself_off_early_does_not_end_the_return(monkeypatch: 
 
 
 def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_reported() -> None:
-    with pytest.raises(InvalidArgument, match="episode_limit: expected from 1 to"):
+    with pytest.raises(InvalidArgument, match="episode_limit: expected at least 1, got 0"):
         named("Slider", episode_limit=0)
     robot = named("Slider", episode_limit=host.LONGEST_KEPT + 1)
     (caveat,) = robot.caveats()

@@ -27,7 +27,7 @@ from animat.cultures.series import Series
 from animat.environment import Animat
 from animat.errors import InvalidArgument
 from animat.evaluation.optimum import Optimum, best_return
-from animat.evaluation.resampling import with_intervals
+from animat.evaluation.resampling import WellSampled
 from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
@@ -141,11 +141,13 @@ def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         asked.append(resolution)
         return best_return(*case, resolution=0.25, episodes=0, **options)
 
-    def narrow(*of: Any, resolution: float, **options: Any) -> tuple[Optimum, ...]:
-        return with_intervals(*of, resolution=0.25, resamples=3, **options)
+    with_interval = WellSampled.with_interval
+
+    def narrow(*of: Any, resolution: float, **options: Any) -> Optimum:
+        return with_interval(*of, resolution=0.25, resamples=3, **options)
 
     monkeypatch.setattr("animat.evaluation.table.best_return", rough)
-    monkeypatch.setattr("animat.evaluation.resampling.with_intervals", narrow)
+    monkeypatch.setattr(WellSampled, "with_interval", narrow)
     monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 4)
     return asked
 

@@ -247,7 +247,7 @@ def test_without_a_known_optimum_gap_and_score_are_lower_bounds(coupling: float,
     """Above and below random stimuli, which return -80; the best known agent returns 10."""
     couplings, random, known = (np.full(4, each) for each in (coupling, -80.0, 10.0))
     least = least_context_gap(couplings, random, np.stack([known - 5, known, known - 20]), highest=50.0)
-    assert least.is_least and least.best_known == 10 and least.gap is not None and least.needs_context
+    assert least.to_dict()["is_least"] and least.best_known == 10 and least.gap is not None and least.needs_context
     assert least.gap.value <= (optimum - coupling) / (optimum + 80) + 1e-12
     assert least.gap.value == pytest.approx(min(1.0, (10 - coupling) / 90))
     for policies in (-5.0, 8.0, coupling - 5):

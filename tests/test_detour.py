@@ -12,7 +12,7 @@ import pytest
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import Heuristic
+from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.rollouts import Actor, Uniform, roll_out
 from animat.robots import Detour, Wheels, WheelsState, robot_from_dict, robot_to_dict
 from animat.robots.surroundings import Surroundings
@@ -120,10 +120,10 @@ def test_the_heuristic_finds_the_way_round_and_that_of_wheels_often_does_not(mon
         ran = roll_out(WithoutNeurons(robot, None), None, actor, 1, episodes=400, seed=1)
         return float(ran.terminated.mean()), float(ran.returns.mean())
 
-    by_rule, at_random = ran(Heuristic()), ran(Uniform())
+    by_rule, at_random = ran(HeuristicPolicy()), ran(Uniform())
     assert by_rule[0] > 0.97 and by_rule[1] > 28
     assert at_random[0] < 0.02 and at_random[1] < -80
     monkeypatch.setattr(Detour, "heuristic", Wheels.heuristic)
     # Of other parameters, so that it is compiled anew.
-    of_wheels = ran(Heuristic(), Detour(reward_goal=50.001))
+    of_wheels = ran(HeuristicPolicy(), Detour(reward_goal=50.001))
     assert of_wheels[0] < 0.8 and of_wheels[1] < 5

@@ -15,8 +15,9 @@ import pytest
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import Optimum, best_return
+from animat.evaluation.resampling import WellSampled
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.neurons.simulator import fit_histogram, silenced
@@ -136,7 +137,7 @@ def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> No
 
 def test_jax_does_not_take_actors_without_numbers_for_each_other() -> None:
     """If it did, it could run the program of one for the other, depending on where classes lie in memory."""
-    assert jax.tree.structure(Uniform()) != jax.tree.structure(Heuristic())
+    assert jax.tree.structure(Uniform()) != jax.tree.structure(HeuristicPolicy())
     assert jax.tree.structure(Uniform()) == jax.tree.structure(Uniform())
 
 
@@ -320,7 +321,7 @@ def test_the_optimum_scores_what_acts_in_the_same_environment() -> None:
 @pytest.mark.oracle
 def test_an_optimum_without_conditions_of_few_responses_gives_no_score(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rows use these conditions too; the optimum has the thresholds of all responses, as the rows have."""
-    monkeypatch.setattr("animat.evaluation.resampling.with_intervals", lambda optima, *_, **__: tuple(optima))
+    monkeypatch.setattr(WellSampled, "with_interval", lambda self, best, **_: replace(best, left_out=self.left_out))
     monkeypatch.setattr("animat.evaluation.table.best_return", partial(best_return, episodes=0))
     responses = answers([60, 60, 60, 60, 3], 2)
     lucky = replace(responses, rate_hz=np.where(responses.condition == 4, 1000.0, responses.rate_hz))

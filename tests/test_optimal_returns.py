@@ -20,7 +20,7 @@ from animat.environment import Animat
 from animat.errors import UnusableData
 from animat.evaluation.optimal_returns import optimal_returns
 from animat.evaluation.optimum import Optimum, best_return, rough_values
-from animat.evaluation.resampling import _rough, with_intervals
+from animat.evaluation.resampling import WellSampled, _rough
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
@@ -158,7 +158,8 @@ def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None
     for spread in ((1.0,) * 5, (0.01, 1.0, 1.0, 1.0, 100.0)):
         responses = answers([30] * 5, 3, spread)
         best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
-        (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25, resamples=8)
+        sampled = WellSampled(environment, fit_histogram(responses), responses, (), fit_histogram)
+        known = sampled.with_interval(best, resolution=0.25, resamples=8)
         assert known.interval is not None
         # The pole falls in the first iteration, or never.
         assert -100 <= known.interval.low <= best.value <= known.interval.high <= SHORT.episode_limit
@@ -169,7 +170,8 @@ def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_bootstr
     """The 95 % interval of 39: another draw falls outside of them once in twenty."""
     environment, responses = Animat(SHORT, Thresholds(1), 5), answers([40] * 5, 3)
     best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
-    (known,) = with_intervals([best], [environment], responses, fit_histogram, resolution=0.25)
+    sampled = WellSampled(environment, fit_histogram(responses), responses, (), fit_histogram)
+    known = sampled.with_interval(best, resolution=0.25)
     rng = np.random.default_rng(1)
     simulators = [fit_histogram(each) for each in (responses, *(responses.bootstrapped(rng) for _ in range(39)))]
     grid = _rough(grid_for(SHORT), 0.25)
@@ -197,7 +199,8 @@ def test_the_interval_holds_the_optimum_of_the_true_distributions(
     trials, held = 40, 0
     for seed in range(1, trials + 1):
         responses = answers([n] * len(spread), seed, spread)
-        (known,) = with_intervals([best(responses)], [environment], responses, fit_histogram, resolution=0.25)
+        sampled = WellSampled(environment, fit_histogram(responses), responses, (), fit_histogram)
+        known = sampled.with_interval(best(responses), resolution=0.25)
         assert known.interval is not None
         held += known.interval.low <= true <= known.interval.high
     print(f"{mapping.name}, {len(spread)} conditions, n = {n}: {held} of {trials}")

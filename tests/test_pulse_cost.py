@@ -342,7 +342,7 @@ def test_an_evaluation_counts_what_each_agent_gives(responses: Responses) -> Non
         assert told["net_return"] == told["mean_return"] - 0.3 * told["electrode_pulses"]
     assert table.net_optimum is not None and table.optimum is not None
     assert table.net_optimum.value <= table.optimum.value + 1e-6
-    assert max(row.net_return or 0 for row in rows.values()) <= table.net_optimum.value + 0.5
+    assert max(row.to_dict()["net_return"] or 0 for row in rows.values()) <= table.net_optimum.value + 0.5
     text = table.to_text()
     assert "electrode pulses  net return" in text and "net return: mean return - 0.3 x electrode pulses" in text
     assert "with the cost of pulses: optimal return" in text
@@ -352,7 +352,7 @@ def test_an_evaluation_counts_what_each_agent_gives(responses: Responses) -> Non
     assert "electrode pulses" in free.to_text() and "net return" not in free.to_text()
     unknown = tuple(replace(each, electrodes=()) for each in responses.conditions)
     of_before = evaluate({"p": policy_of(0, responses, conditions=unknown)}, fit_timeline([responses]), episodes=5)
-    assert of_before.rows[0].electrode_pulses is None and of_before.rows[0].net_return is None
+    assert of_before.rows[0].electrode_pulses is None and of_before.rows[0].to_dict()["net_return"] is None
 
 
 @pytest.mark.oracle

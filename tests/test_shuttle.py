@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.information import goal_information
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
@@ -68,7 +68,7 @@ def test_what_is_right_at_one_place_is_wrong_at_the_other(cue: float) -> None:
 
 def test_the_heuristic_stays_at_its_place_and_no_constant_command_gains() -> None:
     environment = WithoutNeurons(Shuttle(), None)
-    by_rule = roll_out(environment, None, Heuristic(), 1, episodes=200, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=200, seed=1).returns
     # The way to the place's edge takes five to eight iterations of its 120.
     assert 112 <= by_rule.min() <= by_rule.max() <= 116
     at_random = roll_out(environment, None, Uniform(), 1, episodes=2000, seed=1).returns[0]

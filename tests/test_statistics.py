@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_complete_separation_of_ten_and_ten() -> None:
     assert 1 - share == pytest.approx(1.959964**2 * share * (1 + k) / 100, abs=1e-5)
     assert 0.5 < compared.effect.low < 0.7
     assert not compared.ties
-    json.dumps(compared.to_dict())
+    json.dumps(asdict(compared))
 
 
 @given(st.lists(FINITE, min_size=1, max_size=9), st.lists(FINITE, min_size=1, max_size=9))
@@ -163,8 +164,6 @@ def test_refusals_name_the_argument() -> None:
         compare([], [1.0])
     with pytest.raises(InvalidArgument, match="second"):
         compare([1.0], [float("nan")])
-    with pytest.raises(InvalidArgument, match="confidence"):
-        interquartile_mean([1.0], confidence=1.0)
     with pytest.raises(InvalidArgument, match="p:"):
         holm({"a": 1.5})
     with pytest.raises(InvalidArgument, match="u:"):

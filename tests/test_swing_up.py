@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import Heuristic, heuristic_policy
+from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.robots import SwingUp, SwingUpState
@@ -141,7 +141,7 @@ def test_a_motor_that_needs_no_swing_is_reported_and_too_long_a_step_refused() -
 
 def test_the_heuristic_swings_it_up_and_keeps_it_there() -> None:
     environment = WithoutNeurons(SwingUp(), None)
-    by_rule = roll_out(environment, None, Heuristic(), 1, episodes=2, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=2, seed=1).returns
     at_random = roll_out(environment, None, Uniform(), 1, episodes=200, seed=1).returns
     assert by_rule.min() > 135 and at_random.mean() < 5
 

@@ -27,7 +27,7 @@ from animat.closed_loop.session import read_session
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
-from animat.evaluation.heuristic import Heuristic, HeuristicPolicy
+from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.table import evaluate
 from animat.execution.training import train
 from animat.neurons.adjusted_rank import AdjustedRanks
@@ -228,7 +228,7 @@ def test_the_baselines_table_has_what_there_is_without_neurons(baseline: dict[st
     state = wheels.reset(jax.random.key(4))
     seen = wheels.observe(state)
     environment = WithoutNeurons(wheels, None)
-    rule = Heuristic().act(environment, (seen / environment.scales)[None], jnp.zeros((1, 2)))
+    rule = HeuristicPolicy().act(environment, (seen / environment.scales)[None], jnp.zeros((1, 2)))
     np.testing.assert_allclose(rule[0], wheels.heuristic(seen), rtol=1e-6)
 
 

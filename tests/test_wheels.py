@@ -13,7 +13,7 @@ import pytest
 
 from animat.environment import WithoutNeurons
 from animat.errors import InvalidArgument
-from animat.evaluation.heuristic import Heuristic
+from animat.evaluation.heuristic import HeuristicPolicy
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.robots import Wheels, WheelsState, robot_from_dict, robot_to_dict
 from animat.robots.drawing import ACCENT, BODY, GOAL_FILL, INK, draw_robot
@@ -237,7 +237,7 @@ def test_surroundings_are_data() -> None:
 @pytest.mark.oracle
 def test_the_heuristic_finds_the_goal_between_the_obstacles() -> None:
     environment = WithoutNeurons(Wheels(), None)
-    by_rule = roll_out(environment, None, Heuristic(), 1, episodes=200, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=200, seed=1).returns
     at_random = roll_out(environment, None, Uniform(), 1, episodes=200, seed=1).returns
     assert by_rule.mean() > 30 and at_random.mean() < -60
     assert np.mean(by_rule > 0) > 0.97

@@ -24,31 +24,19 @@ Uniforms = Float[Array, " noise"]
 Number = Float[Array, ""]
 Flag = Bool[Array, ""]
 
-
 _NOT_CARRIED = ("delivered", "rate_hz", "command")
 """Entries of `info` about the last iteration, which the next one does not need."""
 
 
 class Ended(NamedTuple):
-    """Whether an episode has ended, and how: at most one of the two is True.
-
-    Attributes:
-        terminated: the task ended by itself (fell, reached).
-        truncated: the episode was cut off (`animat.wrappers.EpisodeLimit`).
-    """
+    """Whether the task ended by itself (fell, reached), or the episode was cut off (`animat.wrappers.EpisodeLimit`)."""
 
     terminated: Flag
     truncated: Flag
 
 
 class Responded(NamedTuple):
-    """The result of an action before the robot moves.
-
-    Attributes:
-        delivered: the condition that reached the neurons (the action itself, without neurons).
-        answer: the response of the neurons.
-        command: the command that moves the robot.
-    """
+    """The result of an action before the robot moves: as in `State.info`, with the answer of the neurons."""
 
     delivered: Array
     answer: Answer
@@ -59,14 +47,13 @@ class State(NamedTuple):
     """The state of an episode, and what the iteration that led to it did (all 0 at the start).
 
     Attributes:
-        robot: the state of the robot.
         iteration: the number of iterations done.
         neurons: their history state, see `animat.neurons.simulator.Answer`.
         reward: in the task's units.
-        ended: whether the episode has ended.
         info: by name. `delivered`: the condition that reached the neurons (the action itself, without neurons).
             `rate_hz`: the response x, Hz per channel (NaN without neurons); with several readouts, shape (readouts,).
-            `command`: the motor command u in [-1, 1]; with several, shape (commands,). Wrappers add what they remember.
+            `command`: the motor command u in [-1, 1]; with several, shape (commands,). Wrappers add what they remember,
+            which `advance` passes on.
     """
 
     robot: Any
@@ -139,9 +126,8 @@ class Environment(abc.ABC, Generic[RobotState]):
         """
         delivered, answer, command = self.respond(uniforms, state, action, simulator)
         robot, reward, terminated = self.robot.advance(uniforms[: self.robot.noise_size], state.robot, command)
-        info = {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
-        ended = Ended(terminated, jnp.bool_(False))
-        return State(robot, state.iteration + 1, answer.history, reward, ended, info)
+        info = state.info | {"delivered": delivered, "rate_hz": answer.rate_hz, "command": command}
+        return State(robot, state.iteration + 1, answer.history, reward, Ended(terminated, jnp.bool_(False)), info)
 
     @final
     def step(self, key: PRNGKeyArray, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
@@ -161,12 +147,10 @@ class Environment(abc.ABC, Generic[RobotState]):
 
 @dataclass(frozen=True)
 class Animat(Environment[RobotState]):
-    """A robot moved by the responses of neurons to the conditions that the agent picks.
+    """A robot moved by the responses of neurons to the conditions that the agent picks from.
 
     Attributes:
-        robot: the body and its task.
         mapping: from the response of a readout to a motor command.
-        n_conditions: the number of conditions that the agent picks from.
     """
 
     robot: Robot[RobotState]
@@ -197,7 +181,6 @@ class WithoutNeurons(Environment[RobotState]):
     """The baseline: the agent moves the robot directly, by one of a few commands or by continuous ones.
 
     Attributes:
-        robot: the body and its task.
         commands: the commands to pick from, such as (-1, 1) for the cartpole; None: continuous commands in [-1, 1], as
             many as the robot takes.
 

@@ -53,11 +53,7 @@ class Registry(Generic[Thing]):
         return _registry_of, (self._base,)
 
     def register(self, kind: type[Thing]) -> None:
-        """Register a class under its name.
-
-        Raises:
-            InvalidArgument: for a class of another kind, one that lacks a method, or a name already taken.
-        """
+        """Register a class under its name; InvalidArgument for a wrong kind, a missing method, or a name taken."""
         noun = self.noun
         if not (isinstance(kind, type) and issubclass(kind, self._base)):
             raise InvalidArgument(f"{noun}: expected a subclass of animat.{self._base.__name__}, got {shown(kind)}")
@@ -87,8 +83,7 @@ class Registry(Generic[Thing]):
         Args:
             name: the prefix of their names, before a colon; in files it is the name of all of them.
             family: their class. `family.import_module(own_name)` imports the module that defines a thing;
-                `family.named(own_name, **parameters)` looks it up. Called with all parameters, as files have them, the
-                class creates it without any look-up.
+                `family.named(own_name, **parameters)` looks it up; all parameters, as in files, need no look-up.
         """
         self._families[name] = family
 
@@ -98,7 +93,6 @@ class Registry(Generic[Thing]):
         Args:
             name: registered, or announced by an installed package (entry points `animat.robots`, `animat.mappings`); or
                 the place to import it from, `my_package.robots:Rover`, which also registers it.
-            parameters: fields of its class.
 
         Raises:
             InvalidArgument: for an unknown name or parameter, a refused value, or a class that cannot be imported or
@@ -127,7 +121,7 @@ class Registry(Generic[Thing]):
     def names(self) -> tuple[str, ...]:
         """All known names: ours, the registered ones, then those announced by packages."""
         announced = importlib.metadata.entry_points(group=self.entry_points)
-        return tuple(dict.fromkeys([*self._ours, *self._registered, *(point.name for point in announced)]))
+        return tuple(dict.fromkeys([*self._ours, *sorted(self._registered), *(point.name for point in announced)]))
 
     def name_of(self, name: str) -> str:
         """The registered name for any form of `name` that `named` accepts; raises as `named` does."""
@@ -175,10 +169,9 @@ class Registry(Generic[Thing]):
             or ":" in str(data["name"])
         ):
             raise InvalidArgument(f'{noun}: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
-        if "import" in data and not _PLACE.fullmatch(str(data["import"])):
+        if "import" in data and not _PLACE.fullmatch(place := str(data["import"])):
             raise InvalidArgument(f"{noun}: expected an import from module:Class, got {shown(data['import'])}")
         if "import" in data and self._kind(data["name"]) is None:
-            place = str(data["import"])
             raise InvalidArgument(
                 f"{noun}: expected a registered one, got {shown(data['name'])}: import {place.partition(':')[0]} "
                 f"first (on the command line: --{noun} {place})"
@@ -192,15 +185,7 @@ class Registry(Generic[Thing]):
         return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:
-        """Refuse a thing that a file could name but that could not be loaded again.
-
-        Args:
-            thing: of any class.
-            in_workers: whether worker processes have to import it.
-
-        Raises:
-            InvalidArgument: if it is not registered, or no worker could import it.
-        """
+        """Refuse a thing that could not be loaded again from a file, or imported (`in_workers`) by a worker process."""
         noun, kind, name = self.noun, type(thing), thing.name  # type: ignore[attr-defined]
         if (name in self._ours and self._ours[name] == thing) or self._family_of(name) is not None:
             return

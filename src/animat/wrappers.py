@@ -23,11 +23,7 @@ Delivery = Literal["chosen", "shuffled"]
 
 @dataclass(frozen=True)
 class Wrapper(Environment[RobotState]):
-    """An environment that passes everything on to another; each subclass changes something.
-
-    Attributes:
-        inside: the other environment.
-    """
+    """An environment that passes everything on to another, `inside`; each subclass changes something."""
 
     inside: Environment[RobotState]
 
@@ -78,17 +74,19 @@ class EpisodeLimit(Wrapper[RobotState]):
         return after._replace(ended=after.ended._replace(truncated=truncated))
 
 
-@final
 @dataclass(frozen=True)
-class ShuffledDelivery(Wrapper[RobotState]):
-    """Delivers a random condition at each iteration, whatever was chosen: the paper's control (section 3.2).
-
-    Raises:
-        InvalidArgument: around an environment without neurons.
-    """
+class NeuralWrapper(Wrapper[RobotState]):
+    """A wrapper of an environment with neurons; raises InvalidArgument around any other."""
 
     def __post_init__(self) -> None:
-        _expect_neurons(self)
+        if not isinstance(inmost := unwrapped(self), Animat):
+            raise InvalidArgument(f"inside: expected an Animat, which has neurons, got {type(inmost).__name__}")
+
+
+@final
+@dataclass(frozen=True)
+class ShuffledDelivery(NeuralWrapper[RobotState]):
+    """Delivers a random condition at each iteration, whatever was chosen: the paper's control (section 3.2)."""
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
         return self.inside.respond(uniforms, state, self._drawn(uniforms), simulator)
@@ -103,17 +101,11 @@ class ShuffledDelivery(Wrapper[RobotState]):
 
 @final
 @dataclass(frozen=True)
-class NeuralObservation(Wrapper[RobotState]):
+class NeuralObservation(NeuralWrapper[RobotState]):
     """Appends the history state of the neurons (`State.neurons`) to the observation.
 
     A simulator's next answer depends on trace and load alone; a simulator without memory leaves both at 0.5.
-
-    Raises:
-        InvalidArgument: around an environment without neurons.
     """
-
-    def __post_init__(self) -> None:
-        _expect_neurons(self)
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
@@ -126,20 +118,20 @@ class NeuralObservation(Wrapper[RobotState]):
 
 @final
 @dataclass(frozen=True)
-class TrialCosts(Wrapper[RobotState]):
+class TrialCosts(NeuralWrapper[RobotState]):
     """Adds up the cost of an episode's trials in `State.info["cost"]`; rewards are unchanged (see `net_reward`).
 
     Attributes:
         costs: of a trial of each condition, in the units of the reward.
 
     Raises:
-        InvalidArgument: around an environment without neurons, or unless there is one cost per condition.
+        InvalidArgument: unless there is one cost per condition.
     """
 
     costs: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        _expect_neurons(self)
+        super().__post_init__()
         if len(self.costs) != self.n_actions:
             raise InvalidArgument(f"costs: expected one for each of {self.n_actions} conditions, got {self.costs}")
 
@@ -148,7 +140,7 @@ class TrialCosts(Wrapper[RobotState]):
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
         after = self.inside.advance(uniforms, state, action, simulator)
-        return _remembering(after, {_COST: state.info[_COST] + self.of(after.info["delivered"])})
+        return add_cost(after, self.of(after.info["delivered"]))
 
     def of(self, delivered: Array) -> Array:
         """The cost of trials of these conditions."""
@@ -172,20 +164,20 @@ def add_cost(state: State, more: Array) -> State:
 
 @final
 @dataclass(frozen=True)
-class YokedDelivery(Wrapper[RobotState]):
+class YokedDelivery(NeuralWrapper[RobotState]):
     """Delivers the stimuli chosen for another episode, which runs in parallel: as many, but unrelated to this one.
 
     The agent observes and acts in the other episode, with its own neurons; when it ends it starts again. The same
     stimuli are delivered here, whatever happens here.
 
     Raises:
-        InvalidArgument: around an environment without neurons, or with a robot that is stepped outside JAX.
+        InvalidArgument: with a robot that is stepped outside JAX.
 
     Source: the non-contingent control of Bakkum et al. 2008, doi:10.1088/1741-2560/5/3/004.
     """
 
     def __post_init__(self) -> None:
-        _expect_neurons(self)
+        super().__post_init__()
         if isinstance(self.robot, HostRobot):
             raise InvalidArgument(f"robot: expected one that is stepped in JAX, got {self.robot.name}, which is not")
 
@@ -201,11 +193,10 @@ class YokedDelivery(Wrapper[RobotState]):
         return _remembering(state, {_OTHER: other, _START: other})
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
-        n, other, start = self.inside.noise_size, state.info[_OTHER], state.info[_START]
+        n, other = self.inside.noise_size, state.info[_OTHER]
         other_after = self.inside.advance(uniforms[n:], other, action, simulator)  # type: ignore[arg-type]
-        next_ = _where(jnp.logical_or(*other_after.ended), start, other_after.carried)
-        after = self.inside.advance(uniforms[:n], state, action, simulator)
-        return _remembering(after, {_OTHER: next_, _START: start})
+        next_ = _where(jnp.logical_or(*other_after.ended), state.info[_START], other_after.carried)
+        return _remembering(self.inside.advance(uniforms[:n], state, action, simulator), {_OTHER: next_})
 
 
 @final
@@ -230,10 +221,9 @@ class GoalSwitch(Wrapper[RobotState]):
         return _remembering(state, {_GOAL: other_goal(self.robot, state.robot, jax.random.fold_in(key, 1))})
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
-        after, other = self.inside.advance(uniforms, state, action, simulator), state.info[_GOAL]
-        switched = capability(self.robot, "with_goal_of")(after.robot, other)
-        robot = _where(after.iteration == self.at, switched, after.robot)
-        return _remembering(after._replace(robot=robot), {_GOAL: other})
+        after = self.inside.advance(uniforms, state, action, simulator)
+        switched = capability(self.robot, "with_goal_of")(after.robot, after.info[_GOAL])
+        return after._replace(robot=_where(after.iteration == self.at, switched, after.robot))
 
 
 @final
@@ -249,11 +239,7 @@ class ReversedMapping(Animat[RobotState]):
 @final
 @dataclass(frozen=True)
 class IdealActuator(Animat[RobotState]):
-    """Moves the robot by a fixed command per condition in place of the response.
-
-    Attributes:
-        commands: one per condition; for a robot with several commands, a tuple of them.
-    """
+    """Moves the robot by the `commands` of the condition (several: a tuple) in place of the response."""
 
     commands: tuple[float | tuple[float, ...], ...]
 
@@ -280,8 +266,7 @@ def other_goal(robot: Robot[RobotState], own: RobotState, key: PRNGKeyArray) -> 
     starts = jax.vmap(robot.reset)(jax.random.split(key, STARTS))
     switched = jax.vmap(capability(robot, "with_goal_of"), (None, 0))(own, starts)
     is_other = jnp.any(jax.vmap(robot.observe)(switched) != robot.observe(own), axis=-1)
-    first: RobotState = jax.tree.map(lambda x: x[jnp.argmax(is_other)], starts)
-    return first
+    return jax.tree.map(lambda x: x[jnp.argmax(is_other)], starts)  # type: ignore[no-any-return]
 
 
 _OTHER, _START, _GOAL, _COST = "other_episode", "other_start", "other_goal", "cost"
@@ -294,8 +279,3 @@ def _remembering(state: State, remembered: dict[str, Any]) -> State:
 
 def _where(condition: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(partial(jnp.where, condition), yes, no)
-
-
-def _expect_neurons(wrapper: Wrapper[Any]) -> None:
-    if not isinstance(inmost := unwrapped(wrapper), Animat):
-        raise InvalidArgument(f"inside: expected an Animat, which has neurons, got {type(inmost).__name__}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -22,28 +22,18 @@ from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
 
 CONTINUOUS_ACTIONS = 21
 """Number of evenly spaced commands that represent a continuous action."""
-
 _QUANTILES = 2048
 """Number of responses of equal probability that represent a condition's distribution, for a continuous mapping."""
-
 _MOST_LEVELS = 12
-
 CLASSES = 6
 """Number of classes of the history state."""
-
 _HISTORIES_PER_CLASS = 8
 """Number of histories that represent a class."""
 
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """For each action, the commands u it can lead to, with their probabilities.
-
-    Attributes:
-        actions: the environment's input for each action: an index, or a command, shape (actions,).
-        levels: the commands of each action, in [-1, 1], shape (actions, levels).
-        probabilities: of each of these commands; every row adds up to 1, shape (actions, levels).
-    """
+    """For each action (the environment's input), the commands u it can lead to, with their probabilities."""
 
     actions: np.ndarray
     levels: Float64[np.ndarray, "actions levels"]
@@ -60,21 +50,13 @@ class Commands:
         levels = np.concatenate([self.levels - shift, self.levels + shift], axis=1)
         return Commands(self.actions, levels, np.concatenate([self.probabilities, self.probabilities], axis=1) / 2)
 
-    def weighted(self, likely: Float64[np.ndarray, "actions levels"]) -> Commands:
-        """The commands with their probabilities multiplied by that of an event, given each command."""
-        return replace(self, probabilities=self.probabilities * likely)
-
     def onto(self, nodes: Float64[np.ndarray, " nodes"], *, smooth: bool) -> Float64[np.ndarray, "actions nodes"]:
         """Weights that give the mean of a function over each action's commands from its values at a few commands.
 
             E[f(u) | action] = sum_k w_k f(u_k),    w_k = E[l_k(u) | action]
 
         with l_k the polynomials (smooth) or hat functions (otherwise) that are 1 at node k and 0 at the others. If all
-        commands are nodes, the weights are their probabilities.
-
-        Args:
-            nodes: the commands at which the function is known, rising.
-            smooth: whether one polynomial through all nodes describes the function well; weights may then be negative.
+        commands are nodes, which rise, the weights are their probabilities; those of polynomials may be negative.
         """
         if smooth:
             basis = np.ones((*self.levels.shape, len(nodes)))
@@ -98,9 +80,6 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     bisection, to the last bit of a float32. For a continuous mapping 2048 responses of equal probability represent a
     condition; 21 evenly spaced commands represent a continuous action.
 
-    Args:
-        simulator: None without neurons.
-
     Raises:
         InvalidArgument: for an Animat without a simulator.
     """
@@ -114,7 +93,6 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
     if simulator is None:
         raise InvalidArgument("simulator: expected a simulator, as an Animat acts through neurons, got None")
     if isinstance(animat.mapping, Thresholds):
-        # The probability of every level, from the shares of responses below each level.
         below = np.asarray(_shares_below(animat.mapping, simulator), np.float64)
         probabilities = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
         levels = np.tile(np.array(animat.mapping.levels), (len(below), 1))
@@ -133,10 +111,9 @@ def commands_of(environment: Environment[Any], simulator: NeuronSimulator | None
 def mean_commands(
     environment: Environment[Any], simulator: NeuronSimulator | None
 ) -> tuple[np.ndarray, Float64[np.ndarray, "actions *commands"]]:
-    """The environment's input for each action, and the mean command that it leads to.
+    """The environment's input for each action, and the mean command that it leads to; errors as in `commands_of`.
 
-    Arguments and errors are those of `commands_of`. Several commands are averaged over 2048 responses of equal
-    probability.
+    Several commands are averaged over 2048 responses of equal probability.
     """
     animat = unwrapped(environment)
     if isinstance(animat, Animat) and simulator is not None and animat.robot.n_commands > 1:
@@ -147,11 +124,7 @@ def mean_commands(
 
 
 def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
-    """Number of classes of the history that are distinguished: one without memory.
-
-    Raises:
-        InvalidArgument: for a custom simulator with memory: its histories are not known.
-    """
+    """Number of classes of the history that are distinguished, one without memory; refuses a custom memory."""
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
         return 1
     if not isinstance(simulator, MemorySimulator):
@@ -172,32 +145,25 @@ def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"])
 
 
 def commands_after(environment: Environment[Any], simulator: NeuronSimulator | None) -> list[list[Commands]]:
-    """The commands that each action leads to after a history of each class, and the class of the next history.
+    """For each class of the history, for each class of the next history: the commands that each action leads to.
 
-    Memory is approximated by six classes (`class_of`): 8 histories represent a class, and 2048 draws after each of them
-    its responses.
-
-    Args:
-        environment, simulator: as in `commands_of`.
-
-    Returns:
-        For each class of the history, for each class of the next history: the commands, with the joint probabilities of
-        commands and next class, which add up to 1 over both. Without memory, one class and the commands of
-        `commands_of`.
+    Their probabilities are joint with the next class and add up to 1 over both. Memory is approximated by six classes
+    (`class_of`): 8 histories represent a class, and 2048 draws after each of them its responses. Without memory there
+    is one class, with the commands of `commands_of`.
     """
-    is_one, animat = layers_of(environment, simulator) == 1, unwrapped(environment)
-    if is_one or not (isinstance(animat, Animat) and isinstance(simulator, MemorySimulator)):
+    animat = unwrapped(environment)
+    if layers_of(environment, simulator) == 1 or not isinstance(simulator, MemorySimulator):
         return [[commands_of(environment, simulator)]]
+    assert isinstance(animat, Animat)
     levels, histories = _answers(animat, simulator, _histories(simulator))
-    levels, classes = np.asarray(levels), class_of(simulator, histories)
+    levels, classes = np.asarray(levels, np.float64), class_of(simulator, histories)
     if is_shuffled(environment):
         # The delivered condition does not depend on the choice: one action represents all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))
     actions, even = np.arange(levels.shape[1]), np.full(levels.shape[1:], 1 / levels.shape[-1])
-    after = [Commands(actions, of_class.astype(np.float64), even) for of_class in levels]
     return [
-        [commands.weighted(likely=then == of) for of in range(len(levels))]
-        for commands, then in zip(after, classes, strict=True)
+        [Commands(actions, of_class, even * (then == of)) for of in range(len(levels))]
+        for of_class, then in zip(levels, classes, strict=True)
     ]
 
 
@@ -232,9 +198,8 @@ def _answers(
     uniforms = (jnp.arange(_QUANTILES, dtype=jnp.float32) + 0.5) / _QUANTILES
     answer = jax.vmap(jax.vmap(simulator.answer, (None, 0, None)), (None, None, 0))
     answers = jax.vmap(jax.vmap(answer, (0, None, None)), (None, None, 0))
-    conditions = jnp.arange(simulator.n_conditions)
-    answered = answers(conditions, uniforms, history)
-    shape = len(history), len(conditions), -1
+    answered = answers(jnp.arange(simulator.n_conditions), uniforms, history)
+    shape = len(history), simulator.n_conditions, -1
     x, then = answered.rate_hz.reshape(shape), answered.history.reshape(*shape, 2)
     return environment.mapping.command(x, simulator.percentiles), then
 
@@ -242,9 +207,7 @@ def _answers(
 def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[np.ndarray, " nodes"], bool]:
     """The fewest commands from which the means over all cases' commands can be computed, and whether by polynomials.
 
-    Args:
-        cases: the distributions to average over.
-        n_smooth: number of Chebyshev nodes that describe a function of the command well; None: it is not smooth.
+    `n_smooth` is the number of Chebyshev nodes that describe a function of the command well; None: it is not smooth.
     """
     levels = np.unique(np.concatenate([np.ravel(case.levels[case.probabilities > 0]) for case in cases]))
     levels = levels[np.concatenate([[True], np.diff(levels) > 1e-6])]
@@ -259,21 +222,19 @@ def nodes_for(cases: Sequence[Commands], n_smooth: int | None) -> tuple[Float64[
 @partial(jax.jit, static_argnums=0)
 def _shares_below(mapping: Thresholds, simulator: NeuronSimulator) -> Float[Array, "conditions thresholds"]:
     """The quantiles at which the command steps up to each level except the lowest, by bisection."""
+    conditions, levels = jnp.arange(simulator.n_conditions), jnp.asarray(mapping.levels[1:], jnp.float32)
+    response = jax.vmap(jax.vmap(simulator.quantile, (None, 0)))
 
-    def is_below(condition: Array, level: Array, quantile: Array) -> Array:
+    def are_below(quantiles: Float[Array, "conditions thresholds"]) -> Array:
         # Levels are 0.2 apart.
-        command = mapping.command(simulator.quantile(condition, quantile), simulator.percentiles)
-        return jnp.asarray(command < level - 0.1)
+        return jnp.asarray(mapping.command(response(conditions, quantiles), simulator.percentiles) < levels - 0.1)
 
-    def share_below(condition: Array, level: Array) -> Float[Array, ""]:
-        def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
-            low, high = bounds
-            middle = (low + high) / 2
-            below = is_below(condition, level, middle)
-            return jnp.where(below, middle, low), jnp.where(below, high, middle)
+    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        middle = (low + high) / 2
+        below = are_below(middle)
+        return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
-        high = jax.lax.fori_loop(0, 40, halve, (jnp.float32(0), jnp.float32(1)))[1]
-        return jnp.where(is_below(condition, level, jnp.float32(0)), high, 0.0)
-
-    levels = jnp.asarray(mapping.levels[1:], jnp.float32)
-    return jax.vmap(lambda c: jax.vmap(lambda level: share_below(c, level))(levels))(jnp.arange(simulator.n_conditions))
+    none = jnp.zeros((len(conditions), len(levels)))
+    high = jax.lax.fori_loop(0, 40, halve, (none, jnp.ones_like(none)))[1]
+    return jnp.where(are_below(none), high, 0.0)

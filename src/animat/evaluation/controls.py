@@ -1,8 +1,4 @@
-"""Controls and interventions that test whether the culture contributes to the return of trained policies.
-
-Each is defined once: on a simulator it is run as defined here, and a closed loop makes an agent from it
-(`animat.closed_loop.agents.agent_of`).
-"""
+"""Controls and interventions that test whether the culture contributes to policies' returns, for simulator and loop."""
 
 from __future__ import annotations
 
@@ -66,10 +62,8 @@ class Control:
     ) -> tuple[Environment[Any], NeuronSimulator | None]:
         """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
-            animat = unwrapped(environment)
-            assert isinstance(animat, Animat)
-            through = animat.robot, animat.mapping, animat.n_conditions
-            changed = ReversedMapping(*through) if self.commands is None else IdealActuator(*through, self.commands)
+            of: Any = vars(unwrapped(environment))
+            changed = ReversedMapping(**of) if self.commands is None else IdealActuator(**of, commands=self.commands)
             environment = replace_innermost(environment, lambda _: changed)
         if self.delivery == "shuffled":
             environment = ShuffledDelivery(environment)
@@ -99,10 +93,7 @@ def controls_of(
     robot's `heuristic`, if it has one; and, through neurons, with policies: *silent*, on a culture without stimuli;
     *shuffled*, with the delivered condition drawn at random in each iteration, whatever they choose.
 
-    Args:
-        environment, simulator: what the policies are evaluated in (no simulator without neurons).
-        labels: of discrete actions.
-        policies: several side by side; None leaves out the controls that need them.
+    `labels` are those of discrete actions; without `policies`, the controls that need them are left out.
     """
     controls = [RANDOM]
     for i, label in enumerate(labels):
@@ -136,9 +127,7 @@ def interventions_of(
     spikes*, the culture's rates, whatever is chosen; *silent* and *shuffled*, as in the controls; *yoked*, the stimuli
     of another episode; *turned round*, the opposite command; *goal switched*, a different goal in mid-episode.
 
-    Args:
-        environment, simulator: what the policies are evaluated in.
-        switch_at: the iteration at which the goal is switched; None leaves it out, as does a robot with one goal.
+    Without `switch_at`, the iteration of the goal's switch, that one is left out, as for a robot with one goal.
     """
     # Mean commands stretched to -1 to 1, each dimension separately; 0 where all are equal.
     means = mean_commands(environment, simulator)[1]
@@ -149,18 +138,11 @@ def interventions_of(
     def control(name: str, meaning: str, **change: Any) -> Control:
         return Control(name, meaning, policies, n_policies, **change)
 
+    by_means = "each condition's mean command, stretched to the full range, in place of the response"
+    at_random = "no pulse; a random recorded response in place of the neurons' own"
     changed = [
-        control(
-            "ideal actuator",
-            "each condition's mean command, stretched to the full range, in place of the response",
-            commands=ideal,
-        ),
-        control(
-            "random spikes",
-            "no pulse; a random recorded response in place of the neurons' own",
-            delivery="silent",
-            is_drawn=True,
-        ),
+        control("ideal actuator", by_means, commands=ideal),
+        control("random spikes", at_random, delivery="silent", is_drawn=True),
         *_without_influence(policies, n_policies),
     ]
     if not isinstance(environment.robot, HostRobot):

@@ -10,7 +10,7 @@ from typing import Any, Literal, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import differential_evolution
 from scipy.stats import t as student_t
 
@@ -24,21 +24,21 @@ from animat.evaluation.statistics import CONFIDENCE, Interval, standard_error
 from animat.evaluation.traces import trace
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress
-from animat.robots.base import capability, lacking
+from animat.robots.base import capability
 from animat.robots.host import HostRobot
 
 Kind = Literal["graded", "switch"]
 KINDS: tuple[Kind, ...] = ("graded", "switch")
 LARGEST_WEIGHT = 12.0
 """Of a quantity in units of its scale: beyond this, a graded command is nearly a switch."""
-GENERATIONS, EPISODES = 60, 32
-"""Generations of a search, and episodes of each coupling, with the same starts and random numbers for all of them."""
-RESTARTS = 2
-"""Searches of each kind."""
+GENERATIONS, EPISODES, RESTARTS = 60, 32, 2
+"""Generations of a search, episodes of each coupling, and searches of each kind."""
 STEEPER = (1.0, 2.0, 4.0, 8.0)
 """Factors for the couplings closest to a heuristic: its commands saturate at -1 and 1, so a linear fit is too flat."""
 FRESH_EPISODES = 512
 """Episodes in which the best of the last generations is chosen: returns in those of the search are biased upwards."""
+_Z = 1.959964
+"""The normal quantile for the ends of a 95 % interval."""
 REFLEX_GAP = 0.05
 """A task needs context only if its context gap surely exceeds this; else a coupling is as good as any controller."""
 
@@ -55,16 +55,15 @@ class Coupling(Actor):
     crossed and uncrossed, are couplings of this kind.
 
     Attributes:
-        weights: W, with b as its last column, shape (actors, commands, seen + 1).
-        actions: the environment's input for each action, shape (actors, actions).
-        means: the mean command of each action, shape (actors, actions), or (actors, actions, commands); None where any
-            command can be given.
+        weights: W, with b as its last column.
+        actions: the environment's input for each action; None where any command can be given.
+        means: the mean command of each action.
         kind: which of the two above.
         seen: indices of the observation that it sees.
     """
 
-    weights: Float[Array, "*actors commands weights"]
-    actions: Array
+    weights: Float[Array, "*actors commands seen+1"]
+    actions: Int[Array, "*actors actions"] | None
     means: Float[Array, "*actors actions *commands"] | None
     kind: Kind
     seen: tuple[int, ...]
@@ -73,7 +72,7 @@ class Coupling(Actor):
         drive = observation[:, jnp.array(self.seen, jnp.int32)] @ self.weights[:, :-1].T + self.weights[:, -1]
         wanted = jnp.tanh(drive) if self.kind == "graded" else jnp.sign(drive)
         wanted = wanted if environment.robot.n_commands > 1 else wanted[:, 0]
-        return wanted if self.means is None else nearest_action(self.actions, self.means, wanted)
+        return nearest_action(self.actions, self.means, wanted)
 
 
 def best_coupling(
@@ -107,15 +106,15 @@ def best_coupling(
     spec = environment.robot.observation_spec
     seen = tuple(i for i, quantity in enumerate(spec) if not quantity.of_goal)
     n_commands = environment.robot.n_commands
-    actions, means = None, None
+    stimuli: Any = (None, None)
     if environment.n_actions is not None:
-        actions, means = mean_commands(environment, simulator)
+        actions, commands = mean_commands(environment, simulator)
+        stimuli = jnp.asarray(actions), jnp.asarray(commands, jnp.float32)
 
     def actor(kind: Kind, weights: Float64[np.ndarray, "actors weights"]) -> Coupling:
-        n, shaped = len(weights), weights.reshape(len(weights), n_commands, len(seen) + 1)
-        each = None if means is None else jnp.broadcast_to(jnp.asarray(means, jnp.float32), (n, *means.shape))
-        acts = jnp.zeros((n, 1)) if actions is None else jnp.broadcast_to(jnp.asarray(actions), (n, len(actions)))
-        return Coupling(jnp.asarray(shaped, jnp.float32), acts, each, kind, seen)
+        inputs, means = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(weights), *x.shape)), stimuli)
+        shaped = weights.reshape(len(weights), n_commands, len(seen) + 1)
+        return Coupling(jnp.asarray(shaped, jnp.float32), inputs, means, kind, seen)
 
     def mean_returns(coupling: Coupling, episodes: int, seed: int) -> Float64[np.ndarray, " actors"]:
         n = len(coupling.weights)
@@ -160,12 +159,9 @@ def best_coupling(
 def _near_heuristic(
     environment: Environment[Any], simulator: NeuronSimulator | None, seen: tuple[int, ...], seed: int
 ) -> Float64[np.ndarray, "starts weights"]:
-    """The coupling closest to the robot's heuristic, by least squares over its episodes, and steeper ones.
-
-    Empty if it has no heuristic.
-    """
+    """The coupling closest to the robot's heuristic, by least squares over its episodes, and steeper ones, if any."""
     robot = environment.robot
-    if "heuristic" in lacking(robot):
+    if not hasattr(robot, "heuristic"):
         return np.zeros((0, 0))
     policy = heuristic_policy(environment, simulator)
     ran = trace(environment, simulator, policy, 1, episodes=EPISODES, seed=seed)
@@ -189,8 +185,7 @@ class ContextGap:
     Attributes:
         coupling: mean return of the best coupling.
         standard_error: of `coupling`.
-        gap: with its interval, on this simulator: for the episodes of coupling and random stimuli, and for the
-            optimum's grid or the episodes of the agent that replaces it. None if the optimum is not above random
+        gap: with its interval for the episodes and the optimum's grid. None if the optimum is not above random
             stimuli, or with one episode.
         best_known: mean return of the best known agent, which replaces the optimum; None if the optimum is known.
         highest: if it is not, the highest possible return of an episode.
@@ -201,11 +196,6 @@ class ContextGap:
     gap: Interval | None
     best_known: float | None = None
     highest: float = np.inf
-
-    @property
-    def is_least(self) -> bool:
-        """Whether gap and score are lower bounds, as the optimum is not known."""
-        return self.best_known is not None
 
     @property
     def needs_context(self) -> bool:
@@ -219,11 +209,7 @@ class ContextGap:
 
         An unknown optimum is between the best known agent and the highest possible return of an episode. The lower
         bound of the score then uses the latter, or the former if the policies are below the coupling. None if the task
-        is not known to need context, or with a single policy.
-
-        Args:
-            returns: mean return of each policy.
-            optimum: on the same simulator; None if it is not known.
+        is not known to need context, or with a single policy; `returns` are the policies' means.
         """
         if not self.needs_context or len(returns) < 2:
             return None
@@ -248,36 +234,30 @@ class ContextGap:
             "coupling_standard_error": self.standard_error if np.isfinite(self.standard_error) else None,
             "context_gap": None if self.gap is None else self.gap.to_dict(),
             "needs_context": self.needs_context,
-            "is_least": self.is_least,
+            "is_least": self.best_known is not None,
             "best_known": self.best_known,
         }
 
     def to_text(self, score: Interval | None = None) -> str:
         """One line, with the policies' context score if it is known."""
-        coupling = f"best coupling {self.coupling:.1f} ± {self.standard_error:.1f}"
+        coupling = f"best coupling {self.coupling:.1f}"
         if not np.isfinite(self.standard_error):
-            return f"best coupling {self.coupling:.1f}; no context gap with one episode"
+            return f"{coupling}; no context gap with one episode"
+        coupling, known = f"{coupling} ± {self.standard_error:.1f}", self.best_known
         if self.gap is None:
-            best = "the optimal return" if self.best_known is None else f"the best known agent ({self.best_known:.1f})"
+            best = "the optimal return" if known is None else f"the best known agent ({known:.1f})"
             return f"{coupling}; no context gap, as {best} is not above that of random stimuli"
-        least = "at least " if self.is_least else ""
-        gap = f"context gap {least}{self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
-        if self.best_known is not None:
-            gap += f", as the best known agent returns {self.best_known:.1f}"
-        if self.needs_context:
-            needs = ""
-        elif self.is_least or self.gap.high > REFLEX_GAP:
-            needs = ": whether this task needs more than a reflex is not known"
-        else:
-            needs = ": this task needs no more than a reflex"
-        scored = ""
+        least = "" if known is None else "at least "
+        text = f"{coupling}; context gap {least}{self.gap.value:.2f} ({self.gap.low:.2f} to {self.gap.high:.2f})"
+        if known is not None:
+            text += f", as the best known agent returns {known:.1f}"
+        if not self.needs_context and known is None and self.gap.high <= REFLEX_GAP:
+            text += ": this task needs no more than a reflex"
+        elif not self.needs_context:
+            text += ": whether this task needs more than a reflex is not known"
         if score is not None:
-            scored = f"; context score {least}{score.value:.2f} ({score.low:.2f} to {score.high:.2f})"
-        return f"{coupling}; {gap}{needs}{scored}"
-
-
-_Z = 1.959964
-"""The normal quantile for the ends of a 95 % interval."""
+            text += f"; context score {least}{score.value:.2f} ({score.low:.2f} to {score.high:.2f})"
+        return text
 
 
 def context_gap(
@@ -285,10 +265,9 @@ def context_gap(
 ) -> ContextGap:
     """The context gap of a task, from returns of the best coupling and of random stimuli in fresh episodes."""
     means, errors = ([float(f(x)) for x in (coupling, random)] for f in (np.mean, standard_error))
-    best, span = optimum.value, optimum.value - means[1]
-    gap = None
+    span, gap = optimum.value - means[1], None
     if span > 0 and np.isfinite(errors).all():
-        value = (best - means[0]) / span
+        value = (optimum.value - means[0]) / span
         # Derivatives of the gap: by coupling -1, by random stimuli gap, by optimum 1 - gap, each divided by the span.
         parts = np.array([errors[0], value * errors[1], (1 - value) * optimum.grid_error / _Z])
         spread = float(_Z * np.linalg.norm(parts) / span)
@@ -306,12 +285,9 @@ def least_context_gap(
 
     The optimum is not below the return of any agent, nor below the coupling. If the coupling is above random stimuli,
     the gap grows with the optimum, so an agent in its place gives a lower bound; else the gap is at least 1. The best
-    of several agents is chosen by the first half of their episodes; its return is that of the second half.
-
-    Args:
-        coupling, random: returns in the same episodes, with the same starts.
-        known: returns of all agents, policies and heuristics.
-        highest: the highest possible return of an episode.
+    of several agents (policies and heuristics, all in `known`) is chosen by the first half of their episodes; its
+    return is that of the second half. `coupling` and `random` are returns in the same episodes, with the same starts;
+    `highest` is the highest possible return.
     """
     half = known.shape[1] // 2 if len(known) > 1 else 0
     best = known[known[:, : max(half, 1)].mean(axis=1).argmax(), half:]

@@ -20,46 +20,31 @@ from animat.robots.base import capability
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class HeuristicPolicy(Actor):
-    """The action whose mean command is nearest to that of the robot's `heuristic`.
+    """The action whose mean command is nearest to that of the robot's `heuristic`, which sees only the robot.
 
     Attributes:
-        actions: the environment's input for each action, shape (1, actions), for one actor.
+        actions: the environment's input for each action, shape (1, actions), for one actor; None where any command can
+            be given (without neurons, continuous ones).
         means: the mean command of each action, the same shape, or (1, actions, commands) for several commands.
     """
 
-    actions: Array
-    means: Float[Array, "..."]
+    actions: Array | None = None
+    means: Float[Array, "..."] | None = None
 
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        return nearest_action(self.actions, self.means, _wanted(environment, observation))
+        of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
+        wanted: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
+        return nearest_action(self.actions, self.means, wanted)
 
 
-# Static: JAX confuses registered dataclasses without fields.
-@final
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class Heuristic(Actor):
-    """The commands of the robot's `heuristic` themselves, where any can be given: without neurons, continuous ones."""
-
-    def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
-        return _wanted(environment, observation)
-
-
-def _wanted(environment: Environment[Any], observation: Seen) -> Array:
-    """The commands of the robot's `heuristic`, which sees only the robot."""
-    of_robot = (observation * environment.scales)[:, : len(environment.robot.observation_spec)]
-    commands: Array = jax.vmap(capability(environment.robot, "heuristic"))(of_robot)
-    return commands
-
-
-def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> Heuristic | HeuristicPolicy:
+def heuristic_policy(environment: Environment[Any], simulator: NeuronSimulator | None) -> HeuristicPolicy:
     """The heuristic policy for an environment and the neurons in it, as one actor for `roll_out`.
 
     Raises:
         InvalidArgument: for a robot without a `heuristic`.
     """
-    capability(environment.robot, "heuristic")  # Raises if there is none.
+    capability(environment.robot, "heuristic")
     if environment.n_actions is None:
-        return Heuristic()
+        return HeuristicPolicy()
     actions, means = mean_commands(environment, simulator)
     return HeuristicPolicy(jnp.asarray(actions)[None], jnp.asarray(means, jnp.float32)[None])

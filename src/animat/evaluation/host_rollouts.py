@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,20 +14,13 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment, State
 from animat.neurons.simulator import NeuronSimulator
-from animat.robots.host import Bodies, HostRobot
+from animat.robots.host import Bodies, HostRobot, StepResult
 
 AT_ONCE = 64
 """Bodies side by side: each may take megabytes, and more would not make a step cheaper."""
 
 _LAST = threading.local()
 """The bodies of a thread's last wave: creating new ones takes longer than many an episode."""
-
-
-class Acting(Protocol):
-    """What chooses actions (`animat.evaluation.rollouts.Actor`)."""
-
-    def act(self, environment: Environment[Any], observation: Array, uniforms: Array) -> Array:
-        """An action for each scaled observation."""
 
 
 class Counts(NamedTuple):
@@ -44,18 +37,11 @@ def roll_out_on_host(
     environment: Environment[Any],
     episodes: int,
     simulator: NeuronSimulator | None,
-    actors: Acting,
+    actors: Any,
     keys: Key[Array, " actors"],
     seed: int,
 ) -> Counts:
-    """Run episodes of several actors, at most `AT_ONCE` side by side.
-
-    Args:
-        environment: with a robot that is stepped on the host.
-        episodes, simulator, actors: as in `animat.evaluation.rollouts.roll_out`.
-        keys: for each actor's random draws.
-        seed: of the bodies' episodes.
-    """
+    """Run episodes of several actors, at most `AT_ONCE` side by side; `seed` is that of the bodies' episodes."""
     counts = _zeros(environment, simulator, (len(keys), episodes))
     side_by_side = min(AT_ONCE, episodes)
     actors_at_once = max(1, AT_ONCE // side_by_side)
@@ -79,7 +65,7 @@ def roll_out_on_host(
 def paths_on_host(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
-    actors: Acting,
+    actors: Any,
     keys: Key[Array, " actors"],
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,17 +82,13 @@ def paths_on_host(
     for number, key in enumerate(keys):
         actor, alone = jax.tree.map(lambda part, number=number: part[number : number + 1], actors), key[None]
         bodies = Bodies(robot, [(seed, number)])
-        state = _started(environment, alone, 1)._replace(robot=bodies.begin()[None])
-        observations[number] = state.robot[0]
-        for iteration in range(robot.episode_limit):
-            command, state, _ = _iteration(environment, simulator, actor, alone, np.int32(iteration), state)
-            stepped = bodies.step(np.asarray(command).reshape(1, -1))
-            commands[number, iteration] = np.asarray(command)[0].reshape(of_each)
-            observations[number, iteration + 1 :] = stepped.observation
+        observations[number] = bodies.begin()
+        for command, _, stepped in _iterations(environment, simulator, actor, alone, bodies):
+            commands[number, lengths[number]] = command[0].reshape(of_each)
             lengths[number] += 1
+            observations[number, lengths[number] :] = stepped.observation
             if stepped.ended[0]:
                 break
-            state = state._replace(robot=stepped.observation[None])
     return observations, commands, lengths
 
 
@@ -122,32 +104,44 @@ def _wave(
     robot, shape = environment.robot, (len(keys), len(seeds) // len(keys))
     assert isinstance(robot, HostRobot)
     bodies = _bodies(robot, seeds)
-
-    def seen(observation: np.ndarray) -> np.ndarray:
-        return observation.reshape(*shape, -1)
-
-    state = _started(environment, keys, shape[1])._replace(robot=seen(bodies.begin()))
+    bodies.begin()
     going = np.broadcast_to(np.arange(shape[1]) < counted, shape).copy()
     counts = _zeros(environment, simulator, shape)
     of_actor = np.indices(shape)[0]
-    for iteration in range(robot.episode_limit):
-        command, state, delivered = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
-        stepped = bodies.step(np.asarray(command).reshape(len(seeds), -1))
+    for command, delivered, stepped in _iterations(environment, simulator, actors, keys, bodies):
         counts.returns[:] += np.where(going, stepped.reward.reshape(shape), 0.0)
         counts.lengths[:] += going
         counts.terminated[:] |= going & stepped.terminated.reshape(shape)
         if counts.presented.size:
-            at = of_actor[going], np.asarray(delivered)[going]
+            at = of_actor[going], delivered[going]
             np.add.at(counts.presented, at, 1)
-            np.add.at(counts.commanded, at, np.asarray(command)[going])
+            np.add.at(counts.commanded, at, command[going])
         going &= ~stepped.ended.reshape(shape)
         if not going.any():
             break
-        if stepped.ended.any():
-            # Ended episodes begin again and are no longer counted: a body must not be stepped after its end.
-            bodies.begin(np.flatnonzero(stepped.ended).tolist())
-        state = state._replace(robot=seen(bodies.observation))
     return counts
+
+
+def _iterations(
+    environment: Environment[Any],
+    simulator: NeuronSimulator | None,
+    actors: Any,
+    keys: Key[Array, " actors"],
+    bodies: Bodies,
+) -> Iterator[tuple[np.ndarray, np.ndarray, StepResult]]:
+    """The commands, delivered conditions and results of each iteration of bodies that have begun, for the same actors.
+
+    Ended episodes begin again: a body must not be stepped after its end.
+    """
+    shape = len(keys), len(bodies) // len(keys)
+    state = _started(environment, keys, shape[1])
+    for iteration in range(environment.robot.episode_limit):
+        state = state._replace(robot=bodies.observation.reshape(*shape, -1))
+        command, state, delivered = _iteration(environment, simulator, actors, keys, np.int32(iteration), state)
+        stepped = bodies.step(np.asarray(command).reshape(len(bodies), -1))
+        yield np.asarray(command), np.asarray(delivered), stepped
+        if stepped.ended.any():
+            bodies.begin(np.flatnonzero(stepped.ended).tolist())
 
 
 def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
@@ -188,7 +182,7 @@ def _iteration(
 ) -> tuple[Float[Array, "actors episodes *commands"], State, Array]:
     """Commands, the next state, and the delivered conditions."""
 
-    def of_actor(actor: Acting, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
+    def of_actor(actor: Any, key: PRNGKeyArray, state: State) -> tuple[Array, State, Array]:
         n, n_drawn = len(state.iteration), environment.n_drawn
         uniforms = jax.random.uniform(jax.random.fold_in(key, iteration), (n, n_drawn + environment.noise_size))
         observation = jax.vmap(environment.observe)(state) / environment.scales

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -29,22 +29,16 @@ PERMUTATIONS = 199
 
 @dataclass(frozen=True)
 class GoalInformation:
-    """I(action; goal | sensors) in bits.
+    """I(action; goal | sensors) in bits, with its interval over states and actors.
 
     Attributes:
-        bits: with its interval, over states and actors.
-        p: share of permutations of the actions at each state among the goals whose estimate is at least as large as
-            that of the original actions.
+        p: share of permutations of the actions at each state among the goals with at least as large an estimate.
         most: log2 of the number of actions, or of goals if there are fewer.
     """
 
     bits: Interval
     p: float
     most: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        return asdict(self)
 
     def to_text(self) -> str:
         """One line."""
@@ -90,8 +84,8 @@ def goal_information(
     states = jax.tree.map(lambda x: x[rows, columns, when], traced.states)
     key = jax.random.key(int(rng.integers(2**31)))
     actions = np.asarray(_at_each_goal(environment, draws, states, actors, jax.random.split(key, n_actors)))
-    # The samples are the actors, or the states of a single actor.
     bits = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)
+    # The samples are the actors, or the states of a single actor.
     samples = bits.reshape(when.shape).mean(axis=1) if n_actors > 1 else bits
     pairs = actions[..., :2].reshape(len(bits), -1, 2)
     null = [
@@ -114,12 +108,8 @@ def conditional_information(
 ) -> Float64[np.ndarray, " states"]:
     """H(A) - E_g H(A | g) at each state in bits, corrected for few draws and few goals.
 
-    The entropy of the actions with one goal is Miller and Madow's; that of the mixture of goals is a jackknife over
-    goals.
-
-    Args:
-        actions: drawn with each goal, from 0 to `n_actions` - 1.
-        n_actions: number of actions.
+    The entropy of the actions (from 0 on) with one goal is Miller and Madow's; that of the mixture of goals is a
+    jackknife over goals.
 
     Source: Miller 1955, in Information Theory in Psychology, 95; Efron & Stein 1981, doi:10.1214/aos/1176345462.
     """
@@ -174,7 +164,6 @@ def _at_each_goal(environment: Environment[Any], draws: int, states: Any, actors
 
         each = jnp.arange(EPISODES), states, jax.random.split(key, EPISODES)
         # State after state: all at once would take gigabytes.
-        actions: Array = jax.lax.map(lambda one: with_others(*one), each)
-        return actions
+        return jax.lax.map(lambda one: with_others(*one), each)  # type: ignore[no-any-return]
 
     return jax.vmap(of_actor)(states, actors, keys)

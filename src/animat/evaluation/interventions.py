@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
-from animat.evaluation.rollouts import Episodes, Networks, roll_out
+from animat.evaluation.rollouts import Networks, roll_out
 from animat.evaluation.statistics import Interval
 from animat.evaluation.traces import Traces, trace
 from animat.neurons.simulator import NeuronSimulator
@@ -34,8 +34,6 @@ class InterventionRow:
     """Policies with one intervention.
 
     Attributes:
-        name, meaning: of the intervention.
-        returns: shape (policies, episodes).
         lost: mean loss of return against the same policies as they are, with its interval; negative for a gain.
         information: goal information of their choices; None if it was not computed.
     """
@@ -53,7 +51,7 @@ class InterventionRow:
             "meaning": self.meaning,
             "mean_return": float(self.returns.mean()),
             "lost": as_json(self.lost.to_dict()),
-            "goal_information": None if self.information is None else self.information.to_dict(),
+            "goal_information": None if self.information is None else asdict(self.information),
         }
 
 
@@ -63,7 +61,7 @@ class SwitchEffect:
 
     Attributes:
         at: number of actions after which the goal was switched.
-        episodes: number of episodes that lasted longer.
+        episodes: number that lasted longer.
         turned: share of these in which a different stimulus was chosen at any time after the switch.
         after: median number of actions from the switch to that choice, 1 for the first action; None if there was none.
     """
@@ -84,11 +82,9 @@ class SwitchEffect:
 
 @dataclass(frozen=True, eq=False)
 class InterventionTable:
-    """Policies with each intervention, on one simulator.
+    """The policies as they are and with each intervention, on one simulator.
 
-    Attributes:
-        rows: the policies as they are, then with each intervention.
-        turning: the effect of the goal switch; None for a robot with only one goal.
+    `turning` is the effect of the goal switch, None for a robot with only one goal.
     """
 
     __repr__ = briefly
@@ -98,10 +94,8 @@ class InterventionTable:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return {
-            "rows": [row.to_dict() for row in self.rows],
-            "turning": None if self.turning is None else vars(self.turning),
-        }
+        turning = None if self.turning is None else vars(self.turning)
+        return {"rows": [row.to_dict() for row in self.rows], "turning": turning}
 
     def to_text(self) -> str:
         """A table for a terminal."""
@@ -115,13 +109,9 @@ class InterventionTable:
             *align_columns(["", "return", "lost", "95 % interval", "bits", ""], cells),
         ]
         information = self.rows[0].information
-        if information is None:
-            lines.append("  no goal information: the robot has only one goal (no method `with_goal_of`)")
-        else:
-            lines.append(f"  {information.to_text()}")
-        if self.turning is not None:
-            lines.append(f"  {self.turning.to_text()}")
-        return "\n".join(lines)
+        one_goal = "no goal information: the robot has only one goal (no method `with_goal_of`)"
+        lines.append(f"  {one_goal if information is None else information.to_text()}")
+        return "\n".join(lines if self.turning is None else [*lines, f"  {self.turning.to_text()}"])
 
 
 def run_interventions(
@@ -136,12 +126,8 @@ def run_interventions(
 ) -> InterventionTable:
     """Run policies as they are and with every intervention of `animat.evaluation.controls.interventions_of`.
 
-    The goal is switched in the middle of the policies' median episode.
-
-    Args:
-        episodes: of each policy and intervention.
-        seed: decides every random draw.
-        progress: updated before each intervention.
+    The goal is switched in the middle of the policies' median episode. `episodes` are of each policy and intervention;
+    `seed` decides every random draw.
 
     Raises:
         InvalidArgument: for an environment without neurons.
@@ -149,27 +135,22 @@ def run_interventions(
     if simulator is None or not isinstance(unwrapped(environment), Animat):
         raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")
     progress, draws = progress or Silent(), 2 if policies.greedy else DRAWS
-
-    def run(control: Control) -> Episodes:
-        within = control.within(environment, simulator)
-        return roll_out(*within, policies, n_policies, episodes=episodes, seed=seed)
-
     plain = Control(AS_THEY_ARE, "through the culture's simulator", policies, n_policies)
-    usual = run(plain)
+    usual = roll_out(environment, simulator, policies, n_policies, episodes=episodes, seed=seed)
     has_goals = hasattr(environment.robot, "with_goal_of")
     switch_at = max(1, int(np.median(usual.lengths)) // 2) if has_goals else None
     acting = [plain, *interventions_of(environment, simulator, policies, n_policies, switch_at=switch_at)]
     rows = []
     for number, control in enumerate(acting):
         progress.update(number, len(acting), control.name)
-        returns = usual.returns if control is plain else run(control).returns
-        lost = usual.returns - returns
+        within = control.within(environment, simulator)
+        ran = usual if control is plain else roll_out(*within, policies, n_policies, episodes=episodes, seed=seed)
+        lost = usual.returns - ran.returns
         information = None
         if has_goals and control.name in WITH_INFORMATION:
-            within = control.within(environment, simulator)
             information = goal_information(*within, policies, n_policies, draws=draws, seed=seed)
         samples = lost.mean(axis=1) if n_policies > 1 else lost[0]
-        rows.append(InterventionRow(control.name, control.meaning, returns, interval_of_mean(samples), information))
+        rows.append(InterventionRow(control.name, control.meaning, ran.returns, interval_of_mean(samples), information))
     turning = None
     if switch_at is not None:
         # The same episodes, with the same random numbers, with and without a switch.

@@ -26,13 +26,12 @@ class Landings(NamedTuple):
 
     Attributes:
         rows: first of the rows around the next state; the same for all nodes of a row, as the first coordinate does not
-            influence how the others change; shape (landings, rows).
-        row_places: distances from that row in steps, shape (landings, rows, axes).
+            influence how the others change.
+        row_places: distances from that row in steps.
         nodes: first of the nodes along the row; `ENDED` where the task ended, `ENDS_NEXT` where the next iteration will
-            end it, shape (landings, rows, nodes).
-        places: distances from that node in steps; for `ENDS_NEXT` the reward of the next iteration, shape
-            (landings, rows, nodes).
-        rewards: of the iteration, shape (landings, rows, nodes).
+            end it.
+        places: distances from that node in steps; for `ENDS_NEXT` the reward of the next iteration.
+        rewards: of the iteration.
     """
 
     rows: Int32[np.ndarray, "landings rows"]
@@ -54,7 +53,7 @@ class Landings(NamedTuple):
 
 
 class Motion:
-    """One iteration of a robot as landings on a grid; compiled once."""
+    """One iteration of a robot as landings on a grid, compiled once; one for each command and, within, noise draw."""
 
     def __init__(
         self,
@@ -63,7 +62,6 @@ class Motion:
         commands: Float[np.ndarray, " commands"],
         uniforms: Float[np.ndarray, "draws noise"],
     ) -> None:
-        """Set up the commands and the noise draws; a landing is a pair of them, commands outer."""
         self._grid = grid
         self._u = jnp.repeat(jnp.asarray(commands, jnp.float32), len(uniforms))
         self._noise = jnp.tile(jnp.asarray(uniforms, jnp.float32), (len(commands), 1))
@@ -84,10 +82,8 @@ class Motion:
             along = jnp.arange(grid.along.stored)
             states = jax.vmap(jax.vmap(grid.state_at, (None, 0)), (0, None))(rows, along)
             flat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), len(along))).ravel(), states)
-            shape = (len(self._u), len(rows), len(along))
-            row, row_places, node, place, reward, positions = (
-                x.reshape(*shape, *x.shape[2:]) for x in from_states(flat)
-            )
+            landed = (x.reshape(len(self._u), len(rows), len(along), *x.shape[2:]) for x in from_states(flat))
+            row, row_places, node, place, reward, positions = landed
             middle = len(along) // 2
             apart = jnp.abs(positions - positions[:, :, middle : middle + 1])
             # Positions do not matter once the task has ended.
@@ -103,11 +99,7 @@ class Motion:
         return Landings(row, row_places, *(x[:, :, None] for x in along))
 
     def from_grid(self) -> Landings:
-        """Landings from every node of the grid.
-
-        Raises:
-            InvalidArgument: if the grid's first coordinate influences how the others change.
-        """
+        """Landings from every node of the grid; InvalidArgument if its first coordinate influences the others."""
         grid, n = self._grid, len(self._u)
         at_once = max(1, min(grid.n_rows, _NODES_AT_ONCE // (grid.along.stored * n)))
         rows, nodes = (n, grid.n_rows), (n, grid.n_rows, grid.along.stored)
@@ -130,34 +122,16 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
-    """Pairs of a landing of the robot and a layer of values, and their weights in each action's mean.
-
-    Attributes:
-        pairs: a landing and a layer, shape (outcomes, 2).
-        weights: of each pair, for each action and each layer in which an iteration starts, shape
-            (layers, actions, outcomes).
-    """
+    """Pairs of a landing of the robot and a layer of values, and their weights in the mean of each layer's actions."""
 
     pairs: Int32[np.ndarray, "outcomes 2"]
     weights: Float32[np.ndarray, "layers actions outcomes"]
 
     @classmethod
     def of(
-        cls,
-        after: Sequence[Sequence[Commands]],
-        nodes: Float64[np.ndarray, " nodes"],
-        *,
-        smooth: bool,
-        n_draws: int,
+        cls, after: Sequence[Sequence[Commands]], nodes: Float64[np.ndarray, " nodes"], *, smooth: bool, n_draws: int
     ) -> Outcomes:
-        """The outcomes of one case.
-
-        Args:
-            after: the commands, as returned by `commands_after`.
-            nodes, smooth: the commands whose landings are known, as in `Commands.onto`.
-            n_draws: number of equally likely draws of the robot's noise; a landing is a pair of a node and a draw,
-                nodes outer.
-        """
+        """The outcomes of one case: its `commands_after` on `nodes` (`Commands.onto`), each with the noise draws."""
         spread = np.array([[commands.onto(nodes, smooth=smooth) for commands in row] for row in after])
         weights = np.moveaxis(np.repeat(spread / n_draws, n_draws, axis=-1), 1, 2).astype(np.float32)
         then, landings = np.nonzero(np.any(weights != 0, axis=(0, 1)))
@@ -174,14 +148,13 @@ def side_by_side(
     A case with fewer actions is padded with its last one, one with fewer outcomes with weights of 0.
     """
     most_actions, most_outcomes = (max(case.weights.shape[axis] for case in cases) for axis in (1, 2))
-    pairs, weights = [], []
-    first = 0
+    pairs, weights, first = [], [], 0
     for case in cases:
         layers, actions, outcomes = case.weights.shape
-        room = most_outcomes - outcomes
-        shifted = np.pad(case.pairs + np.array([0, first], np.int32), ((0, room), (0, 0)))
+        room = (0, most_outcomes - outcomes)
+        shifted = np.pad(case.pairs + np.array([0, first], np.int32), (room, (0, 0)))
         pairs.append(np.repeat(shifted[None], layers, axis=0))
         more = np.pad(case.weights, ((0, 0), (0, most_actions - actions), (0, 0)), mode="edge")
-        weights.append(np.pad(more, ((0, 0), (0, 0), (0, room))))
+        weights.append(np.pad(more, ((0, 0), (0, 0), room)))
         first += layers
     return np.concatenate(pairs), np.concatenate(weights)

@@ -10,7 +10,7 @@ from animat.coding.mapping import Mapping, Thresholds
 from animat.environment import Animat
 from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
 from animat.evaluation.optimum import Optimum, best_returns
-from animat.evaluation.resampling import RESAMPLES, with_enough_samples, with_intervals
+from animat.evaluation.resampling import RESAMPLES, WellSampled, with_enough_samples
 from animat.evaluation.rollouts import Uniform, roll_out
 from animat.evaluation.statistics import standard_error
 from animat.neurons.simulator import HistogramSimulator, fit_histogram, pooled_percentiles
@@ -64,7 +64,7 @@ def optimal_returns(
             than 30 non-burst responses are left out, also for the random stimuli.
         resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by at most 0.8.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
-        resamples: of the responses, for the optimum's interval (`with_intervals`).
+        resamples: of the responses, for the optimum's interval (`WellSampled.with_interval`).
         seed: decides every random draw.
         progress: what to report to; optima, their intervals, and couplings take about as long each.
 
@@ -79,19 +79,21 @@ def optimal_returns(
         # The mapping's thresholds are those of all responses, even if some of them are left out.
         return replace(simulator, percentiles=pooled_percentiles(all_responses)) if left_out else simulator
 
-    simulator = fit(responses)
+    simulator, n = fit(responses), len(mappings)
     cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
     solving, resampling, searching = (Part(progress or Silent(), third, 1, 3) for third in range(3))
-    best = best_returns(cases, resolution=resolution, episodes=episodes, seed=seed, progress=solving)
-    environments = [environment for environment, _ in cases]
-    options: dict[str, Any] = {"resolution": resolution, "resamples": resamples, "seed": seed}
-    best = with_intervals(best, environments, responses, fit, progress=resampling, **options)
+    options: dict[str, Any] = {"resolution": resolution, "seed": seed}
+    best = list(best_returns(cases, episodes=episodes, progress=solving, **options))
+    for i, case in enumerate(cases):
+        of_case = WellSampled(*case, responses, left_out, fit)
+        best[i] = of_case.with_interval(best[i], resamples=resamples, progress=Part(resampling, i, 1, n), **options)
     optima: list[OptimalReturn] = []
     for mapping, case, optimum in zip(mappings, cases, best, strict=True):
         random = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
-        coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(optima), 1, len(cases)))
+        coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(optima), 1, n))
         of_coupling = roll_out(*case, coupling, 1, episodes=episodes, seed=seed).returns[0]
         gap = context_gap(of_coupling, random, optimum)
-        means = float(random.mean()), standard_error(random)
-        optima.append(OptimalReturn(robot.name, mapping.name, *means, replace(optimum, left_out=left_out), gap))
+        optima.append(
+            OptimalReturn(robot.name, mapping.name, float(random.mean()), standard_error(random), optimum, gap)
+        )
     return tuple(optima)

@@ -79,11 +79,9 @@ class Optimum:
 
     def to_text(self) -> str:
         """One line: the value and how well it is known."""
-        text = f"optimal return {self.value:.1f}"
-        if self.interval is not None:
-            text += (
-                f", {100 * self.interval.confidence:g} % interval {self.interval.low:.1f} to {self.interval.high:.1f}"
-            )
+        text, interval = f"optimal return {self.value:.1f}", self.interval
+        if interval is not None:
+            text += f", {100 * interval.confidence:g} % interval {interval.low:.1f} to {interval.high:.1f}"
         text += f" (grid {self.grid_error:.1f})"
         if self.episodes:
             text += (
@@ -100,26 +98,17 @@ class Optimum:
 
 
 def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
-    """A warning if a value and its controller's return differ by more than 3 standard errors plus the grid's error.
-
-    Args:
-        value, grid_error, monte_carlo: as in `Optimum`.
-        error: the `standard_error` of `monte_carlo`.
-    """
-    difference = value - monte_carlo
+    """A warning if a value and its controller's return differ by more than 3 of its `error` plus the grid's error."""
+    difference, of_controller = value - monte_carlo, f"its controller's return {monte_carlo:.2f} ± {error:.2f}"
     # No warning for NaN, where the controller was not run.
     if not abs(difference) > max(_SAME, 3 * error + grid_error):
         return ()
-    message = (
-        f"the value {value:.2f} (grid {grid_error:.2f}) and its controller's return {monte_carlo:.2f} ± {error:.2f}"
+    too_coarse = (
+        f", which is achievable, differ: the grid is too coarse (or the {CLASSES} history classes of a memory "
+        "simulator are); use a higher resolution"
     )
-    if difference > 0:
-        message += " differ: the optimal return lies between the two"
-    else:
-        message += (
-            f", which is achievable, differ: the grid is too coarse (or the {CLASSES} history classes of a memory "
-            "simulator are); use a higher resolution"
-        )
+    which = " differ: the optimal return lies between the two" if difference > 0 else too_coarse
+    message = f"the value {value:.2f} (grid {grid_error:.2f}) and {of_controller}{which}"
     return (Finding("optimum", "warning", message, difference),)
 
 
@@ -189,13 +178,12 @@ def best_returns(
         programme = _Programme(fine, batch)
         tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
         values = programme.run(tables, seed, Part(part, 1, 3, 4))
-        for case in range(len(batch)):
+        for case, (value, coarser) in enumerate(zip(values.tolist(), rough.tolist(), strict=True)):
             run = math.nan, math.nan, math.nan, math.nan
             if tables is not None:
                 known, unknown = (programme.play(tables, case, episodes, seed, clock=clock) for clock in (True, False))
                 run = float(known.mean()), standard_error(known), float(unknown.mean()), standard_error(unknown)
-            grid_error = float(abs(values[case] - rough[case]))
-            optima.append(Optimum(float(values[case]), grid_error, *run, episodes, fine.size))
+            optima.append(Optimum(value, abs(value - coarser), *run, episodes, fine.size))
         progress.update(len(optima), len(cases), f"optimum {optima[-1].value:.1f}")
     return tuple(optima)
 
@@ -203,18 +191,14 @@ def best_returns(
 def rough_values(
     cases: Sequence[Case], grid: Grid, seed: int, progress: Progress | None = None
 ) -> tuple[Float64[np.ndarray, " cases"], tuple[float, float]]:
-    """Only the values, of many cases on a given grid, and the lowest and the highest possible return.
-
-    Args:
-        cases, grid, seed, progress: as in `best_returns`.
-    """
+    """Only the values, of many cases on a given grid, and the lowest and the highest possible return."""
     programme = _Programme(grid, cases)
     return programme.run(None, seed, progress or Silent()), programme.bounds
 
 
+# At module level, so that it is compiled once, with the clock and without.
 @partial(jax.jit, static_argnums=(0, 1))
 def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, action: Any, simulator: Any) -> Any:
-    """An iteration of every episode; at module level, so that it is compiled once, with the clock and without."""
     uniforms = jax.random.uniform(key, (episodes, environment.noise_size))
     return jax.vmap(environment.advance, (0, 0, 0, None))(uniforms, state, action, simulator)
 
@@ -237,7 +221,6 @@ class _Tables:
         self._step = np.empty((n_times, n_layers))
 
     def keep(self, remaining: int, values: Float32[np.ndarray, "rows layers nodes"]) -> None:
-        """Store the values for a time left."""
         for layer in range(values.shape[1]):
             of_layer = values[:, layer].ravel()
             low, high = float(of_layer.min()), float(of_layer.max())
@@ -247,7 +230,6 @@ class _Tables:
             self._kept[remaining, layer] = (of_layer - np.float32(low)) * np.float32(1 / step) + np.float32(0.5)
 
     def values(self, remaining: int, layers: slice) -> Float32[np.ndarray, "rows layers nodes"]:
-        """The values for a time left."""
         kept: Float32[np.ndarray, "layers nodes"] = self._kept[remaining, layers].astype(np.float32)
         kept *= self._step[remaining, layers, None].astype(np.float32)
         kept += self._low[remaining, layers, None].astype(np.float32)
@@ -288,30 +270,28 @@ class _Programme:
         costs = [np.pad(of_case, (0, weights.shape[1] - len(of_case)), mode="edge") for of_case in self._costs]
         costs_of_layers = np.repeat(costs, [len(each.weights) for each in self._outcomes], axis=0)
         dearest = float(np.max(costs_of_layers))
-        shape = (grid.n_rows, self.n_layers, grid.along.stored)
-        values = np.zeros(math.prod(shape), np.float32)
+        values = np.zeros((grid.n_rows, self.n_layers, grid.along.stored), np.float32)
         before = np.empty_like(values)
         for remaining, (lowest, highest) in zip(range(self._robot.episode_limit), landings.bounds(), strict=False):
             lowest -= dearest * (remaining + 1)
             self.bounds = lowest, highest
             if tables is not None:
-                tables.keep(remaining, values.reshape(shape))
+                tables.keep(remaining, values)
             ends = np.float32(lowest), np.float32(highest)
             led_to = grid.row_offsets, pairs, weights, costs_of_layers
-            bellman_backup(values, *landings, *led_to, remaining, *ends, before)
+            bellman_backup(values.reshape(-1), *landings, *led_to, remaining, *ends, before.reshape(-1))
             values, before = before, values
             progress.update(remaining + 1, self._robot.episode_limit)
         starts = jax.vmap(self._robot.reset)(jax.random.split(jax.random.key(seed), 64))
         first = np.array([INITIAL_HISTORY])
         at_first = [of_case.start + int(self._layer(case, first)[0]) for case, of_case in enumerate(self._layers)]
-        return self._interpolate(values.reshape(shape)[:, at_first], starts)
+        return self._interpolate(values[:, at_first], starts)
 
     def play(
         self, tables: _Tables, case: int, episodes: int, seed: int, *, clock: bool
     ) -> Float64[np.ndarray, " episodes"]:
         """Returns of the maximising controller on the environment itself."""
-        environment, simulator = self._cases[case]
-        limit = self._robot.episode_limit
+        (environment, simulator), limit = self._cases[case], self._robot.episode_limit
         outcomes, actions = self._outcomes[case], self._actions[case]
         pairs = np.repeat(outcomes.pairs[None], len(outcomes.weights), axis=0)
 

@@ -15,7 +15,7 @@ from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import SimulatorTimeline
-from animat.progress import Part, Progress, Silent
+from animat.progress import Progress
 from animat.responses.condition import Condition
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.responses.responses import Responses
@@ -31,12 +31,9 @@ a command acts smoothly and never decides whether an episode ends: its quantiles
 
 @dataclass(frozen=True, eq=False)
 class WellSampled:
-    """The conditions of a recording with enough responses for an optimal return.
+    """Environment, simulator and responses with only the conditions that have enough responses for an optimal return.
 
     Attributes:
-        environment: with only these conditions.
-        simulator: of these responses.
-        responses: to these conditions.
         left_out: the other conditions, with the number of their responses.
         fit: makes a simulator of bootstrapped responses.
     """
@@ -49,14 +46,9 @@ class WellSampled:
 
     @classmethod
     def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_fixed: bool) -> Self:
-        """Select the conditions of one recording of a timeline.
+        """Select the conditions of one recording of a timeline; UnusableData if none has enough responses.
 
-        Args:
-            environment: with all conditions.
-            are_fixed: whether the mapping's percentiles are those of the first recording.
-
-        Raises:
-            UnusableData: if no condition has enough responses.
+        `are_fixed`: whether the mapping's percentiles are those of the first recording.
         """
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
         simulator = (timeline.with_first_percentiles() if are_fixed else timeline).at(minute)
@@ -75,14 +67,55 @@ class WellSampled:
         spread = "histogram" if simulator.has_memory else kind
         return cls(environment, simulator, responses, left_out, lambda these: fit(these, spread))
 
-    def with_interval(self, optimum: Optimum, **options: Any) -> Optimum:
-        """The optimum in this environment with its interval and what was left out; options as in `with_intervals`."""
-        optima = with_intervals([optimum], [self.environment], self.responses, self.fit, **options)
-        return replace(optima[0], left_out=self.left_out)
+    def with_interval(
+        self,
+        optimum: Optimum,
+        *,
+        resolution: float = 1.0,
+        resamples: int = RESAMPLES,
+        seed: int = 1,
+        progress: Progress | None = None,
+    ) -> Optimum:
+        """The optimum in this environment with what was left out, and its interval.
+
+            low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
+
+        with v the optimum, v_0 the same on a coarse grid, v_b that of responses bootstrapped, condition by condition,
+        39 times, and e the grid's error. The lower end is the lower of those of the percentile and the reversed
+        interval, as an optimum is the best of several values and few responses raise it. If conditions do not differ
+        significantly (Kruskal-Wallis, p > 0.05), it reaches down to the return of random stimuli. Neither end is
+        outside the range of possible returns.
+
+        Args:
+            resolution: of the optimum's grid; the coarse one is not finer.
+            resamples: number of bootstrap samples; 0: no interval.
+            seed: decides every random draw.
+            progress: what to report to.
+        """
+        from scipy.stats import kruskal
+
+        optimum = replace(optimum, left_out=self.left_out)
+        if not resamples:
+            return optimum
+        responses, rng = self.responses, np.random.default_rng(seed)
+        drawn = [responses, *(responses.bootstrapped(rng) for _ in range(resamples))]
+        cases = [(self.environment, self.fit(each)) for each in drawn]
+        grid = _rough(grid_for(self.environment.robot), resolution)
+        values, (least, most) = rough_values(cases, grid, seed, progress)
+        low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
+        low, high = min(low, -high, 0.0), max(high, 0.0)
+        rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
+        is_flat = len(rates_hz) == 1 or np.ptp(np.concatenate(rates_hz)) == 0
+        if is_flat or not kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE:
+            at_random = ShuffledDelivery(self.environment), cases[0][1]
+            low = min(low, float(rough_values([at_random], grid, seed)[0][0] - values[0]))
+        error = optimum.grid_error
+        ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
+        return replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE))
 
 
 def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...]]:
-    """Responses to the conditions with 30 or more non-burst responses, and the labels of the other conditions.
+    """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
     The best of several values is likely a lucky one, so a condition with three responses promises too much. With 30 or
     more, nine of ten intervals contain the true optimum, with 10 three of four (docs/evidence/optimal-return.md).
@@ -111,60 +144,6 @@ def _counts(responses: Responses) -> list[int]:
 def too_few(conditions: Sequence[Condition], n: Sequence[int]) -> tuple[str, ...]:
     """The conditions with fewer than 30 non-burst responses, each with their number; n: of each condition."""
     return tuple(f"{c.label} ({count})" for c, count in zip(conditions, n, strict=True) if count < FEW_SAMPLES)
-
-
-def with_intervals(
-    optima: Sequence[Optimum],
-    environments: Sequence[Animat[Any]],
-    responses: Responses,
-    fit: Callable[[Responses], NeuronSimulator],
-    *,
-    resolution: float = 1.0,
-    resamples: int = RESAMPLES,
-    seed: int = 1,
-    progress: Progress | None = None,
-) -> tuple[Optimum, ...]:
-    """Optimal returns with intervals for the optima of the true response distributions.
-
-        low = v + min(q, -p) - e,    high = v + p + e,    q, p: the 2.5 and the 97.5 % quantile of v_b - v_0
-
-    with v the optimum, v_0 the same on a coarse grid, v_b that of responses bootstrapped, condition by condition, 39
-    times, and e the grid's error. The lower end is the lower of those of the percentile and the reversed interval, as
-    an optimum is the best of several values and few responses raise it. If conditions do not differ significantly
-    (Kruskal-Wallis, p > 0.05), it reaches down to the return of random stimuli. Neither end is outside the range of
-    possible returns.
-
-    Args:
-        optima: as returned by `best_returns`.
-        environments: of the optima, all with one robot.
-        responses: from which the simulator in them was made.
-        resolution: of the optima's grid; the coarse one is not finer.
-        resamples: number of bootstrap samples; 0: no intervals.
-        seed: decides every random draw.
-        progress: what to report to.
-    """
-    from scipy.stats import kruskal
-
-    if not resamples:
-        return tuple(optima)
-    rng = np.random.default_rng(seed)
-    simulators = [fit(each) for each in (responses, *(responses.bootstrapped(rng) for _ in range(resamples)))]
-    grid = _rough(grid_for(environments[0].robot), resolution)
-    rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
-    differ = len(rates_hz) > 1 and np.ptp(np.concatenate(rates_hz)) > 0 and kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE
-    bounded: list[Optimum] = []
-    for optimum, environment in zip(optima, environments, strict=True):
-        part = Part(progress or Silent(), len(bounded), 1, len(optima))
-        values, (least, most) = rough_values([(environment, each) for each in simulators], grid, seed, part)
-        low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
-        low, high = min(low, -high, 0.0), max(high, 0.0)
-        if not differ:
-            at_random = ShuffledDelivery(environment)
-            low = min(low, float(rough_values([(at_random, simulators[0])], grid, seed)[0][0] - values[0]))
-        error = optimum.grid_error
-        ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
-        bounded.append(replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE)))
-    return tuple(bounded)
 
 
 def _rough(grid: Grid, resolution: float) -> Grid:

@@ -87,12 +87,11 @@ class Constant(Actor):
 
 
 def nearest_action(
-    actions: Array, means: Float[Array, "actions *commands"], wanted: Float[Array, "episodes *commands"]
+    actions: Array | None, means: Float[Array, "actions *commands"] | None, wanted: Float[Array, "episodes *commands"]
 ) -> Array:
-    """The action whose mean command is nearest to the wanted one; with several commands by Euclidean distance.
-
-    With a single command neither has an axis of commands.
-    """
+    """The action whose mean command is nearest (Euclidean) to the wanted one; without actions, the wanted command."""
+    if actions is None or means is None:
+        return wanted
     apart = means - wanted[:, None]
     distance = jnp.abs(apart) if apart.ndim == 2 else jnp.linalg.norm(apart, axis=2)
     return actions[jnp.argmin(distance, axis=1)]
@@ -103,13 +102,11 @@ class Episodes:
     """Results of episodes of several actors.
 
     Attributes:
-        returns: sum of rewards of each episode, in the task's own units, shape (actors, episodes).
-        lengths: iterations of each, shape (actors, episodes).
-        terminated: whether it ended by itself and not at the episode limit, shape (actors, episodes).
-        presented: how often each condition was delivered, in all episodes together, shape (actors, conditions); no
-            conditions without neurons.
-        commanded: the sum of the commands that each condition led to, the same shape; with several commands separately,
-            shape (actors, conditions, commands).
+        returns: sum of rewards of each episode, in the task's own units.
+        lengths: iterations of each.
+        terminated: whether it ended by itself and not at the episode limit.
+        presented: how often each condition was delivered, in all episodes together; no conditions without neurons.
+        commanded: the sum of the commands that each condition led to; several commands separately.
         outcome: of each episode, for a robot with a goal; shape (actors, episodes), and with a last axis of objectives.
     """
 
@@ -130,11 +127,7 @@ def check_seed(seed: int) -> None:
 
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
-    """Refuse fewer than one episode, or more than fit side by side.
-
-    Raises:
-        InvalidArgument: with the name of the argument or option.
-    """
+    """Refuse fewer than one episode, or more than fit side by side (InvalidArgument, with the argument's name)."""
     if episodes < 1:
         raise InvalidArgument(f"{name}: expected at least 1, got {episodes}")
     if episodes * n_actors > MOST_AT_ONCE:
@@ -152,13 +145,11 @@ def networks_of(policies: Sequence[Policy], *, greedy: bool = False) -> Networks
     """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
-    first = policies[0]
-    for policy in policies[1:]:
-        if [w.shape for w in policy.weights] != [w.shape for w in first.weights]:
-            raise InvalidArgument("policies: expected networks of one shape, got several: evaluate them one by one")
+    if len({tuple(w.shape for w in policy.weights) for policy in policies}) > 1:
+        raise InvalidArgument("policies: expected networks of one shape, got several: evaluate them one by one")
     layers = (
         Layer(stacked([p.weights[i] for p in policies]), stacked([p.biases[i][None] for p in policies]))
-        for i in range(len(first.weights))
+        for i in range(len(policies[0].weights))
     )
     return Networks(tuple(layers), stacked([np.asarray(p.scales, np.float32) for p in policies]), greedy)
 
@@ -191,17 +182,10 @@ def roll_out(
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
         return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
-    returns, lengths, presented, commanded, terminated, outcome = _roll_out(
-        environment, episodes, simulator, actors, keys
-    )
-    return Episodes(
-        np.asarray(returns, np.float64),
-        np.asarray(lengths, np.int64),
-        np.asarray(terminated),
-        np.asarray(presented, np.int64),
-        np.asarray(commanded, np.float64),
-        None if outcome is None else Outcome(*(np.asarray(each) for each in outcome)),  # type: ignore[arg-type]
-    )
+    *counted, terminated, outcome = jax.device_get(_roll_out(environment, episodes, simulator, actors, keys))
+    kinds = (np.float64, np.int64, np.int64, np.float64)
+    returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))
+    return Episodes(returns, lengths, terminated, presented, commanded, outcome)
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=COMPILER_OPTIONS)

@@ -14,12 +14,9 @@ from animat.evaluation.statistics import standard_error
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A row of the table: an agent and its returns.
+    """A row of the table: `policies` or a control, with its returns.
 
     Attributes:
-        name: `policies`, or the control.
-        meaning: a short description.
-        episodes: one row per actor.
         changed: whether its environment differs from that of the policies: another culture, or another delivery.
         electrode_pulses: mean number per episode, for each actor; None if the conditions' electrodes are not known.
         pulse_cost: of one electrode pulse, in the units of the return.
@@ -37,16 +34,10 @@ class Row:
         """Each actor's mean return over its episodes, which the paper calls a policy's performance."""
         return self.episodes.returns.mean(axis=1)  # type: ignore[no-any-return]
 
-    @property
-    def net_return(self) -> float | None:
-        """The mean return less the cost of pulses; None if these are not known."""
-        if self.electrode_pulses is None:
-            return None
-        return float(self.mean_returns.mean() - self.pulse_cost * self.electrode_pulses.mean())
-
     def to_dict(self) -> dict[str, Any]:
-        """The row as plain data."""
-        means, pulses = self.mean_returns, self.electrode_pulses
+        """The row as plain data; the net return is the mean return less the cost of pulses, if these are known."""
+        means = self.mean_returns
+        pulses = None if self.electrode_pulses is None else float(self.electrode_pulses.mean())
         # The samples are the actors; a control has one actor, whose episodes are the samples.
         samples = means if len(means) > 1 else self.episodes.returns[0]
         return {
@@ -59,8 +50,8 @@ class Row:
             "mean_length": float(self.episodes.lengths.mean()),
             "terminated_share": float(self.episodes.terminated.mean()),
             "mean_returns": means.tolist(),
-            "electrode_pulses": None if pulses is None else float(pulses.mean()),
-            "net_return": self.net_return,
+            "electrode_pulses": pulses,
+            "net_return": None if pulses is None else float(means.mean()) - self.pulse_cost * pulses,
             **self.met,
         }
 

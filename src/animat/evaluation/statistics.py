@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -65,10 +64,6 @@ class Comparison:
     effect: Interval
     ties: bool
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        return asdict(self)
-
 
 def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     """The two-sided Mann-Whitney U test of two groups, by the normal approximation and exactly, with effect size.
@@ -81,8 +76,7 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
 
         V(t) = t (1 - t) (1 + k ((1 - t) / (2 - t) + t / (1 + t))) / n_1 n_2,    k = (n_1 + n_2) / 2 - 1
 
-    As V is that of the assumed share, not of the observed one, the interval has a width even if all pairs are won; a
-    bootstrap, which can only repeat the observations, has none there.
+    As V is that of the assumed share, the interval has a width even if all pairs are won.
 
     Args:
         first, second: one number per policy, such as its mean return.
@@ -93,31 +87,27 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     Source: Mann and Whitney 1947, doi:10.1214/aoms/1177730491; Newcombe 2006, doi:10.1002/sim.2324; the paper's table
         of comparisons.
     """
-    a, b = _samples("first", first), _samples("second", second)
     from scipy.stats import mannwhitneyu
 
-    u_first = float(np.sum(a[:, None] > b) + np.sum(a[:, None] == b) / 2)
-    pooled = np.concatenate([a, b])
-    ties = len(np.unique(pooled)) < len(pooled)
-    if np.ptp(pooled) == 0:
-        p_normal = p_exact = 1.0
-    else:
-        # With the continuity correction scipy's p can exceed 1 if U is at its mean.
-        p_normal = min(1.0, float(mannwhitneyu(a, b, alternative="two-sided", method="asymptotic").pvalue))
-        p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
-
+    a, b = _samples("first", first), _samples("second", second)
+    u_first, p_normal = mann_whitney(a, b)
+    ties = len(np.unique(np.concatenate([a, b]))) < len(a) + len(b)
+    p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
     total = len(a) * len(b)
-    low, high = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
-    return Comparison(
-        u=min(u_first, total - u_first),
-        u_first=u_first,
-        n_first=len(a),
-        n_second=len(b),
-        p_normal=p_normal,
-        p_exact=p_exact,
-        effect=Interval(1 - 2 * u_first / total, high, low, CONFIDENCE),
-        ties=ties,
-    )
+    high, low = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
+    effect = Interval(1 - 2 * u_first / total, low, high, CONFIDENCE)
+    return Comparison(min(u_first, total - u_first), u_first, len(a), len(b), p_normal, p_exact, effect, ties)
+
+
+def mann_whitney(first: Float64[np.ndarray, " n"], second: Float64[np.ndarray, " m"]) -> tuple[float, float]:
+    """The U of the first group, and the two-sided p by the normal approximation as in `compare`."""
+    from scipy.stats import mannwhitneyu
+
+    if np.ptp(np.concatenate([first, second])) == 0:
+        return len(first) * len(second) / 2, 1.0
+    test = mannwhitneyu(first, second, alternative="two-sided", method="asymptotic")
+    # With the continuity correction p can exceed 1 if U is at its mean.
+    return float(test.statistic), min(1.0, float(test.pvalue))
 
 
 def p_of_u(u: float, n_first: int, n_second: int) -> float:
@@ -129,20 +119,18 @@ def p_of_u(u: float, n_first: int, n_second: int) -> float:
     Raises:
         InvalidArgument: for an empty group, or a U that is impossible for groups of these sizes.
     """
+    from scipy.stats import norm
+
     if n_first < 1 or n_second < 1:
         raise InvalidArgument(f"n: expected at least 1 sample in each group, got {n_first} and {n_second}")
     total = n_first * n_second
     if not 0 <= u <= total:
         raise InvalidArgument(f"u: expected 0 to {total} for {n_first} and {n_second} samples, got {u:g}")
-    from scipy.stats import norm
-
     z = (abs(u - total / 2) - 0.5) / np.sqrt(total * (n_first + n_second + 1) / 12)
     return float(min(1.0, 2 * norm.sf(z)))
 
 
-def interquartile_mean(
-    samples: ArrayLike, *, confidence: float = CONFIDENCE, within: tuple[float, float] = (-math.inf, math.inf)
-) -> Interval:
+def interquartile_mean(samples: ArrayLike, *, within: tuple[float, float] = (-math.inf, math.inf)) -> Interval:
     """The mean of the middle half of samples, with its interval by Student's t.
 
     A quarter of the samples, rounded down, is left out at each end. With g samples left out at each end, h = n - 2 g,
@@ -150,32 +138,28 @@ def interquartile_mean(
 
         t_(h-1) s sqrt((n - 1) / (h (h - 1)))
 
-    Its coverage is right for few samples too, where a bootstrap of the middle ones is too narrow. With fewer than two
-    samples in the middle it is infinite.
+    With fewer than two samples in the middle it is infinite.
 
     Args:
         samples: numbers, shape (samples,).
         within: the lowest and the highest possible number, which limit the interval.
 
     Raises:
-        InvalidArgument: for no samples, numbers that are not finite, or a confidence outside 0 to 1.
+        InvalidArgument: for no samples, or numbers that are not finite.
 
     Source: Agarwal et al. 2021, arXiv:2108.13264 (rliable); the interval: Tukey and McLaughlin 1963, Sankhya A 25, 331.
     """
+    from scipy.stats import t
+
     x = np.sort(_samples("samples", samples))
-    if not 0 < confidence < 1:
-        raise InvalidArgument(f"confidence: expected between 0 and 1, got {confidence:g}")
-    n = len(x)
-    cut = n // 4
+    n, cut = len(x), len(x) // 4
     kept = n - 2 * cut
     mean = float(x[cut : n - cut].mean())
     if kept < 2:
-        return Interval(mean, *within, confidence)
-    from scipy.stats import t
-
+        return Interval(mean, *within, CONFIDENCE)
     spread = float(np.clip(x, x[cut], x[n - cut - 1]).std(ddof=1))
-    half = float(t.ppf((1 + confidence) / 2, kept - 1)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
-    return Interval(mean, max(mean - half, within[0]), min(mean + half, within[1]), confidence)
+    half = float(t.ppf((1 + CONFIDENCE) / 2, kept - 1)) * spread * math.sqrt((n - 1) / (kept * (kept - 1)))
+    return Interval(mean, max(mean - half, within[0]), min(mean + half, within[1]), CONFIDENCE)
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:
@@ -194,11 +178,9 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
     for name, value in p.items():
         if not 0 <= value <= 1:
             raise InvalidArgument(f"p: expected 0 to 1, got {value:g} for {name}")
-    highest = 0.0
-    corrected = {}
-    for i, name in enumerate(sorted(p, key=lambda name: p[name])):
-        highest = max(highest, min(1.0, (len(p) - i) * p[name]))
-        corrected[name] = highest
+    rising = sorted(p, key=lambda name: p[name])
+    highest = np.maximum.accumulate([(len(p) - i) * p[name] for i, name in enumerate(rising)])
+    corrected = dict(zip(rising, np.minimum(1.0, highest).tolist(), strict=True))
     return {name: corrected[name] for name in p}
 
 
@@ -234,11 +216,11 @@ def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
 def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
     """The share of all ways to divide the pooled samples in which U is at least as far from its mean.
 
-    Ways are counted by the sum of the first group's ranks, sample by sample; ties share a rank, which may be a half,
-    so ranks are doubled. (scipy's exact test does not support ties, and its permutations take a second.)
+    (scipy's exact test does not support ties, and its permutations take a second.)
     """
     from scipy.stats import rankdata
 
+    # Ways are counted by the sum of the first group's ranks, doubled, as a tie's may be a half.
     ranks = np.rint(2 * rankdata(np.concatenate([a, b]))).astype(np.int64)
     n = len(a)
     ways = np.zeros((n + 1, int(ranks.sum()) + 1))

@@ -72,8 +72,7 @@ def bellman_backup(
         values: of the next states, at the grid's nodes: row by row, and layer by layer within a row.
         rows, row_places, nodes, places, rewards: the landings, as in `animat.evaluation.landings.Landings`.
         row_offsets: of the rows around a landing.
-        outcomes: of the actions in each layer: the landing, and the next layer.
-        weights: of the outcomes, for each layer and action.
+        outcomes, weights: of the actions in each layer, the landing and the next layer, and their weights.
         costs: of the trial of each action.
         remaining: iterations left after this one.
         lowest, highest: bounds of all values, which interpolation near a cliff could exceed.
@@ -170,17 +169,9 @@ def look_ahead(
     remaining: int,
     chosen: Int32[np.ndarray, " states"],
 ) -> None:
-    """The best action in each of some states, by the values of the next states (see `bellman_backup`).
+    """The best action in each of some states of one case, by the values of the next states (see `bellman_backup`).
 
-    Args:
-        values: of the next states, of one case.
-        rows, row_places, nodes, places, rewards: the landings of the states.
-        row_offsets: of the rows around a landing.
-        layers: of the states.
-        outcomes, weights: as in `bellman_backup`, of the case's layers.
-        costs: of the trial of each action.
-        remaining: iterations left after this one.
-        chosen: output.
+    `layers` are those of the states among the case's, and `chosen` is the output.
     """
     n_states = nodes.shape[1]
     _, n_actions, n_outcomes = weights.shape

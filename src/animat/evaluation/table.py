@@ -18,7 +18,7 @@ from animat.evaluation.coupling import ContextGap, context_gap, least_context_ga
 from animat.evaluation.interventions import InterventionTable, run_interventions
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import WellSampled
-from animat.evaluation.rollouts import Networks, networks_of, roll_out
+from animat.evaluation.rollouts import networks_of, roll_out
 from animat.evaluation.row import Row
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
@@ -101,12 +101,8 @@ class Evaluation:
         random = next((each for each in self.rows if each.name == "random"), None)
         if random is None or self.optimum is None or self.optimum.left_out or row.changed:
             return None
-        try:
-            return normalised_score(
-                float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
-            )
-        except InvalidArgument:
-            return None
+        mean, at_random, best = float(row.mean_returns.mean()), float(random.mean_returns.mean()), self.optimum.value
+        return normalised_score(mean, at_random, best) if best > at_random else None
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -176,8 +172,8 @@ class Evaluation:
         return "\n".join([*lines, *([] if self.whose_work is None else [self.whose_work.to_text()])])
 
     def _optimum_lines(self) -> list[str]:
+        context = [] if self.context is None else [f"  {self.context.to_text(self.context_score)}"]
         if self.no_optimum is not None:
-            context = [] if self.context is None else [f"  {self.context.to_text(self.context_score)}"]
             return [f"  no optimal return: {self.no_optimum}", *context]
         if self.optimum is None:
             return []
@@ -193,9 +189,7 @@ class Evaluation:
         lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
         if self.net_optimum is not None:
             lines.append(f"  with the cost of pulses: {self.net_optimum.to_text()}")
-        if self.context is not None:
-            lines.append(f"  {self.context.to_text(self.context_score)}")
-        return lines
+        return [*lines, *context]
 
 
 def evaluate(
@@ -245,8 +239,14 @@ def evaluate(
     world = _World.of(first, body, timeline, at_min)
     within = world.environment, world.simulator
     networks, n = networks_of(list(policies.values()), greedy=greedy), len(policies)
-    trained = _as_trained(first, networks, n)
-    all_controls = controls_of(*within, _labels(first), networks, n)
+    # Those trained as a control run as one here too: their choices have no effect.
+    is_control = first.mapping is not None and first.delivery == "shuffled"
+    meaning = "as trained: the delivered condition is drawn at random" if is_control else "as trained"
+    trained = Control("policies", meaning, networks, n, delivery="shuffled" if is_control else "chosen")
+    labels = [condition.label for condition in first.conditions]
+    if first.mapping is None:
+        labels = [f"{command:+g}" for command in first.commands or ()]
+    all_controls = controls_of(*within, labels, networks, n)
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
@@ -296,14 +296,7 @@ def evaluate(
 
 @dataclass(frozen=True, eq=False)
 class _World:
-    """What policies are evaluated in.
-
-    Attributes:
-        first: the first policy, which represents all.
-        environment: the robot, with neurons if policies act through them.
-        simulator, timeline, minute: of these neurons; `minute` is the time of the simulator's recording. None without.
-        fixed_from_min, findings: as in `Evaluation`.
-    """
+    """What policies, represented by the first, are evaluated in; simulator, timeline and minute are of its neurons."""
 
     first: Policy
     environment: Environment[Any]
@@ -329,7 +322,6 @@ class _World:
         return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings)
 
     def row_of(self, control: Control, *, episodes: int, seed: int) -> Row:
-        """Run a control, or the policies."""
         environment, simulator = control.within(self.environment, self.simulator)
         ran = roll_out(environment, simulator, control.actor, control.n_actors, episodes=episodes, seed=seed)
         changed = environment is not self.environment or simulator is not self.simulator
@@ -361,21 +353,6 @@ class _World:
         """Electrode pulses per trial of each condition, if there are neurons and the electrodes are known."""
         pulses = 1 if self.first.presentation is None else self.first.presentation.pulses
         return electrode_pulses(self.first.conditions, pulses) if self.simulator is not None else None
-
-
-def _as_trained(first: Policy, networks: Networks, n: int) -> Control:
-    """The policies themselves; those trained as a control run as one here too: their choices have no effect."""
-    if first.mapping is None or first.delivery != "shuffled":
-        return Control("policies", "as trained", networks, n)
-    meaning = "as trained: the delivered condition is drawn at random"
-    return Control("policies", meaning, networks, n, delivery="shuffled")
-
-
-def _labels(first: Policy) -> list[str]:
-    """Labels of the actions."""
-    if first.mapping is None:
-        return [f"{command:+g}" for command in first.commands or ()]
-    return [condition.label for condition in first.conditions]
 
 
 def _context(rows: Sequence[Row], optimum: Optimum | None, largest_return: float) -> ContextGap | None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int, Shaped
 
 from animat.environment import Environment, State
 from animat.evaluation.rollouts import Actor
@@ -18,19 +19,18 @@ class Traces(NamedTuple):
     """Episodes of several actors; entries after the end of an episode are meaningless.
 
     Attributes:
-        states: before each iteration and after the last (`State.carried`), each array with leading axes (actors,
-            episodes, iterations + 1).
-        observations: of these states, shape (actors, episodes, iterations + 1, observations).
-        actions: chosen in each iteration, shape (actors, episodes, iterations).
-        commands: u of each iteration, the same shape.
-        lengths: iterations of each episode, shape (actors, episodes).
+        states: before each iteration and after the last (`State.carried`), each array with the axes of `observations`.
+        observations: of these states.
+        actions: chosen in each iteration.
+        commands: u of each iteration.
+        lengths: iterations of each episode.
     """
 
     states: State
-    observations: np.ndarray
-    actions: np.ndarray
-    commands: np.ndarray
-    lengths: np.ndarray
+    observations: Float[np.ndarray, "actors episodes iterations+1 observations"]
+    actions: Shaped[np.ndarray, "actors episodes iterations *commands"]
+    commands: Float[np.ndarray, "actors episodes iterations *commands"]
+    lengths: Int[np.ndarray, "actors episodes"]
 
 
 def trace(

@@ -1,7 +1,4 @@
-"""Findings known beforehand that keep a closed loop on the culture from reaching the returns that a simulator predicts.
-
-Training, evaluation and the closed loop report them in the same words.
-"""
+"""Findings known beforehand that keep a closed loop on the culture from reaching a simulator's returns."""
 
 from __future__ import annotations
 
@@ -81,12 +78,7 @@ _LABELS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz":
 
 
 def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Finding]:
-    """A warning if the predicting recording is old.
-
-    Args:
-        recorded_at_min: time of the recording on the culture's clock.
-        culture_min: the culture's time, or that of its newest recording.
-    """
+    """A warning if the predicting recording is old at the time of the culture or its newest recording."""
     age_min = culture_min - recorded_at_min
     if age_min > OLD_MIN:
         message = (
@@ -107,27 +99,13 @@ def no_memory(noticed: Iterable[Finding], presentation: Presentation | None, *, 
     yield Finding("no-memory", "warning", message, remembers.value)
 
 
-def other_recording(trained_until_min: float, evaluated_at_min: float) -> Iterator[Finding]:
-    """A warning if policies are not evaluated on the recording that would calibrate their closed loop."""
-    if trained_until_min != evaluated_at_min:
-        message = (
-            f"this is the culture at {in_min(evaluated_at_min)}; the policies were last trained on the recording at "
-            f"{in_min(trained_until_min)}, which calibrates their closed loop"
-        )
-        yield Finding("other-recording", "warning", message, evaluated_at_min - trained_until_min)
-
-
 NAMES = (UNKNOWN, "other-presentation", "other-calibration", "old-calibration", "no-memory", "other-recording")
 """Names of the findings because of which a culture would respond differently. `other-simulator` is not among them: the
 user chooses the simulator that predicts, and a loop has none."""
 
 
 def expect_conditions(policy: Policy, conditions: Sequence[Condition], readouts: Readouts) -> None:
-    """Raise unless a policy can act through these conditions and readouts.
-
-    Raises:
-        Mismatch: if conditions, stimuli or readouts differ from those in training.
-    """
+    """Raise Mismatch unless conditions, stimuli and readouts are those of a policy's training."""
     if policy.conditions != tuple(conditions):
         raise Mismatch(
             f"conditions: expected {some_of([c.label for c in policy.conditions])}, from which the policies choose, "
@@ -170,8 +148,12 @@ def loop_differences(policy: Policy, timeline: SimulatorTimeline, minute: float)
     has_memory = timeline.simulators.has_memory
     yield from no_memory(timeline.findings_at(minute), timeline.presentation, has_memory=has_memory)
     trained_until = policy.trained_until_min(float(timeline.start_min[0]))
-    if trained_until is not None:
-        yield from other_recording(float(timeline.start_min[timeline.row_at(trained_until)]), minute)
+    if trained_until is not None and (newest := float(timeline.start_min[timeline.row_at(trained_until)])) != minute:
+        message = (
+            f"this is the culture at {in_min(minute)}; the policies were last trained on the recording at "
+            f"{in_min(newest)}, which calibrates their closed loop"
+        )
+        yield Finding("other-recording", "warning", message, minute - newest)
 
 
 def describe_window(window_ms: tuple[float, float] | None) -> str:

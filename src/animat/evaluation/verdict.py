@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from animat.evaluation.statistics import p_of_u
+from animat.evaluation.statistics import mann_whitney, p_of_u
 
 OUTPERFORMED_P = 0.01
 """Policies count as better if p is below this, as in the paper's comparisons."""
@@ -35,31 +35,16 @@ class EpisodeComparison(NamedTuple):
         return self.p < OUTPERFORMED_P and self.wins > 0.5
 
     @property
-    def is_worse(self) -> bool:
-        """Whether the policies' returns are smaller than the control's."""
-        return is_worse(self.p, self.wins)
-
-    @property
     def has_enough_episodes(self) -> bool:
         """Whether this number of episodes could give a small p at all: if all of the policies' were larger."""
         return p_of_u(0.0, self.policies, self.control) < OUTPERFORMED_P
 
 
 def compare_episodes(policies: ArrayLike, control: ArrayLike) -> EpisodeComparison:
-    """Compare the returns of policies with those of a control by their episodes, all policies together.
-
-    Args:
-        policies, control: returns, at least one of each, any shape.
-    """
-    from scipy.stats import mannwhitneyu
-
+    """Compare the returns (at least one, any shape) of all policies together with those of a control, by episodes."""
     ours, theirs = np.ravel(policies), np.ravel(control)
-    if np.ptp(np.concatenate([ours, theirs])) == 0:
-        return EpisodeComparison(1.0, 0.5, len(ours), len(theirs))
-    test = mannwhitneyu(ours, theirs, alternative="two-sided", method="asymptotic")
-    # With the continuity correction p can exceed 1 if U is at its mean.
-    p, wins = min(1.0, float(test.pvalue)), float(test.statistic) / ours.size / theirs.size
-    return EpisodeComparison(p, wins, len(ours), len(theirs))
+    u, p = mann_whitney(ours, theirs)
+    return EpisodeComparison(p, u / len(ours) / len(theirs), len(ours), len(theirs))
 
 
 def is_worse(p: float, wins: float) -> bool:
@@ -69,11 +54,7 @@ def is_worse(p: float, wins: float) -> bool:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether policies outperform each control.
-
-    Attributes:
-        controls: by name, at least one.
-    """
+    """Whether policies outperform each control; there is at least one."""
 
     controls: Mapping[str, EpisodeComparison]
 
@@ -90,16 +71,14 @@ class Verdict:
     def __str__(self) -> str:
         few = {name: each for name, each in self.controls.items() if not each.has_enough_episodes}
         not_outperformed = [
-            f"{name} (p = {each.p:.2g}; {'they are worse: ' if each.is_worse else ''}their return is larger in "
-            f"{100 * each.wins:.0f} % of the pairs of episodes)"
+            f"{name} (p = {each.p:.2g}; {'they are worse: ' if is_worse(each.p, each.wins) else ''}their return is "
+            f"larger in {100 * each.wins:.0f} % of the pairs of episodes)"
             for name, each in self.controls.items()
             if not each.is_outperformed and each.has_enough_episodes
         ]
-        parts = (
-            [f"the policies do not outperform these controls: {', '.join(not_outperformed)}"]
-            if not_outperformed
-            else []
-        )
+        parts = []
+        if not_outperformed:
+            parts.append(f"the policies do not outperform these controls: {', '.join(not_outperformed)}")
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
             parts.append(

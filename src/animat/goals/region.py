@@ -44,13 +44,13 @@ class Range:
     outside: Flag = False
 
     def __post_init__(self) -> None:
-        both = self.low is not None and self.high is not None
-        if (self.low is None and self.high is None) or (self.outside and not both):
+        ends = [end for end in (self.low, self.high) if end is not None]
+        if len(ends) < 1 + self.outside:
             raise InvalidArgument(f"{self.quantity}: expected {'both ends' if self.outside else 'an end'}, got none")
-        if self.low is not None and self.high is not None and not self.low < self.high:
+        if len(ends) == 2 and not ends[0] < ends[1]:
+            given = "..".join(map(number, ends))
             raise InvalidArgument(
-                f"{self.quantity}: expected the lower end first, got {number(self.low)}..{number(self.high)}, "
-                "between which nothing lies"
+                f"{self.quantity}: expected the lower end first, got {given}, between which nothing lies"
             )
 
     def __str__(self) -> str:
@@ -66,7 +66,6 @@ class Range:
 
     @property
     def includes_edge(self) -> bool:
-        """Whether it includes its ends."""
         return self.relation == "in"
 
     def bounds(self) -> dict[str, tuple[float, float]]:
@@ -75,24 +74,16 @@ class Range:
         return {} if self.outside else {self.quantity: ends}
 
     def in_units(self, spec: Mapping[str, Quantity]) -> Range:
-        """The same range in the units of a robot.
-
-        Raises:
-            InvalidArgument: for an unknown quantity, or a unit that it cannot have.
-        """
+        """The same range in the units of a robot; InvalidArgument for a quantity or unit that it cannot have."""
         factor = _factor(self.unit, _quantity_named(self.quantity, spec))
         low, high = (None if end is None else end * factor for end in (self.low, self.high))
         return Range(self.quantity, low, high, spec[self.quantity].unit, self.outside)
 
     def margin(self, values: Mapping[str, Array], spec: Mapping[str, Quantity]) -> Float[Array, ""]:
-        """How far inside it a robot is, in scales of the quantity; below 0 outside.
-
-        Args:
-            values: the quantities by name, in the units of `spec`, as the region is (`in_units`).
-        """
+        """How far inside it a robot is, in scales of the quantity; below 0 outside; all in the units of `spec`."""
         value = values[self.quantity]
-        distances = [value - self.low] if self.low is not None else []
-        distances += [self.high - value] if self.high is not None else []
+        distances = [] if self.low is None else [value - self.low]
+        distances += [] if self.high is None else [self.high - value]
         nearest = reduce(jnp.minimum, distances) / spec[self.quantity].scale
         return -nearest if self.outside else nearest
 
@@ -164,11 +155,7 @@ def margin_of(
 
 
 def region_in_units(region: tuple[Range | Ball, ...], spec: Mapping[str, Quantity]) -> tuple[Range | Ball, ...]:
-    """A region in the units of a robot.
-
-    Raises:
-        InvalidArgument: as `Range.in_units`, and for parts that do not overlap.
-    """
+    """A region in the units of a robot; InvalidArgument as `Range.in_units`, and for parts that do not overlap."""
     parts = tuple(part.in_units(spec) for part in region)
     common: dict[str, tuple[float, float]] = {}
     for part in parts:

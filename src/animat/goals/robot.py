@@ -1,19 +1,4 @@
-"""A robot with a goal in place of its own task: the same body, with the rewards and ends that follow from the goal.
-
-An episode fails in an iteration that enters a region to avoid, or in which `within` is exceeded. It succeeds in one
-that enters a region to reach. With w the n weights, and c = 1 if there is anything to reach, else 0, the reward of an
-iteration is
-
-    failed:     -100 n w_i / sum w - c episode_limit    with i the objective that failed, the largest of several
-    succeeded:  50 n w_i / sum w                        with i the objective that was reached, the largest of several
-    otherwise:  sum (w_i r_i) / sum w - c
-
-    r_i:  avoid 1,  reach 0,  drive 1 in its region and 0 outside,  minimize and maximize (1 + m_i) / 2
-
-with m_i the margin in [-1, 1]: how far inside the region the robot is, in scales of the quantity. So only the ratios of
-weights matter. Continuing pays if there is nothing to reach, and costs otherwise, so that sooner is better. Failing
-never pays, as it costs more than a whole episode.
-"""
+"""A robot with a goal in place of its own task: the same body, with the rewards and ends that follow from the goal."""
 
 from __future__ import annotations
 
@@ -32,7 +17,7 @@ from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
 from animat.goals.text import read_goal
 from animat.lazy import Array, jax, jnp
-from animat.robots.base import WITHOUT, Quantity, Robot, capability
+from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms, capability
 from animat.robots.grid import Grid
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_from_dict, robot_named, robot_to_dict
@@ -45,12 +30,7 @@ POTENTIAL = 3.0
 
 
 class GoalState(NamedTuple):
-    """The state of an episode.
-
-    Attributes:
-        robot: the state of the body.
-        outside: for each objective with `within`, the number of consecutive iterations outside its region.
-    """
+    """The state of an episode; `outside` counts consecutive iterations outside each region with `within`."""
 
     robot: Any
     outside: tuple[Int[Array, ""], ...]
@@ -60,10 +40,17 @@ class GoalState(NamedTuple):
 @final
 @dataclass(frozen=True)
 class RobotWithGoal(Robot[GoalState]):
-    """A robot with a goal in place of its own task; it keeps the robot's other abilities.
+    """A robot with a goal in place of its own rewards and ends; it keeps the robot's other abilities.
 
-    Attributes:
-        robot: the body; its own rewards and ends are not used.
+    An episode fails in an iteration that enters a region to avoid, or exceeds `within`. It succeeds in one that enters
+    a region to reach. With w the n weights, and c = 1 if there is anything to reach, else 0, an iteration's reward is
+
+        failed:     -100 n w_i / sum w - c episode_limit    with i the objective that failed, the largest of several
+        succeeded:  50 n w_i / sum w                        with i the objective that was reached, likewise
+        otherwise:  sum (w_i r_i) / sum w - c
+        r_i:        avoid 1,  reach 0,  drive 1 in its region and 0 outside,  minimize and maximize (1 + m_i) / 2
+
+    with m_i the margin in [-1, 1]: how far inside the region the robot is, in scales of the quantity.
 
     Raises:
         InvalidArgument: for a robot that is stepped on the host or already has a goal, and for a goal with quantities
@@ -93,10 +80,9 @@ class RobotWithGoal(Robot[GoalState]):
 
     def __getattr__(self, name: str) -> Any:
         # It has those optional methods that its robot has.
-        if name in WITHOUT and hasattr(self.robot, name):
-            return self._value_grid if name == "value_grid" else getattr(self.robot, name)
-        if name == "with_goal_of" and hasattr(self.robot, name):
-            return self._with_goal_of
+        if name in (*WITHOUT, "with_goal_of") and hasattr(self.robot, name):
+            own = {"value_grid": self._value_grid, "with_goal_of": self._with_goal_of}
+            return own.get(name) or getattr(self.robot, name)
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def _with_goal_of(self, state: Any, other: Any) -> Any:
@@ -146,7 +132,7 @@ class RobotWithGoal(Robot[GoalState]):
 
     def caveats(self) -> tuple[str, ...]:
         """Those of the robot, and a warning if episodes start in a region that ends them."""
-        pairs = zip(self.goal.objectives, self._margins(self.robot.reset(jax.random.key(0))), strict=True)
+        pairs = zip(self.goal.objectives, self._margins(self.observe(self.reset(jax.random.key(0)))), strict=True)
         ending = [objective for objective, (_, inside) in pairs if inside and objective.kind in ("avoid", "reach")]
         return (*self.robot.caveats(), *(f"goal: episodes of {self.name} start in the region: {of}" for of in ending))
 
@@ -160,20 +146,18 @@ class RobotWithGoal(Robot[GoalState]):
     def observe(self, state: GoalState) -> Float[Array, " observations"]:
         return self.robot.observe(state.robot)
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: GoalState, u: Float[Array, "*commands"]
-    ) -> tuple[GoalState, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: GoalState, u: Float[Array, "*commands"]) -> Transition[GoalState]:
         robot, _, _ = self.robot.advance(uniforms, state.robot, u)
-        outside, tally, reward, ended = self._judge(self._margins(robot), state.outside, state.tally)
+        outside, tally, reward, ended = self._judge(self.robot.observe(robot), state.outside, state.tally)
         return GoalState(robot, outside, tally), reward, ended
 
     def _judge(
-        self, margins: Margins, outside: tuple[Int[Array, ""], ...], tally: Tally
+        self, observation: Float[Array, " observations"], outside: tuple[Int[Array, ""], ...], tally: Tally
     ) -> tuple[tuple[Int[Array, ""], ...], Tally, Float[Array, ""], Bool[Array, ""]]:
         """The counts and tally after an iteration, its reward, and whether it ends the episode."""
-        outside = self._outside(margins, outside)
+        margins = self._margins(observation)
+        outside, no = self._outside(margins, outside), jnp.bool_(False)
         counts = iter(outside)
-        no = jnp.bool_(False)
         failures, reaches, running = [], [], jnp.float32(0.0)
         for objective, share, (margin, inside) in zip(self._objectives, self._shares, margins, strict=True):
             is_late = no if objective.within is None else next(counts) > objective.within
@@ -196,7 +180,7 @@ class RobotWithGoal(Robot[GoalState]):
         The other objectives pay on the way.
         """
         potential: Array = jnp.float32(0.0)
-        margins = self._margins(state.robot)
+        margins = self._margins(self.observe(state))
         for objective, share, (margin, _) in zip(self._objectives, self._shares, margins, strict=True):
             if objective.kind in ("reach", "drive"):
                 potential += POTENTIAL * share / len(margins) * jnp.minimum(margin, 0.0)
@@ -217,10 +201,7 @@ class RobotWithGoal(Robot[GoalState]):
         result: Outcome = jax.device_get(_outcome_along(self)(np.pad(observations, ((0, missing), (0, 0)), "edge")))
         return result
 
-    def _margins(self, robot: Any) -> Margins:
-        return self._margins_in(self.robot.observe(robot))
-
-    def _margins_in(self, observation: Float[Array, " observations"]) -> Margins:
+    def _margins(self, observation: Float[Array, " observations"]) -> Margins:
         values = dict(zip(self._spec, observation, strict=True))
         return [margin_of(objective.region, values, self._spec) for objective in self._objectives]
 
@@ -231,7 +212,7 @@ class RobotWithGoal(Robot[GoalState]):
 
     def started(self, robot: Any) -> GoalState:
         """An episode that begins with the body in this state."""
-        return GoalState(robot, self._outside(self._margins(robot)), empty_tally(self._objectives))
+        return GoalState(robot, self._outside(self._margins(self.robot.observe(robot))), empty_tally(self._objectives))
 
     def _largest(self, flags: Sequence[Bool[Array, ""]]) -> Float[Array, ""]:
         """The largest share of the flagged objectives."""
@@ -242,14 +223,14 @@ class RobotWithGoal(Robot[GoalState]):
         if any(objective.within is not None for objective in self._objectives):
             raise InvalidArgument("goal: expected none with `within` for an optimal return, got one")
         grid: Grid = capability(self.robot, "value_grid")()
-        of_goal = replace(
+        is_decided = self._is_decided(grid)
+        return replace(
             grid,
             to_coordinates=lambda state: grid.to_coordinates(state.robot),
             to_state=lambda coordinates: self.started(grid.to_state(coordinates)),
+            end_is_known=grid.end_is_known and is_decided,
+            smooth_commands=grid.smooth_commands if is_decided else None,
         )
-        if self._is_decided(grid):
-            return of_goal
-        return replace(of_goal, end_is_known=False, smooth_commands=None)
 
     def _is_decided(self, grid: Grid) -> bool:
         """Whether the state decides if the next iteration ends the episode, for any command; tested on random nodes."""
@@ -258,7 +239,7 @@ class RobotWithGoal(Robot[GoalState]):
         def margins_after(row: Array, node: Array, chance: float, u: float) -> Array:
             state = grid.state_at(row, node)
             robot, _, _ = self.robot.advance(jnp.full(self.noise_size, chance), state, jnp.float32(u))
-            pairs = zip(self._objectives, self._margins(robot), strict=True)
+            pairs = zip(self._objectives, self._margins(self.robot.observe(robot)), strict=True)
             margins = [margin for objective, (margin, _) in pairs if objective.can_fail or objective.kind == "reach"]
             return jnp.stack(margins) if margins else jnp.zeros(0)
 
@@ -272,9 +253,9 @@ def _outcome_along(robot: RobotWithGoal) -> Callable[[Any], Outcome]:
 
     def along(observations: Float[Array, "iterations observations"]) -> Outcome:
         def iteration(carry: Any, observation: Array) -> tuple[Any, None]:
-            return robot._judge(robot._margins_in(observation), *carry)[:2], None
+            return robot._judge(observation, *carry)[:2], None
 
-        start = robot._outside(robot._margins_in(observations[0])), empty_tally(robot._objectives)
+        start = robot._outside(robot._margins(observations[0])), empty_tally(robot._objectives)
         (_, tally), _ = jax.lax.scan(iteration, start, observations[1:])
         return outcome(robot._objectives, tally, robot.episode_limit)
 
@@ -312,10 +293,6 @@ def body_and_goal(robot: Robot[Any]) -> dict[str, Any]:
 
 
 def robot_of(data: Mapping[str, Any]) -> Robot[Any]:
-    """The inverse of `body_and_goal`; other keys are ignored.
-
-    Raises:
-        InvalidArgument: as `robot_from_dict` and `with_goal`.
-    """
+    """The inverse of `body_and_goal`; other keys are ignored, and errors are those of its parts."""
     robot = robot_from_dict(data["robot"])
     return robot if data.get("goal") is None else with_goal(robot, data["goal"])

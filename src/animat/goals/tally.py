@@ -20,8 +20,7 @@ class Tally(NamedTuple):
     """The running record of an episode, without its start; nothing in it affects how the episode continues.
 
     Attributes:
-        inside: for each objective, the number of iterations in its region.
-        is_inside: for each, whether the last state is in its region.
+        inside, is_inside: for each objective, the number of iterations in its region; whether the last state is there.
         margins: for each: to avoid, the smallest distance from the region; to reach, the best margin; for others, the
             margin of the last state.
         failed, reached: whether it has ended in this way; nothing after that is counted.

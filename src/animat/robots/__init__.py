@@ -9,8 +9,7 @@ from animat.robots.navigation import Navigation, NavigationState
 from animat.robots.registry import ROBOTS, register_robot, robot_from_dict, robot_named, robot_to_dict
 from animat.robots.shuttle import Shuttle, ShuttleState
 from animat.robots.swing_up import SwingUp, SwingUpState
-from animat.robots.wheeled import WheelsState
-from animat.robots.wheels import Wheels
+from animat.robots.wheels import Wheels, WheelsState
 
 __all__ = [
     "ROBOTS",

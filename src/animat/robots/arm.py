@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import record
-from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture, draw_over_time
 from animat.robots.motion import cost_of_distance, runge_kutta
 from animat.robots.registry import register_robot
@@ -31,10 +31,9 @@ NEAREST, FARTHEST = 0.3, 0.95
 
 
 class ArmState(NamedTuple):
-    """Angles and velocities of the joints, and the target, seen from above: x to the right, y down.
+    """Joints and target, seen from above with the shoulder at (0, 0): x to the right, y down.
 
-    The shoulder is at (0, 0). Angles increase clockwise, as y points down, and are not wrapped: the shoulder's is 0 to
-    the right, the elbow's is 0 for a straight arm.
+    Angles increase clockwise and are not wrapped: the shoulder's is 0 to the right, the elbow's for a straight arm.
     """
 
     shoulder_rad: Float[Array, ""]
@@ -139,9 +138,7 @@ class TwoLinkArm(Robot[ArmState]):
         x_m, y_m = distance_m * jnp.cos(direction), distance_m * jnp.sin(direction)
         return ArmState(zero, jnp.float32(math.pi / 2), zero, zero, x_m, y_m)
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: ArmState, u: Float[Array, " n_commands"]
-    ) -> tuple[ArmState, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: ArmState, u: Float[Array, "2"]) -> Transition[ArmState]:
         m11, m12, m22, coupling = self._inertia
         torques = self.torque_n_m * jnp.asarray(u)
 
@@ -234,10 +231,8 @@ class TwoLinkArm(Robot[ArmState]):
 
     @property
     def _inertias_kg_m2(self) -> tuple[float, float]:
-        """The smallest and the largest eigenvalue of M in any position.
-
-        They are those of a straight arm, where the trace is largest and the determinant smallest.
-        """
+        """The smallest and the largest eigenvalue of M in any position."""
+        # Those of a straight arm, where the trace is largest and the determinant smallest.
         m11, m12, m22, coupling = self._inertia
         trace, determinant = m11 + 2 * coupling + m22, (m11 + 2 * coupling) * m22 - (m12 + coupling) ** 2
         largest = (trace + math.sqrt(max(trace**2 - 4 * determinant, 0.0))) / 2

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from numbers import Real
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, final
+from typing import Annotated, Any, ClassVar, Generic, TypeAlias, TypeVar, final
 
 from jaxtyping import Bool, Float
 from pydantic import BeforeValidator, Field
@@ -18,6 +18,10 @@ from animat.records import Number, Whole
 
 State = TypeVar("State")
 """A robot's state: a NamedTuple of float32 scalars; `jax.vmap` makes batches of robots."""
+
+Uniforms: TypeAlias = "Float[Array, ' noise_size']"
+Transition: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]
+"""The state after an iteration, the reward in the task's own units, and whether the task ended."""
 
 LONGEST_EPISODE = 1_000_000
 """Most iterations of an episode: each has its own random key, drawn before the first."""
@@ -131,9 +135,7 @@ class Robot(abc.ABC, Generic[State]):
         """The state at the start of an episode."""
 
     @abc.abstractmethod
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: State, u: Float[Array, "*commands"]
-    ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: State, u: Float[Array, "*commands"]) -> Transition[State]:
         """One iteration from given random numbers: no random generator runs inside.
 
         Args:
@@ -150,9 +152,7 @@ class Robot(abc.ABC, Generic[State]):
         """The observation of `state`, in the units of `observation_spec`, float32, shape (observations,)."""
 
     @final
-    def step(
-        self, key: Array, state: State, u: Float[Array, "*commands"]
-    ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
+    def step(self, key: Array, state: State, u: Float[Array, "*commands"]) -> Transition[State]:
         """One iteration with random numbers drawn from `key`; arguments and results as in `advance`."""
         return self.advance(jax.random.uniform(key, (self.noise_size,)), state, u)
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
-from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
@@ -44,9 +44,6 @@ class Cartpole(Robot[CartpoleState]):
     with m the pole's mass, M that of pole and cart together, l half the pole's length, a the pole's angle from upright
     and w its angular velocity. Integration is explicit Euler: positions move with the velocities from before the
     iteration. An episode starts at rest, upright, in the middle of the track.
-
-    The paper's table prints a pole of 0.55 kg and an end at 12 "rad"; the open simulator that it used has 0.055 kg and
-    12 degrees, the defaults here. `Cartpole.as_printed()` takes the table literally.
 
     Attributes:
         force_noise: largest error of a push, as a fraction of `force_n`.
@@ -106,9 +103,7 @@ class Cartpole(Robot[CartpoleState]):
         zero = jnp.zeros((), jnp.float32)
         return CartpoleState(zero, zero, zero, zero)
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: CartpoleState, u: Float[Array, ""]
-    ) -> tuple[CartpoleState, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: CartpoleState, u: Float[Array, ""]) -> Transition[CartpoleState]:
         position, velocity, angle, angular_velocity = state
         pole_mass, half_length = self.pole_mass_kg, self.pole_length_m / 2
         total_mass = self.cart_mass_kg + pole_mass

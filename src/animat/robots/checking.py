@@ -22,11 +22,7 @@ MOST_COMMANDS = 64
 
 
 def check_robot(robot: Robot[Any]) -> None:
-    """Reset a robot and step it a few times, and refuse it if an environment cannot use it.
-
-    Raises:
-        InvalidArgument: naming the method or attribute, what was expected and what it returned.
-    """
+    """Reset a robot and step it a few times, and refuse it (InvalidArgument) if an environment cannot use it."""
     _expect_attributes(robot)
     if isinstance(robot, HostRobot):
         _check_on_host(robot)
@@ -97,18 +93,14 @@ def _check_compiled(robot: Robot[Any]) -> None:
             if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(value)):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
     last = [*ends, True].index(True)
-    _expect_within_bounds(robot, [observation for _, observation, *_ in outputs[: last + 2]])
-
-
-def _expect_within_bounds(robot: Robot[Any], observations: list[Any]) -> None:
-    """Check the observations of an episode, including the last, up to rounding in float32."""
-    for observation in observations:
+    for _, observation, *_ in outputs[: last + 2]:
         for number, quantity in zip(observation, robot.observation_spec, strict=True):
             within = np.clip(number, quantity.low, quantity.high)
+            # Up to rounding in float32.
             if not np.isclose(number, within, rtol=1e-5, atol=1e-5 * quantity.scale):
                 raise InvalidArgument(
-                    f"{type(robot).__name__}.observe: {quantity.name}: expected from {quantity.low:g} to "
-                    f"{quantity.high:g}, the bounds of its Quantity, got {number:g}"
+                    f"{name}.observe: {quantity.name}: expected from {quantity.low:g} to {quantity.high:g}, the bounds "
+                    f"of its Quantity, got {number:g}"
                 )
 
 
@@ -172,12 +164,11 @@ def _call(what: str, function: Callable[..., Any], *arguments: Any, expected: st
         raise
     except Exception as error:
         # Anything may go wrong in a user's robot.
+        got = first_line(error)
         if isinstance(error, jax.errors.UnexpectedTracerError):
-            raise InvalidArgument(
-                f"{what}: expected methods that keep nothing from one call to the next, got a traced value that was "
-                "kept: put it into the state, or make it a NumPy array if it never changes"
-            ) from error
-        raise InvalidArgument(f"{what}: expected {expected}, got {first_line(error)}") from error
+            expected = "methods that keep nothing from one call to the next"
+            got = "a traced value that was kept: put it into the state, or make it a NumPy array if it never changes"
+        raise InvalidArgument(f"{what}: expected {expected}, got {got}") from error
 
 
 def _expect_shape(what: str, value: Any, shape: tuple[int, ...], expected: str, dtype: type = float) -> None:
@@ -193,11 +184,11 @@ def _expect_shape(what: str, value: Any, shape: tuple[int, ...], expected: str, 
 
 def _expect_same_structure(what: str, after: Any, before: Any) -> None:
     """A state keeps its structure: it is carried through a loop that is compiled once."""
-    structures = [
-        (jax.tree.structure(state), [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(state)])
+    leaves = [
+        ", ".join(f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in jax.tree.leaves(state))
         for state in (before, after)
     ]
-    if structures[0] != structures[1]:
-        leaves = [", ".join(f"{dtype}{list(shape)}" for shape, dtype in of) for _, of in structures]
-        first, other = leaves
-        raise InvalidArgument(f"{what}: expected the state's structure from reset ({first}), got another ({other})")
+    if (jax.tree.structure(before), leaves[0]) != (jax.tree.structure(after), leaves[1]):
+        raise InvalidArgument(
+            f"{what}: expected the state's structure from reset ({leaves[0]}), got another ({leaves[1]})"
+        )

@@ -11,7 +11,7 @@ from animat.errors import InvalidArgument
 from animat.records import record
 from animat.robots.registry import register_robot
 from animat.robots.surroundings import Obstacles, Surroundings, Walls
-from animat.robots.wheeled import ARENA, Wheeled
+from animat.robots.wheels import ARENA, Wheels
 
 _NEAR_M, _FAR_M, _LEFT_M, _RIGHT_M = 0.29, 0.71, 0.42, 0.58
 _SCREENS = (
@@ -27,15 +27,14 @@ _POSTS = tuple((x, y, 0.015) for x1, y1, x2, y2 in _SCREENS for x, y in ((x1, y1
 @final
 @register_robot
 @record
-class Detour(Wheeled):
-    """A wheeled robot in an arena where the straight path from the start to the goal is always blocked.
+class Detour(Wheels):
+    """The same robot (`Wheels`) in an arena where the straight path from the start to the goal is always blocked.
 
-    A goal is drawn from the places that the robot can reach but cannot drive straight to, because its body would touch
-    a wall or an obstacle on the straight path. By default the start is in the middle of four screens with a post at
-    both ends of each, and goals are behind the screens.
+    A goal is drawn from the places that the robot can reach but not by driving straight. By default the start is in the
+    middle of four screens, and goals are behind them.
 
     Raises:
-        InvalidArgument: as `Wheeled`, and for surroundings in which no straight path is blocked.
+        InvalidArgument: as `Wheels`, and for surroundings in which no straight path is blocked.
 
     Source: the detour problem, in which an animal has to move away from what it wants (Köhler 1921,
     Intelligenzprüfungen an Menschenaffen, ch. 1).

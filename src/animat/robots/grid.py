@@ -77,11 +77,9 @@ class Located(NamedTuple):
     """A state's place between the nodes of a grid.
 
     Attributes:
-        row: first of the 4^axes rows around it.
-        row_places: distances from that row in steps, shape (axes,).
+        row, row_places: first of the 4^axes rows around it, and the distances from it in steps, shape (axes,).
         positions: places among all stored nodes of each axis, in steps, shape (axes,).
-        node: first of the four nodes around it along a row.
-        place: distance from that node in steps.
+        node, place: first of the four nodes around it along a row, and the distance from it in steps.
     """
 
     row: Array
@@ -140,11 +138,8 @@ class Grid:
     def scaled(self, factor: float, *, periodic: bool = False) -> Grid:
         """The same grid with `factor` times as many steps along each axis.
 
-        An axis with a middle node keeps one, as the start is often there.
-
-        Args:
-            factor: positive.
-            periodic: also scale periodic axes, whose nodes match the turns that a robot makes.
+        An axis with a middle node keeps one, as the start is often there. Periodic axes, whose nodes match the turns
+        that a robot makes, are scaled only if `periodic`.
         """
 
         def scaled_axis(axis: Axis) -> Axis:
@@ -166,13 +161,8 @@ class Grid:
             row += first * stride
             places.append(place)
             positions.append(first + place)
-        empty = jnp.zeros(0, jnp.float32)
-        return Located(
-            row,
-            jnp.stack(places) if places else empty,
-            jnp.stack(positions) if positions else empty,
-            *self.along.locate(along),
-        )
+        row_places, at = (jnp.stack(each) if each else jnp.zeros(0, jnp.float32) for each in (places, positions))
+        return Located(row, row_places, at, *self.along.locate(along))
 
     def state_at(self, row: Array, node: Array) -> Any:
         """The robot's state at a node of a row."""
@@ -186,11 +176,7 @@ class Grid:
 
 
 def grid_for(robot: Robot[Any]) -> Grid:
-    """The robot's own grid, its `value_grid`.
-
-    Raises:
-        InvalidArgument: for a robot without one, or without one for its parameters, or with several commands.
-    """
+    """The robot's own `value_grid`; InvalidArgument if it has none (for its parameters), or for several commands."""
     if robot.n_commands > 1:
         raise InvalidArgument(f"{robot.name}: expected one command for an optimal return, got {robot.n_commands}")
     make = capability(robot, "value_grid")

@@ -7,6 +7,7 @@ import importlib.metadata
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, final
 
@@ -17,7 +18,7 @@ from pydantic import Field
 from animat.errors import InvalidArgument, first_line, shown
 from animat.extras import install_command
 from animat.records import Flag, Number, Whole, record
-from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Iterations, Quantity
+from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Iterations, Quantity
 from animat.robots.host import LONGEST_KEPT, Body, HostRobot, time_limit
 from animat.robots.measuring import is_repeatable, measured_scales
 from animat.robots.registry import REGISTRY
@@ -26,7 +27,6 @@ FAMILY = "gymnasium"
 _ID = re.compile(r"(?:[A-Za-z_][\w.]{0,200}:)?[\w./:-]{1,200}")
 MOST_OBSERVED = 4_096
 """Most numbers in an observation: a policy is a small network."""
-MOST_LEVELS = 1_024
 LARGEST_BOUND = 1e6
 """Of an observation: a larger bound says nothing about its usual size."""
 
@@ -60,7 +60,7 @@ class GymnasiumRobot(HostRobot):
     episode_limit: Iterations
     low: Annotated[tuple[Number, ...], Field(max_length=64)]
     high: Annotated[tuple[Number, ...], Field(max_length=64)]
-    levels: Annotated[Whole, Field(ge=0, le=MOST_LEVELS)]
+    levels: Annotated[Whole, Field(ge=0, le=1_024)]
     scales: Annotated[tuple[Scale, ...], Field(min_length=1, max_length=MOST_OBSERVED)]
     keeps_state: Flag
 
@@ -110,8 +110,8 @@ class GymnasiumRobot(HostRobot):
 
     def body(self, *, with_pictures: bool = False) -> Body:
         module = self.id.rpartition(":")[0]
+        # A file could name any module.
         if module and module not in sys.modules:
-            # A file could name any module.
             raise InvalidArgument(
                 f"{self.name}: expected {module} to be imported, got only a policy: import it first (on the command "
                 f"line: --robot {self.name})"
@@ -131,24 +131,18 @@ class GymnasiumRobot(HostRobot):
     def caveats(self) -> tuple[str, ...]:
         if self.keeps_episodes:
             return ()
+        why = "the same seed and commands do not give the same episode, so an episode cannot continue from a checkpoint"
         if self.keeps_state:
-            return (
-                f"{self.name}: an episode of {self.episode_limit:,} iterations is longer than the {LONGEST_KEPT:,} "
-                "whose commands are kept: episodes restart at each checkpoint",
-            )
-        return (
-            f"{self.name}: the same seed and commands do not give the same episode, so an episode cannot continue from "
-            "a checkpoint: episodes restart at each checkpoint",
-        )
+            limit = f"{self.episode_limit:,} iterations is longer than the {LONGEST_KEPT:,}"
+            why = f"an episode of {limit} whose commands are kept"
+        return (f"{self.name}: {why}: episodes restart at each checkpoint",)
 
     @staticmethod
     def import_module(id: str) -> None:
         """Import the module that an id names, if any; raises as `named`."""
-        module = id.rpartition(":")[0]
-        if not module:
-            return
         try:
-            importlib.import_module(module)
+            if module := id.rpartition(":")[0]:
+                importlib.import_module(module)
         except (Exception, SystemExit) as error:
             raise InvalidArgument(
                 f"robot: expected {FAMILY}:module:Id with a module that can be imported, got {first_line(error)}"
@@ -172,7 +166,7 @@ class GymnasiumRobot(HostRobot):
             raise InvalidArgument(f"robot: expected gymnasium: and an environment's id, got {shown(f'{FAMILY}:{id}')}")
         cls.import_module(id)
         items = tuple(settings.items())
-        with time_limit(cls(id, items, 1, (0.0,), (1.0,), 0, (1.0,), False), "being made"):
+        with time_limit(f"{FAMILY}:{id}", "being made"):
             body = _Environment(id, items)
         limit = body.limit if episode_limit is None else episode_limit
         if limit is None:
@@ -180,11 +174,8 @@ class GymnasiumRobot(HostRobot):
                 f"{FAMILY}:{id}: expected an episode limit, got an environment without one: "
                 "--parameters episode_limit=1000"
             )
-        if not 1 <= limit <= LONGEST_EPISODE:
-            raise InvalidArgument(f"episode_limit: expected from 1 to {LONGEST_EPISODE:,} iterations, got {limit:,}")
-        action_space = body.low, body.high, body.levels
-        robot = cls(id, items, limit, *action_space, (1.0,) * body.observed, False)
-        return cls(id, items, limit, *action_space, measured_scales(robot, body.bounds), is_repeatable(robot))
+        robot = cls(id, items, limit, body.low, body.high, body.levels, (1.0,) * body.observed, False)
+        return replace(robot, scales=measured_scales(robot, body.bounds), keeps_state=is_repeatable(robot))
 
 
 REGISTRY.add_family(FAMILY, GymnasiumRobot)
@@ -262,16 +253,12 @@ def _commands(name: str, space: Any) -> tuple[tuple[float, ...], tuple[float, ..
     from gymnasium.spaces import Box, Discrete
 
     if isinstance(space, Discrete):
-        if space.n > MOST_LEVELS:
-            raise InvalidArgument(f"{name}: expected at most {MOST_LEVELS:,} actions, got {space.n:,}")
         return (), (), int(space.n)
     if not isinstance(space, Box):
         raise InvalidArgument(f"{name}: expected an action space of kind Box or Discrete, got {type(space).__name__}")
     if not np.issubdtype(space.dtype, np.floating):
         raise InvalidArgument(f"{name}: expected actions that are floating-point numbers, got {space.dtype}")
     low, high = space.low.ravel().astype(float), space.high.ravel().astype(float)
-    if not 1 <= len(low) <= 64:
-        raise InvalidArgument(f"{name}: expected actions of 1 to 64 dimensions, got {len(low)}")
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise InvalidArgument(f"{name}: expected actions with finite bounds, low below high, got {shown(space)}")
     return tuple(low.tolist()), tuple(high.tolist()), 0

@@ -38,8 +38,7 @@ class Body(abc.ABC):
         """One iteration by one of the robot's `actions`.
 
         Returns:
-            the observation after it, the reward in the task's own units, whether the task itself ended, and whether it
-            was cut off.
+            the observation, the reward in the task's own units, whether the task itself ended, and if it was cut off.
         """
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
@@ -72,11 +71,7 @@ class HostRobot(Robot[Any]):
 
     @abc.abstractmethod
     def body(self, *, with_pictures: bool = False) -> Body:
-        """A new body, with a `picture` if requested.
-
-        Raises:
-            InvalidArgument: if it cannot be made, or does not match the parameters.
-        """
+        """A new body, with a `picture` if requested; InvalidArgument if it cannot be made, or differs."""
 
     @abc.abstractmethod
     def actions(self, commands: Float[np.ndarray, "bodies commands"]) -> Sequence[Any]:
@@ -102,13 +97,9 @@ class HostRobot(Robot[Any]):
 
 
 class StepResult(NamedTuple):
-    """The result of a step of several bodies.
+    """The result of a step of several bodies, before ended episodes restart.
 
-    Attributes:
-        observation: after the step, before ended episodes restart.
-        reward: in the task's own units.
-        terminated: whether the task itself ended.
-        truncated: whether the body or the robot's `episode_limit` cut it off; never both.
+    A body, or the robot's `episode_limit`, may cut off an episode (`truncated`) whose task has not ended itself.
     """
 
     observation: Float32[np.ndarray, "bodies observations"]
@@ -128,8 +119,7 @@ class Snapshot(NamedTuple):
     Attributes:
         observation: the last of each.
         episodes: number of episodes that each has begun.
-        iterations: of each in its current episode.
-        commands: in that episode; empty if the robot's state cannot be kept.
+        iterations, commands: of each in its current episode; no commands if the robot's state cannot be kept.
     """
 
     observation: Float32[np.ndarray, "*some bodies observations"]
@@ -141,21 +131,16 @@ class Snapshot(NamedTuple):
     def initial(cls, robot: HostRobot, bodies: int) -> Snapshot:
         """The state of bodies that have not begun."""
         kept = robot.episode_limit if robot.keeps_episodes else 0
-        return cls(
-            np.zeros((bodies, len(robot.observation_spec)), np.float32),
-            np.zeros(bodies, np.int32),
-            np.zeros(bodies, np.int32),
-            np.zeros((bodies, kept, robot.n_commands), np.float32),
-        )
+        observation = np.zeros((bodies, len(robot.observation_spec)), np.float32)
+        commands = np.zeros((bodies, kept, robot.n_commands), np.float32)
+        return cls(observation, np.zeros(bodies, np.int32), np.zeros(bodies, np.int32), commands)
 
 
 class Bodies:
     """Bodies of one robot side by side, each with its own sequence of episodes.
 
     Args:
-        robot: to which the bodies belong.
         seeds: of each body; the seed of an episode follows from it and the episode's number.
-        with_pictures: whether the bodies have pictures.
     """
 
     def __init__(self, robot: HostRobot, seeds: Sequence[Sequence[int]], *, with_pictures: bool = False) -> None:
@@ -196,9 +181,8 @@ class Bodies:
             BodyFailed: naming the robot, if a body raised, hung, or returned a number that is not finite.
         """
         robot, (observation, _, iterations, kept), bodies = self.robot, self._now, self._bodies
-        actions = robot.actions(commands)
-        reward = np.zeros(len(bodies))
-        terminated, truncated = np.zeros(len(bodies), bool), np.zeros(len(bodies), bool)
+        actions, reward = robot.actions(commands), np.zeros(len(bodies))
+        terminated, truncated = np.zeros((2, len(bodies)), bool)
 
         def step() -> None:
             for i, (body, action) in enumerate(zip(bodies, actions, strict=True)):
@@ -219,11 +203,7 @@ class Bodies:
         return call_body(self.robot, "render", self._bodies[0].picture)
 
     def restore(self, snapshot: Snapshot) -> bool:
-        """Bring new bodies to the state of others; returns whether that succeeded.
-
-        If not, because the robot's state is not kept or the bodies behaved differently, each has begun its next
-        episode.
-        """
+        """Bring new bodies to the state of others; returns whether that succeeded: if not, each begins another."""
         for part, kept in zip(self._now, snapshot, strict=True):
             part[...] = kept
         if snapshot.commands.shape[1] and snapshot.episodes.all():
@@ -261,7 +241,7 @@ class Bodies:
 def call_body(robot: HostRobot, what: str, function: Callable[..., Answer], *arguments: Any) -> Answer:
     """Call external code; whatever it raises becomes a one-line BodyFailed that names the robot."""
     try:
-        with time_limit(robot, what):
+        with time_limit(robot.name, what):
             return function(*arguments)
     except AnimatError:
         # Ours already have a one-line message.
@@ -275,14 +255,10 @@ class _TooLongError(BaseException):
 
 
 @contextmanager
-def time_limit(robot: HostRobot, what: str) -> Iterator[None]:
-    """Limit external code to `PATIENCE_S`.
+def time_limit(name: str, what: str) -> Iterator[None]:
+    """Raise BodyFailed if external code takes longer than `PATIENCE_S`, when it returns to Python.
 
-    This works only in a process's main thread, the only one to receive signals, and takes effect when the body's code
-    returns to Python.
-
-    Raises:
-        BodyFailed: after that time.
+    This works only in a process's main thread, the only one to receive signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -297,7 +273,7 @@ def time_limit(robot: HostRobot, what: str) -> Iterator[None]:
     try:
         yield
     except _TooLongError:
-        raise BodyFailed(f"{robot.name}: expected {what} within {PATIENCE_S:g} s, got no response: it hangs") from None
+        raise BodyFailed(f"{name}: expected {what} within {PATIENCE_S:g} s, got no response: it hangs") from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL if before is None else before)

@@ -15,16 +15,10 @@ _SEED = 20_260_000
 
 
 def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, ...]:
-    """The scale of each observed number: its bound, or, if that is not known, its root mean square.
+    """The scale of each observed number: its bound, or, where that is 0 (not known), its root mean square.
 
     The root mean square is over random commands. It has two digits, so that it does not depend on how a processor
     rounds, and is 1 for a number that is always 0.
-
-    Args:
-        bounds: largest size of each number; 0 if not known.
-
-    Raises:
-        BodyFailed: as `Bodies.step`.
     """
     if all(bounds):
         return tuple(map(float, bounds))
@@ -38,7 +32,7 @@ def measured_scales(robot: HostRobot, bounds: Sequence[float]) -> tuple[float, .
             observed.append(bodies.begin()[0])
     size = np.sqrt(np.mean(np.square(observed, dtype=np.float64), axis=0))
     return tuple(
-        float(bound or f"{min(max(float(rms), 1e-9), 1e9):.2g}") if bound or rms > 1e-9 else 1.0
+        float(bound or f"{min(float(rms), 1e9):.2g}") if bound or rms > 1e-9 else 1.0
         for bound, rms in zip(bounds, size, strict=True)
     )
 

@@ -31,10 +31,7 @@ def runge_kutta(rates: Callable[[Numbers], Numbers], state: Numbers, step_s: flo
         y(t + h) = y + h/6 (k1 + 2 k2 + 2 k3 + k4),
         k1 = f(y), k2 = f(y + h/2 k1), k3 = f(y + h/2 k2), k4 = f(y + h k3)
 
-    Args:
-        rates: f, the derivative of each number of a state, per second; commands are constant within a step.
-        state: y, a pytree.
-        step_s: h.
+    with f the `rates`, y the state (a pytree) and h `step_s`; commands are constant within a step.
     """
 
     def after(rate: Numbers, share: float) -> Numbers:

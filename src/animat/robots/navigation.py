@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
-from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, AIM, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
@@ -21,10 +21,7 @@ from animat.robots.registry import register_robot
 
 
 class NavigationState(NamedTuple):
-    """Position and heading of the robot, seen from above: x to the right, y down from the top-left corner.
-
-    The heading is 0 to the right and increases clockwise, as y points down; it lies in (-pi, pi].
-    """
+    """Position (x to the right, y down from the top-left corner) and heading (clockwise from the right, (-pi, pi])."""
 
     x_m: Float[Array, ""]
     y_m: Float[Array, ""]
@@ -42,9 +39,6 @@ class Navigation(Robot[NavigationState]):
 
     with d the distance to the goal after the move and R the goal's radius. An episode starts in the top-left corner,
     facing right.
-
-    The paper prints 20 iterations per episode, too few to reach the goal (`fewest_iterations_to_goal` is 36); the
-    default here is 100. `Navigation.as_printed()` takes the paper literally, and its `caveats` say so.
 
     Attributes:
         turn_rad: turn per iteration at u = 1.
@@ -117,9 +111,7 @@ class Navigation(Robot[NavigationState]):
         zero = jnp.zeros((), jnp.float32)
         return NavigationState(zero, zero, zero)
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: NavigationState, u: Float[Array, ""]
-    ) -> tuple[NavigationState, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: NavigationState, u: Float[Array, ""]) -> Transition[NavigationState]:
         heading = within_half_a_turn(state.heading_rad + self.turn_rad * u)
         x = jnp.clip(state.x_m + self.stride_m * jnp.cos(heading), 0.0, self.arena_width_m)
         y = jnp.clip(state.y_m + self.stride_m * jnp.sin(heading), 0.0, self.arena_height_m)
@@ -167,14 +159,12 @@ class Navigation(Robot[NavigationState]):
         return 2.0 * (right > 0) - 1.0
 
     def value_grid(self) -> Grid:
-        """The grid found by measurement to suit the task (see docs/evidence/optimal-return.md).
-
-        With a hundred headings, turns of u pi/10 with u a multiple of 0.2 lead exactly from one to another.
-        """
+        """The grid found by measurement to suit the task (see docs/evidence/optimal-return.md)."""
         return Grid(
             Axis("x", "m", 0.0, self.arena_width_m, 61),
             (
                 Axis("y", "m", 0.0, self.arena_height_m, 61),
+                # With a hundred headings, turns of u pi/10 with u a multiple of 0.2 lead exactly from one to another.
                 Axis("heading", "rad", -math.pi, math.pi, 100, periodic=True),
             ),
             tuple,

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jax, jnp
 from animat.records import Number, record
-from animat.robots.base import Iterations, Quantity, Robot, Size
+from animat.robots.base import Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, RAIL, Canvas, Picture, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.registry import register_robot
@@ -41,9 +41,6 @@ class Shuttle(Robot[ShuttleState]):
     with x the cart's position and v its velocity. An iteration is the exact solution for a constant u. A cart that
     reaches an end of the track stops there. An episode starts at rest in the middle and is never terminated. Its cue is
     drawn, right and left with equal probability.
-
-    What is right at one place is wrong at the other, and position and velocity do not show which is which: without the
-    cue, no rule has a mean return above 0.
 
     Attributes:
         place_m: distance of both places from the middle.
@@ -103,9 +100,7 @@ class Shuttle(Robot[ShuttleState]):
         zero = jnp.zeros((), jnp.float32)
         return ShuttleState(zero, zero, jnp.where(jax.random.uniform(key) < 0.5, 1.0, -1.0).astype(jnp.float32))
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: ShuttleState, u: Float[Array, ""]
-    ) -> tuple[ShuttleState, Float[Array, ""], Bool[Array, ""]]:
+    def advance(self, uniforms: Uniforms, state: ShuttleState, u: Float[Array, ""]) -> Transition[ShuttleState]:
         kept = math.exp(-self.step_s / self.time_constant_s)
         final = self.speed_m_per_s * u
         moved = final * self.step_s + (state.velocity_m_per_s - final) * self.time_constant_s * (1 - kept)
@@ -134,10 +129,7 @@ class Shuttle(Robot[ShuttleState]):
         return xp.clip((cue * self.place_m - position - BRAKE_S * velocity) / self.place_radius_m, -1.0, 1.0)
 
     def value_grid(self) -> Grid:
-        """Cue by position by velocity; of the cue's nodes, only those of its two values are ever visited.
-
-        Computed for every command, as a command may decide whether an iteration is rewarded.
-        """
+        """Cue by position by velocity, for every command, as a command may decide whether an iteration is rewarded."""
         half_m, fastest = self.track_length_m / 2, self.speed_m_per_s
         return Grid(
             Axis("cue", "1", -1.0, 1.0, TAPS),

@@ -34,11 +34,7 @@ class Surroundings(NamedTuple):
     obstacles: tuple[Obstacle, ...]
 
     def clearance_m(self, x_m: Float[Array, "*places"], y_m: Float[Array, "*places"]) -> Float[Array, "*places"]:
-        """Distance to the nearest wall or obstacle's edge; below 0 inside an obstacle, infinite if there is nothing.
-
-        Args:
-            x_m, y_m: of places, as NumPy or JAX arrays.
-        """
+        """Distance to the nearest wall or obstacle's edge; below 0 inside an obstacle, infinite if there is nothing."""
         xp = x_m.__array_namespace__()
         distance_m: Array = xp.full_like(x_m, math.inf)
         for x1, y1, x2, y2 in self.walls:
@@ -104,8 +100,7 @@ def places_within_reach(
             moves from a place to its four neighbours.
 
     Returns:
-        x and y (m) of each, including the start; none if the disc has no room at the start, or if there are more than
-        a million places to check.
+        x and y (m) of each, including the start; none without room at the start, or with over a million to check.
     """
     from scipy.ndimage import label
 
@@ -118,9 +113,6 @@ def places_within_reach(
         return np.zeros((0, 2))
     x_m, y_m = np.meshgrid(*(at + spacing_m * of for at, of in zip(start_m, steps, strict=True)), indexing="ij")
     regions, _ = label(around.clearance_m(x_m, y_m) >= room_m)
-    at_start = np.flatnonzero(steps[0] == 0), np.flatnonzero(steps[1] == 0)
-    if not (len(at_start[0]) and len(at_start[1])):
-        return np.zeros((0, 2))
-    own = int(regions[at_start[0][0], at_start[1][0]])
+    own = regions[np.ix_(steps[0] == 0, steps[1] == 0)].max(initial=0)
     reached = (regions == own) & (own > 0)
     return np.stack([x_m[reached], y_m[reached]], axis=1)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from pydantic import Field
 
 from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
-from animat.robots.base import Amount, Iterations, Quantity, Robot, Size
+from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
 from animat.robots.drawing import ACCENT, BODY, GOAL, GOAL_FILL, INK, Canvas, Picture, draw_over_time
 from animat.robots.grid import TAPS, Axis, Grid
 from animat.robots.motion import runge_kutta, within_half_a_turn
@@ -97,10 +97,7 @@ class SwingUp(Robot[SwingUpState]):
         """At rest, hanging; `key` is not used."""
         return SwingUpState(jnp.float32(math.pi), jnp.zeros((), jnp.float32))
 
-    def advance(
-        self, uniforms: Float[Array, " noise_size"], state: SwingUpState, u: Float[Array, ""]
-    ) -> tuple[SwingUpState, Float[Array, ""], Bool[Array, ""]]:
-
+    def advance(self, uniforms: Uniforms, state: SwingUpState, u: Float[Array, ""]) -> Transition[SwingUpState]:
         def rates(state: SwingUpState) -> SwingUpState:
             angle, angular_velocity = state
             return SwingUpState(angular_velocity, self._gravity_per_s2 * jnp.sin(angle) + self._push_per_s2 * u)
@@ -144,13 +141,10 @@ class SwingUp(Robot[SwingUpState]):
         return xp.where((cosine > 0) & (xp.abs(falling) < held), catching, pumping)
 
     def value_grid(self) -> Grid:
-        """Angle by angular velocity, computed for every command, as a command may decide whether a step is rewarded.
-
-        Each of the two affects how the other moves, but a grid needs a first coordinate that does not affect the
-        others: here it is a dummy with the fewest nodes.
-        """
+        """Angle by angular velocity, computed for every command, as a command may decide whether a step is rewarded."""
         fastest = self.speed_limit_rad_per_s
         return Grid(
+            # Each of the two affects how the other moves, as a grid's first coordinate may not.
             Axis("nothing", "1", 0.0, 1.0, TAPS),
             (
                 Axis("angle", "rad", -math.pi, math.pi, 180, periodic=True),

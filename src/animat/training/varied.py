@@ -91,9 +91,7 @@ class Varied(Wrapper[RobotState]):
         return self._in(state).respond(uniforms, state, action, self._drawn(state, simulator))
 
     def advance(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> State:
-        after = self._in(state).advance(uniforms, state, action, self._drawn(state, simulator))
-        kept = {name: state.info[name] for name in ("parameters", "recording")}
-        return after._replace(info=after.info | kept)
+        return self._in(state).advance(uniforms, state, action, self._drawn(state, simulator))
 
     def succeeded(self, state: State) -> Bool[Array, ""]:
         """Whether an episode that ended in this state succeeded; False for a robot that does not report success."""
