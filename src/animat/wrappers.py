@@ -86,7 +86,11 @@ class NeuralWrapper(Wrapper[RobotState]):
 @final
 @dataclass(frozen=True)
 class ShuffledDelivery(NeuralWrapper[RobotState]):
-    """Delivers a random condition at each iteration, whatever was chosen: the paper's control (section 3.2)."""
+    """Delivers a random condition at each iteration, whatever was chosen: the paper's control (section 3.2).
+
+    Raises:
+        InvalidArgument: around an environment without neurons.
+    """
 
     def respond(self, uniforms: Uniforms, state: State, action: Array, simulator: NeuronSimulator | None) -> Responded:
         return self.inside.respond(uniforms, state, self._drawn(uniforms), simulator)
@@ -105,6 +109,9 @@ class NeuralObservation(NeuralWrapper[RobotState]):
     """Appends the history state of the neurons (`State.neurons`) to the observation.
 
     A simulator's next answer depends on trace and load alone; a simulator without memory leaves both at 0.5.
+
+    Raises:
+        InvalidArgument: around an environment without neurons.
     """
 
     @property

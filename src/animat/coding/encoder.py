@@ -20,7 +20,11 @@ SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
 
 @dataclass(frozen=True)
 class Encoder:
-    """From an agent's actions to stimuli: each action is a condition, presented as trials of `pulses` pulses.
+    """From an agent's actions to stimuli: each action is a condition, presented as trials of several pulses.
+
+    Attributes:
+        conditions: in the order of the actions.
+        pulses: per trial.
 
     Raises:
         InvalidArgument: for no conditions, or trains that take too long.

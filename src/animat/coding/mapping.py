@@ -32,12 +32,15 @@ class Mapping(abc.ABC):
 
     @abc.abstractmethod
     def command(self, x: Numbers, percentiles: Numbers) -> Numbers:
-        """The motor command u in [-1, 1] for the response `x`, never falling as x rises, in the shape of `x`.
+        """The motor command for the response `x`.
 
         Args:
             x: firing rate per channel in the response window, in Hz, any shape.
             percentiles: P0, P10, ..., P100 of the non-burst responses of all conditions together, in Hz, rising,
                 shape (11,).
+
+        Returns:
+            u in [-1, 1], never falling as x rises, in the shape of `x`.
         """
 
 
@@ -51,6 +54,9 @@ class Thresholds(Mapping):
 
     There is no zero among the ten: the published end points and step leave it out. If percentiles are tied (many equal
     responses), a response on the tie passes all of them at once, and the commands in between never occur.
+
+    Args:
+        count: 1 or 9.
 
     Raises:
         InvalidArgument: for any other count.
@@ -129,7 +135,11 @@ Kind = TypeVar("Kind", bound=type[Mapping])
 def register_mapping(kind: Kind) -> Kind:
     """Register a mapping, so that policies with it can be saved and loaded; a class decorator.
 
-    InvalidArgument is raised for anything but a frozen dataclass on `Mapping` with all methods and a name of its own.
+    Args:
+        kind: a frozen dataclass of all parameters, with a `name` and a `command` (see `Mapping`).
+
+    Raises:
+        InvalidArgument: for a class of another kind, one that lacks a method, or a name already taken.
     """
     REGISTRY.register(kind)
     return kind

@@ -126,7 +126,12 @@ class Culture(Openable):
 
     @final
     def rest(self, duration_s: float) -> None:
-        """Let time pass unobserved; raises as `deliver` does."""
+        """Let time pass unobserved.
+
+        Raises:
+            InvalidArgument: for a culture that is not open, or a negative time.
+            DeviceFailed: if the device fails meanwhile.
+        """
         turns, duration_s = self._opened(), plain_duration(duration_s)
         with as_device_failure(self.name, "rest"), turns:
             self._rest(duration_s)
@@ -135,9 +140,18 @@ class Culture(Openable):
     def stimulate(
         self, electrodes: Sequence[int], pulse: Pulse, window_ms: tuple[float, float] = (2.0, 10.0)
     ) -> Spikes:
-        """Deliver one pulse now, and return the spikes with start <= time < end of a window, counted from the pulse.
+        """Deliver one pulse now and return the spikes of a window after it; time passes to the window's end.
 
-        Time passes to the window's end. Raises as `deliver` does.
+        Args:
+            electrodes: pulsed together.
+            pulse: that each delivers.
+            window_ms: start and end of the window after the pulse.
+
+        Returns:
+            Spikes with start <= time < end, counted from the pulse.
+
+        Raises:
+            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
         start_ms, end_ms = (number("window_ms", edge_ms) for edge_ms in window_ms)
         if not 0 <= start_ms < end_ms < float("inf"):
@@ -181,7 +195,7 @@ class Culture(Openable):
         """Stimulate by a protocol and record.
 
         The whole schedule is checked before anything is delivered. Set-up times pass unobserved and are left out of the
-        recording's clock, on which blocks follow one another directly. Raises as `deliver` does.
+        recording's clock, on which blocks follow one another directly.
 
         Args:
             protocol: what to do; it is kept with the recording.
@@ -189,6 +203,9 @@ class Culture(Openable):
             progress: updated after each block, or stretch of one (`stretch_s`).
             follow: then called, except at the end, with a function that returns the recording so far. The time it takes
                 is subtracted from the next set-up time.
+
+        Raises:
+            UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.
         """
         schedule, progress = self.schedule(protocol, seed), progress or Silent()
         provenance = {**self.provenance, "protocol_seed": str(seed)}

@@ -161,7 +161,11 @@ class VirtualCulture(ComputedCulture):
         }
 
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write the complete state, to continue from bit for bit, and whole numbers; the file is complete or absent.
+        """Write the complete state, to continue from bit for bit; the file is complete or absent.
+
+        Args:
+            path: the file.
+            remarks: whole numbers to store with it.
 
         Raises:
             InvalidFile: if it cannot be written.

@@ -38,6 +38,10 @@ class Condition:
         electrodes: sets of electrodes, each pulse on one of them; empty: not known; None: any of the culture's
             patterns; `RESTING`: nothing is delivered.
         only_last: only the last pulse of a trial is on these electrodes, and those before are on any pattern.
+
+    Raises:
+        InvalidArgument: for a label that is not a line of text, a value that is not a finite number, frequencies that
+            are not positive, or electrodes that are not sets of numbers from 0 on.
     """
 
     label: Annotated[Line, Field(min_length=1)]

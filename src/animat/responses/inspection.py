@@ -144,8 +144,16 @@ def inspect_recording(
 ) -> Inspection:
     """Inspect a recording as training would use it: its contents, and what is wrong with it.
 
-    Args and errors are those of `animat.extract_responses`; `name` is what to call the recording, by default the source
-    in its provenance.
+    Args:
+        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
+        window_ms: start and end of the window that responses are read in, after the pulse.
+        burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
+        name: what to call it; by default the source in its provenance.
+
+    Raises:
+        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        UnusableData: for a recording without channels.
+        Mismatch: for a window that differs from a table's.
     """
     responses = extract_responses(recording, by, window_ms, burst_threshold)
     stimuli, read = recording.stimuli, recording.stimuli.is_last_of_presentation

@@ -36,6 +36,9 @@ class Readouts:
         names: of the groups, in the order of the commands.
         electrodes: of each group, rising; None: one group of all channels, whatever they read. An electrode may be in
             several groups.
+
+    Raises:
+        InvalidArgument: for invalid names or electrodes, or names without electrodes.
     """
 
     names: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_READOUTS)] = ("all",)
@@ -91,8 +94,15 @@ class Readouts:
 
             x = S / (T N),  S: spikes of the group's N channels in a window of T
 
-        Arguments and edges are as in `animat.responses.windows.read_windows`; `members` is from `self.members`. A row
-        per window; with a single readout, without the axis of readouts.
+        Edges are as in `animat.responses.windows.count_spikes`.
+
+        Args:
+            members: which of its channels belong to each group (`members`).
+            after_s: times of the pulses, in seconds on the clock of the spikes.
+            window_ms: start and end of the window after each.
+
+        Returns:
+            A row per window; with a single readout, without the axis of readouts.
         """
         window, spike = spikes_in(recording, after_s + window_ms[0] * 1e-3, after_s + window_ms[1] * 1e-3)
         channel = recording.spike_channels[spike]

@@ -40,6 +40,9 @@ class Presentation:
         order: `"blocked"`, all stimuli of a frequency together (the paper), or `"mixed"`, a frequency drawn at random
             for each trial (as a closed loop presents them).
         pulses: pulses 1/f apart in one trial; the response is read after the last one (the paper: 1).
+
+    Raises:
+        InvalidArgument: for an unknown order, or fewer than one pulse.
     """
 
     order: Order
