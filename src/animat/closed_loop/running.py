@@ -188,6 +188,9 @@ class _Supervisor:
             try:
                 self._write()
             except OSError as error:
+                if not is_running:
+                    # Why the loop ended counts; `_finish` tries again, and says what is lost.
+                    break
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
             if thread.is_alive() and (stopped := driver.stopped_by_file()):
                 # The loop checks before its next trial; do not wait for the pulses of the current one.
