@@ -606,6 +606,34 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         LogWriter(tmp_path / "other.log", {})
 
 
+@pytest.mark.parametrize(("at", "by", "why"), [(999, "disk", "all 1 episodes were run"), (4, "culture", "the culture")])
+def test_a_disk_that_is_full_once_the_loop_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, by: str, why: str
+) -> None:
+    real, begun = os.write, threading.Event()
+
+    def write(file: int, data: Any) -> int:
+        if begun.is_set() and not any(thread.name == "closed loop" for thread in threading.enumerate()):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(file, data)
+
+    def fault(culture: FakeCulture, observed: Observed) -> Observed:
+        culture._at += 1
+        begun.set()
+        if culture.deliveries >= at:
+            raise RuntimeError("the amplifier is on fire")
+        return observed
+
+    monkeypatch.setattr("animat.closed_loop.log.os.write", write)
+    with FakeCulture(fault=fault, at=0) as culture:
+        loop = loop_of(robot=Navigation(episode_limit=6))
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1)
+        assert culture.is_stopped == (by == "culture")
+    assert session.ending.by == by
+    assert session.ending.message.startswith(why)
+    assert re.search(r" lost \(No space left on device\)$", session.ending.message)
+
+
 def test_a_recording_that_cannot_be_written_is_made_later(tmp_path: Path) -> None:
     # A folder stands where the file should go.
     (tmp_path / "session.nwb").mkdir()

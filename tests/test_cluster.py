@@ -25,7 +25,7 @@ from animat.execution.cluster import Cluster
 from animat.execution.dask_worker import _own_cores, versions_tag
 from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.local_cluster import local_cluster
-from animat.execution.task import Task
+from animat.execution.task import Task, bring_back, carry_out_unshared, store
 from animat.progress import Progress, Silent
 from worker_tasks import Fail, Join, Sized, rest, tell_process
 
@@ -65,6 +65,15 @@ def test_a_worker_takes_cores_in_a_folder_of_its_own_user_and_follows_no_link(
         _own_cores(1)
     assert victim.read_text() == "all there" and core in os.sched_getaffinity(0)
     held.pop().close()
+
+
+def test_a_file_that_came_back_damaged_is_a_line(tmp_path: Path) -> None:
+    store(tmp_path, {})
+    result, contents = carry_out_unshared(Join("a"), {}, tmp_path)
+    assert bring_back(tmp_path, result, contents) == result
+    assert (tmp_path / "a").read_text() == "(a)"
+    with pytest.raises(InvalidFile, match="/a: expected the file that the worker wrote, got a different one"):
+        bring_back(tmp_path, result, {"a": b"(b)"})
 
 
 def test_the_page_has_commands_that_animat_knows() -> None:

@@ -82,6 +82,12 @@ def continuous(mean: float | None = None, log_std: float = 0.0) -> Policy:
 # --- acting ---------------------------------------------------------------------------------------------------------
 
 
+def test_a_flag_of_numpy_can_be_saved(tmp_path: Path) -> None:
+    seeing = {**layers(0, 6, 8, 8, 5), "scales": np.ones(6, np.float32), "neural_observation": np.True_}
+    replace(through_neurons(), **seeing).save(tmp_path / "p0.safetensors")
+    assert Policy.load(tmp_path / "p0.safetensors").neural_observation is True
+
+
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_numpy_answers_as_jax_does(seed: int) -> None:

@@ -147,7 +147,7 @@ def long_log(folder: Path, ticks: int) -> None:
 
 @pytest.mark.oracle
 def test_memory_does_not_grow_with_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("animat.closed_loop.log._BLOCK_RECORDS", 128)
+    monkeypatch.setattr("animat.closed_loop.log._BLOCK_SPIKES", 5_000)
     peaks = {}
     for ticks in (500, 3_000):
         long_log(tmp_path / str(ticks), ticks)

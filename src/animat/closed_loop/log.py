@@ -16,7 +16,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +35,8 @@ RECORD = b"REC1"
 HEAD = struct.Struct("<4sIII")
 """The head of each record: `RECORD`, the length of the fields, the number of spikes, the checksum of both."""
 _BUFFER_BYTES = 2**18
-_BLOCK_RECORDS = 4096
-"""How many records are read at once for their spikes."""
+_BLOCK_SPIKES = 2**20
+"""Spikes that are read at once, some more by the last record of a block."""
 _NO_TIMES, _NO_CHANNELS = np.empty(0, np.float64), np.empty(0, np.int64)
 
 
@@ -135,11 +135,18 @@ class Log:
         return (parse_fields(self.path, data) for data in self._data())
 
     def spike_blocks(self) -> Iterator[tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]]:
-        """All spikes in the order they were written: times in s and channels, of some thousand records at a time."""
-        spikes = map(_spikes, self._data())
-        while block := list(itertools.islice(spikes, _BLOCK_RECORDS)):
-            times_s, channels = zip(*block, strict=True)
-            yield np.concatenate(times_s), np.concatenate(channels)
+        """All spikes in the order they were written: times in s and channels, about a million at a time."""
+        block: list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+        n_spikes = 0
+        for times_s, channels in map(_spikes, self._data()):
+            if len(times_s):
+                block.append((times_s, channels))
+                n_spikes += len(times_s)
+            if n_spikes >= _BLOCK_SPIKES:
+                yield _joined(block)
+                block, n_spikes = [], 0
+        if block:
+            yield _joined(block)
 
     def _data(self) -> Iterator[bytes]:
         with open_file(self.path) as file:
@@ -203,6 +210,13 @@ def _spikes(data: bytes) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarr
     at = HEAD.size + n_fields
     channels = np.frombuffer(data, "<i4", n_spikes, at + 8 * n_spikes)
     return np.frombuffer(data, "<f8", n_spikes, at).astype(np.float64), channels.astype(np.int64)
+
+
+def _joined(
+    block: Sequence[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]],
+) -> tuple[Float64[np.ndarray, " spikes"], Int64[np.ndarray, " spikes"]]:
+    times_s, channels = zip(*block, strict=True)
+    return np.concatenate(times_s), np.concatenate(channels)
 
 
 def parse_fields(path: Path, data: bytes) -> dict[str, Any]:

@@ -69,13 +69,16 @@ def run_session(
     """Run agents in closed loop on a culture, their episodes interleaved in random order.
 
     Whatever happens, `session.log` has every tick except those of the last 0.2 s before a SIGKILL, and the stimuli
-    that were requested and not yet answered. Unless the plan was completed or the budget spent, the culture is then
-    stopped: it delivers nothing until it is closed and opened again. `ending` says what happened; nothing is raised for
-    it, not even for Ctrl-C and SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An
-    exception of `progress` is raised again, once the culture is stopped and the log is written.
+    that were requested and not yet answered. Once this or `recover_session` returns, `session.nwb` is a recording like
+    any other. Unless the plan was completed or the budget spent, the culture is then stopped: it delivers nothing until
+    it is closed and opened again. `ending` says what happened; nothing is raised for it, not even for Ctrl-C and
+    SIGTERM. A file `STOP` in the folder ends the session before the next pulse. An exception of `progress` is raised
+    again, once the culture is stopped and the log is written.
 
     Args:
         culture: open; it stays open.
+        loop: the settings.
+        agents: at least one, each name once.
         folder: for `session.log`, `session.nwb`, and `ticks.csv` with a line per tick.
         episodes: of each agent; one number, or one for each.
         seed: decides every random draw, except what the culture does.
@@ -188,6 +191,9 @@ class _Supervisor:
             try:
                 self._write()
             except OSError as error:
+                if not is_running:
+                    # Why the loop ended counts; `_finish` tries again, and says what is lost.
+                    break
                 return Ending("disk", f"the log cannot be written: {error.strerror or error}")
             if thread.is_alive() and (stopped := driver.stopped_by_file()):
                 # The loop checks before its next trial; do not wait for the pulses of the current one.

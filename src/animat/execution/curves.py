@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -81,9 +82,11 @@ class Curves:
         """Report the rows that are new in the files, and pass the update on."""
         if self._folder is not None and self._callbacks:
             for members, n_reported in self._n_reported.items():
-                file = _file(self._folder, members[0])
-                # The last line may be incomplete.
-                lines = file.read_text().split("\n")[:-1] if file.exists() else []
+                lines: list[str] = []
+                # A file that is missing, or cannot be read just now, is read at a later update.
+                with suppress(OSError):
+                    # The last line may be incomplete.
+                    lines = _file(self._folder, members[0]).read_text().split("\n")[:-1]
                 for line in lines[n_reported:]:
                     self.add(members, np.array(json.loads(line)))
         self._progress.update(done, total, note)

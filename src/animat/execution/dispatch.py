@@ -194,9 +194,15 @@ class Dispatch:
 
     def _next_calls(self) -> list[Call]:
         """The first waiting call; if it is small, further small ones, leaving enough for the other workers."""
-        threads = sum(place.threads for place in self._places.values())
+        shares = 2 * sum(place.threads for place in self._places.values())
+        waiting_s = 0.0
+        for call in self._waiting:
+            waiting_s += self._expect_s(call)
+            if waiting_s > shares * self._longest_s:
+                # Thousands may be waiting.
+                break
         # If little is waiting, less is taken, so that all cores finish together.
-        most_s = min(self._longest_s, sum(map(self._expect_s, self._waiting)) / (2 * threads))
+        most_s = min(self._longest_s, waiting_s / shares)
         calls: list[Call] = []
         total_s = 0.0
         while self._waiting:

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @final
 class PinnedProcesses(ThreadPoolExecutor):
-    """Threads that each pass their work to their own process, pinned to its own core (None: to none, with the GPU).
+    """Threads that each pass their work to their own process, pinned to its own core; None: not pinned, with the GPU.
 
     A process is started when there is work for it, and reused until it has grown large. If a `with` block is left by an
     error, running work is ended. Work whose process ends raises a `BrokenExecutor`.

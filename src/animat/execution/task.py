@@ -199,7 +199,8 @@ def carry_out_unshared(task: Task, reads: Mapping[str, str], folder: Path) -> tu
 
 
 def bring_back(folder: Path, result: TaskResult, contents: Mapping[str, bytes]) -> TaskResult:
-    """Write the files that came back from a worker into the folder."""
+    """Write the files that came back from a worker into the folder; raises InvalidFile for a damaged one."""
     for place, content in contents.items():
-        write_whole(folder / place, content)
+        if digest_of(write_whole(folder / place, content)) != result.files[place]:
+            raise InvalidFile(f"{folder / place}: expected the file that the worker wrote, got a different one")
     return result

@@ -110,7 +110,10 @@ def _train(
 
 
 def parts_that_fit(groups: Sequence[Group]) -> list[list[int]]:
-    """Divide groups into parts, as even as possible; a part of several groups fits into the device's memory."""
+    """Divide groups, by their indices, into parts, as even as possible, that fit into the device's memory.
+
+    A part has at least one group, however large.
+    """
     available = _SHARE * device_memory_bytes()
     parts = 1 if math.isinf(available) else math.ceil(bytes_at_once(groups) / available)
     return [part.tolist() for part in np.array_split(np.arange(len(groups)), min(parts, len(groups)))]

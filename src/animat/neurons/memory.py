@@ -196,12 +196,13 @@ def _find_memory(ranked: Ranked) -> Memory:
 
 
 def _has_load(ranked: Ranked, memory: Memory) -> bool:
-    """Whether a load explains ranks that the trace does not, with coefficients of each condition's own."""
+    """Whether a load explains ranks that the trace does not."""
     from scipy.stats import f
 
     trace, load = ranked.traces(memory), ranked.loads(_LOAD_S)
     if not load.added:
         return False
+    # Each condition has its own coefficients, so that differences of means explain nothing.
     one = np.concatenate([np.eye(len(ranked.rows))[[c] * len(rows)] for c, rows in enumerate(ranked.rows)])
     every = np.concatenate(ranked.rows)
     rank = ranked.rank[every]

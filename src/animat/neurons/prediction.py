@@ -88,7 +88,7 @@ def halved(responses: Responses, readout: int | None = None) -> Halves:
 
 
 class Prediction(NamedTuple):
-    """Distributions over the values of a recording, one for each held-out response, made from n responses each."""
+    """Distributions over the values of a recording, one for each held-out response, made from `n` responses each."""
 
     halves: Halves
     probability: Float64[np.ndarray, "held values"]

@@ -207,7 +207,7 @@ class SideBySide:
         return [rows[end - len(group.members) : end] for group, end in zip(self._groups, ends, strict=True)]
 
     def train(self, index: int, *simulators: NeuronSimulator | None) -> float:
-        """Train one chunk, counted from 0, with the simulator of each group; there may be more than a training has.
+        """Train one chunk with the simulator of each group; `index` counts from 0, also beyond those of the training.
 
         Returns the mean return of the episodes that ended in it, NaN if none ended.
 

@@ -100,7 +100,8 @@ class Policy:
 
     def __post_init__(self) -> None:
         read_record(PulseCost, self.pulse_cost, "pulse_cost")
-        read_record(Flag, self.neural_observation, "neural_observation")
+        # As a Python bool, since numpy's cannot be written to a file.
+        vars(self)["neural_observation"] = read_record(Flag, self.neural_observation, "neural_observation")
         if self.neural_observation and self.mapping is None:
             raise InvalidArgument("neural_observation: expected only with a mapping, got no mapping")
         self._expect_network()
