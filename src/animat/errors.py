@@ -150,9 +150,9 @@ def did_you_mean(word: str, among: Iterable[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """An error of third-party code: its type and the first line of its message."""
-    lines = str(error).strip().splitlines() or ["no more is known"]
-    return f"{type(error).__name__}: {lines[0]}"
+    """An error of third-party code: its type and the first line of its message, which may quote a damaged file."""
+    line = "".join(filter(str.isprintable, str(error).strip().partition("\n")[0]))
+    return f"{type(error).__name__}: {line[:300] or 'no more is known'}"
 
 
 def out_of_memory(error: BaseException) -> str | None:

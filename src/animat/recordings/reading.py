@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from animat.errors import InvalidArgument, InvalidFile, as_invalid_file, in_file
+from animat.errors import InvalidArgument, InvalidFile, as_invalid_file, first_line, in_file
 from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
-from animat.recordings.formats.hdf5 import DAMAGE, first_line
+from animat.recordings.formats.hdf5 import DAMAGE
 from animat.recordings.formats.npz import read_npz
 from animat.recordings.formats.response_files import (
     is_response_npz,
