@@ -94,19 +94,15 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
         InvalidFile: if it cannot be created, or is empty and cannot be written to.
     """
     folder = Path(folder)
-    try:
+    with as_invalid_file(folder, "cannot be created or read", "; choose another --out"):
+        if folder.exists() and not folder.is_dir():
+            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out")
         created = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         if not any(folder.iterdir()):
             # A folder with a finished run may be read-only; in an empty one nothing could be done.
             expect_writable(folder)
         descriptors = [os.open(folder, os.O_RDONLY)]
-    except OSError as error:
-        if folder.exists() and not folder.is_dir():
-            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out") from error
-        raise InvalidFile(
-            f"{folder}: cannot be created or read: {error.strerror or error}; choose another --out"
-        ) from error
     try:
         if _is_locked(folder, descriptors[0]):
             _expect_same(folder, descriptors[0])
