@@ -48,7 +48,9 @@ def fail(*_: object) -> None:
 
 def test_any_error_in_reading_names_the_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5_subprocess, "_read", fail)
-    with pytest.raises(InvalidFile, match=r"a\.nwb: expected a recording, but it cannot be read \(of the library\)"):
+    with pytest.raises(
+        InvalidFile, match=r"a\.nwb: expected a recording, but it cannot be read \(SystemError: of the library\)"
+    ):
         hdf5_subprocess.read_hdf5_in_subprocess(path)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copyreg
 import difflib
+import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -68,6 +70,33 @@ class BodyFailed(AnimatError):
     """A third-party body (`gymnasium:...`) raised, hung, or returned non-finite numbers; finished work is kept."""
 
 
+@contextmanager
+def within(name: object, kinds: tuple[type[AnimatError], ...] = (InvalidArgument,)) -> Iterator[None]:
+    """Put a name in front of an InvalidArgument, or of errors of these kinds, that is raised in this context."""
+    try:
+        yield
+    except kinds as error:
+        raise type(error)(f"{name}: {error}") from error
+
+
+@contextmanager
+def in_file(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what is wrong with the contents of a file, raised in this context, into an InvalidFile that names it."""
+    try:
+        yield
+    except (InvalidArgument, UnusableData) as error:
+        raise InvalidFile(f"{path}: {error}") from error
+
+
+@contextmanager
+def as_invalid_file(path: str | os.PathLike[str], failure: str = "cannot be read", ending: str = "") -> Iterator[None]:
+    """Turn an OSError raised in this context into an InvalidFile: the path, the failure, and the system's reason."""
+    try:
+        yield
+    except OSError as error:
+        raise InvalidFile(f"{path}: {failure}: {error.strerror or error}{ending}") from error
+
+
 def in_min(minutes: float) -> str:
     """A time on the culture's clock for messages and tables, with at most two decimals."""
     return f"{round(minutes, 2):.10g} min"
@@ -86,6 +115,17 @@ def shown(value: object) -> str:
 def some_of(names: Sequence[object], most: int = 8) -> str:
     """The first names of a list, and dots if there are more."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
+
+
+def counted(n: int, noun: str, plural: str = "") -> str:
+    """A number of things for messages and tables; the usual plural ends with `s`."""
+    return f"{n:,} {noun if n == 1 else plural or f'{noun}s'}"
+
+
+def expect_at_least(what: str, given: float | None, least: int) -> None:
+    """Raise InvalidArgument for an argument below a limit; None passes."""
+    if given is not None and given < least:
+        raise InvalidArgument(f"{what}: expected {f'at least {least}' if least else '0 or more'}, got {given}")
 
 
 def expect_kind(what: str, given: object, kind: Any, words: str) -> None:
@@ -110,9 +150,9 @@ def did_you_mean(word: str, among: Iterable[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """An error of third-party code: its type and the first line of its message."""
-    lines = str(error).strip().splitlines() or ["no more is known"]
-    return f"{type(error).__name__}: {lines[0]}"
+    """An error of third-party code: its type and the first line of its message, which may quote a damaged file."""
+    line = "".join(filter(str.isprintable, str(error).strip().partition("\n")[0]))
+    return f"{type(error).__name__}: {line[:300] or 'no more is known'}"
 
 
 def out_of_memory(error: BaseException) -> str | None:

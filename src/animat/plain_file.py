@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, as_invalid_file
 
 
 def expect_plain_file(path: str | os.PathLike[str], most_bytes: int | None = None) -> Path:
@@ -57,17 +57,15 @@ def is_absent(path: Path) -> bool:
 def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
     """The text of a file in UTF-8; raises InvalidFile if it is not a text file or too large."""
     path = expect_plain_file(path, most_bytes)
+    with as_invalid_file(path), path.open("rb") as file:
+        # Files that the system generates on reading have no size before.
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
     try:
-        with path.open("rb") as file:
-            # Files that the system generates on reading have no size before.
-            content = file.read(most_bytes + 1)
-        if len(content) > most_bytes:
-            raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InvalidFile(f"{path}: expected text in UTF-8, got something else ({error.reason})") from error
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def read_toml(path: str | os.PathLike[str], most_bytes: int) -> dict[str, Any]:

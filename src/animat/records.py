@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
@@ -16,7 +13,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, Va
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails
 
-from animat.errors import InvalidArgument, InvalidFile, did_you_mean, shown
+from animat.errors import InvalidArgument, did_you_mean, shown
 from animat.writing import write_whole
 
 T = TypeVar("T")
@@ -113,15 +110,6 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if repeated := [name for name, times in Counter(name for name, _ in pairs).items() if times > 1]:
         raise InvalidArgument(f"expected each name once, got {_key(repeated[0])} twice")
     return dict(pairs)
-
-
-@contextmanager
-def in_file(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn an InvalidArgument raised in this context into an InvalidFile that names the file."""
-    try:
-        yield
-    except InvalidArgument as error:
-        raise InvalidFile(f"{path}: {error}") from error
 
 
 def as_json(value: Any) -> Any:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from animat.errors import InvalidArgument, did_you_mean, first_line, shown
+from animat.errors import InvalidArgument, did_you_mean, first_line, shown, within
 
 Thing = TypeVar("Thing")
 
@@ -178,10 +178,8 @@ class Registry(Generic[Thing]):
             )
         parameters = {name: _frozen(value) for name, value in data["parameters"].items()}
         if data["name"] in self._families:
-            try:
+            with within(data["name"]):
                 return self._families[data["name"]](**parameters)  # type: ignore[no-any-return]
-            except InvalidArgument as error:
-                raise InvalidArgument(f"{data['name']}: {error}") from error
         return self.named(data["name"], **parameters)
 
     def expect_loadable(self, thing: Thing, *, in_workers: bool = False) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from animat.errors import InvalidFile, Mismatch
+from animat.errors import InvalidFile, Mismatch, as_invalid_file
 
 UNCHANGED = "; any previous file is unchanged"
 LOCK = ".lock"
@@ -31,26 +31,22 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         InvalidFile: if the file cannot be written.
     """
     path = Path(path)
-    try:
+    with as_invalid_file(path, "cannot be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=f".partial{path.suffix}")
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error
     os.close(handle)
     temporary = Path(name)
-    try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}{UNCHANGED}") from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with as_invalid_file(path, "cannot be written", UNCHANGED):
+        try:
+            yield temporary
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+            sync_folder(path.parent)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
 
 
 def write_whole(path: Path, content: str | bytes) -> Path:
@@ -98,19 +94,15 @@ def exclusive_lock(folder: str | os.PathLike[str]) -> Iterator[None]:
         InvalidFile: if it cannot be created, or is empty and cannot be written to.
     """
     folder = Path(folder)
-    try:
+    with as_invalid_file(folder, "cannot be created or read", "; choose another --out"):
+        if folder.exists() and not folder.is_dir():
+            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out")
         created = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         if not any(folder.iterdir()):
             # A folder with a finished run may be read-only; in an empty one nothing could be done.
             expect_writable(folder)
         descriptors = [os.open(folder, os.O_RDONLY)]
-    except OSError as error:
-        if folder.exists() and not folder.is_dir():
-            raise InvalidFile(f"{folder}: expected a folder, got a file; choose another --out") from error
-        raise InvalidFile(
-            f"{folder}: cannot be created or read: {error.strerror or error}; choose another --out"
-        ) from error
     try:
         if _is_locked(folder, descriptors[0]):
             _expect_same(folder, descriptors[0])

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from animat.cli.command import Command
-from animat.errors import AnimatError, InvalidArgument
+from animat.errors import AnimatError, expect_at_least
 from animat.writing import expect_writable
 
 
@@ -30,8 +30,7 @@ class ClusterCommand(Command):
         from animat.execution.local_cluster import local_cluster
 
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
-        if workers < 1:
-            raise InvalidArgument(f"--workers: expected at least 1, got {workers}")
+        expect_at_least("--workers", workers, 1)
         expect_writable(self.file.parent, "--file")
         with local_cluster(workers, self.file) as processes:
             print(f"{workers} workers; to use them: --cluster {self.file}; to end them: Ctrl-C", flush=True)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import ResponseOptions, naming, print_warnings
-from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData
+from animat.cli.responses import ResponseOptions, print_warnings
+from animat.errors import AnimatError, InvalidArgument, Mismatch, UnusableData, within
 from animat.progress import Bar, Part, Progress
 from animat.writing import expect_writable
 
@@ -71,7 +71,7 @@ class Inspect(ResponseOptions):
                 progress.update(steps * number, total, file.name)
                 try:
                     source = read_source(file, stimuli=self.stimuli, part=self.part)
-                    with naming(file):
+                    with within(file, (UnusableData, Mismatch)):
                         inspection = inspect_recording(source, by, window_ms, self.burst_threshold, file.name)
                 except AnimatError as error:
                     if len(files) == 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, within
 
 if TYPE_CHECKING:
     from animat.training.settings import SAC
@@ -30,7 +30,5 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     from animat.training.settings import SAC
 
     numbers = read_numbers("--sac", pairs)
-    try:
+    with within("--sac"):
         return SAC(**numbers)  # type: ignore[arg-type]
-    except InvalidArgument as error:
-        raise InvalidArgument(f"--sac: {error}") from error

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.cli.command import FolderCommand
-from animat.errors import InvalidArgument, Mismatch, in_min, some_of
+from animat.errors import InvalidArgument, Mismatch, counted, in_min, some_of
 from animat.folder_kinds import expect_no_other
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class Record(FolderCommand):
                 print(f"missed: the recording at {in_min(minute)} was not made, as the next was due", file=sys.stderr)
         files = series.files
         existed = "; all existed already" if files and before.issuperset(self.out.glob("*")) else ""
-        print(f"{len(files)} recording{'' if len(files) == 1 else 's'} in {self.out}{existed}")
+        print(f"{counted(len(files), 'recording')} in {self.out}{existed}")
         if protocol.places:
             print("each place is a condition; --conditions frequency pools the places")
         return {"recordings": [str(file) for file in files]}

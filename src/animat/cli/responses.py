@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.cli.command import Command
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import InvalidArgument, Mismatch
 from animat.recordings.findings import Finding, warnings_once
 
 if TYPE_CHECKING:
@@ -105,15 +104,6 @@ def simulator_settings(
                 f"{option}: expected none, as a simulator of kind {settings['kind']} has no bins; got {value:g}"
             )
     return settings
-
-
-@contextmanager
-def naming(file: Path) -> Iterator[None]:
-    """Let errors about the data of a file, which begin with what is wrong in it, begin with its name."""
-    try:
-        yield
-    except (UnusableData, Mismatch) as error:
-        raise type(error)(f"{file}: {error}") from error
 
 
 def print_warnings(findings: Sequence[Finding]) -> None:

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from animat.cli.responses import policies_for, simulator_settings
 from animat.cli.stimulation import StimulationOptions, expect_no_fault
-from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, in_min
+from animat.errors import InvalidArgument, Mismatch, UnsafeStimulus, expect_at_least, in_min
 from animat.plain_file import expect_no_file
 from animat.progress import Bar, Progress
 from animat.recordings.findings import Finding
@@ -96,8 +96,7 @@ class Run(StimulationOptions):
 
         # Everything is checked before the culture is opened.
         check_episodes("--episodes", self.episodes)
-        if self.seed < 0:
-            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        expect_at_least("--seed", self.seed, 0)
         self._expect_culture_seed()
         policies = policies_for(self.robot, self.mapping, self.policies)
         first = check_policies(policies)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from animat.cli.command import FolderCommand
-from animat.errors import InvalidArgument, InvalidFile, LoopEnded
+from animat.errors import InvalidFile, LoopEnded, expect_at_least
 
 if TYPE_CHECKING:
     from animat.closed_loop.session import Session
@@ -45,8 +45,7 @@ class StimulationOptions(FolderCommand):
 
     def _expect_culture_seed(self) -> None:
         """Raise for a negative seed, under the option's name: later it would be called `seed`, as the policies' is."""
-        if self.culture_seed is not None and self.culture_seed < 0:
-            raise InvalidArgument(f"--culture-seed: expected 0 or more, got {self.culture_seed}")
+        expect_at_least("--culture-seed", self.culture_seed, 0)
 
     def _loop_settings(self) -> dict[str, Any]:
         names = ("on_burst", "on_late", "pause_s", "warm_up", "settling", "patience_s")

@@ -14,8 +14,8 @@ from tyro.conf import Positional
 from animat.cli.jobs import JobOptions
 from animat.cli.named_numbers import read_numbers, read_sac
 from animat.cli.responses import SimulatorOptions, print_warnings
-from animat.errors import InvalidArgument, UnusableData, in_min
-from animat.records import as_json, in_file
+from animat.errors import InvalidArgument, UnusableData, counted, expect_at_least, in_file, in_min
+from animat.records import as_json
 from animat.writing import expect_writable
 
 if TYPE_CHECKING:
@@ -87,8 +87,7 @@ class Train(SimulatorOptions, JobOptions):
         from animat.training.folder import MANIFEST, expect_folder_for, expect_trainable, is_finished
 
         # Check what can be checked before recordings are read, which can take a while.
-        if self.workers is not None and self.workers < 1:
-            raise InvalidArgument(f"--workers: expected at least 1, got {self.workers}")
+        expect_at_least("--workers", self.workers, 1)
         if not self.out.is_dir():
             expect_writable(self.out)
         training, readouts = self._training()
@@ -193,9 +192,9 @@ class Train(SimulatorOptions, JobOptions):
         policies, control = (row.to_dict() for row in evaluation.rows)
         on = "" if evaluation.recorded_at_min is None else f" on the simulator at {in_min(evaluation.recorded_at_min)}"
         error = "" if policies["standard_error"] is None else f" (standard error {policies['standard_error']:.1f})"
-        counted = "1 policy" if len(trained) == 1 else f"{len(trained)} policies"
         mean, at_random = f"{policies['mean_return']:.1f}{error}", f"{control['mean_return']:.1f}"
-        print(f"{counted} in {self.out}; mean return{on}: {mean}, of random actions {at_random}")
+        made = f"{counted(len(trained), 'policy', 'policies')} in {self.out}"
+        print(f"{made}; mean return{on}: {mean}, of random actions {at_random}")
         if self.pulse_cost:
             net, pulses = f"{policies['net_return']:.1f}", f"{policies['electrode_pulses']:.1f}"
             print(

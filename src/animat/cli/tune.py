@@ -10,6 +10,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from animat.cli.jobs import JobOptions
+from animat.errors import counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +44,13 @@ class TuneFile(JobOptions):
             name = names[final.trial] if final.trial < len(names) else f"trial {final.trial}"
             mean = "diverged" if final.returns is None else f"{final.mean:.4g}"
             cells.append([name, mean, error, describe_settings(final.settings)])
-        policies, episodes = tuning.study.policies, tuning.study.episodes
-        counted = "1 policy" if policies == 1 else f"{policies} policies"
-        print(f"retrained, {counted} of each, in {episodes} fresh episodes per policy:")
+        policies, episodes = counted(tuning.study.policies, "policy", "policies"), tuning.study.episodes
+        print(f"retrained, {policies} of each, in {episodes} fresh episodes per policy:")
         print("\n".join(align_columns(["", "mean return", "s.e.", "settings"], cells)))
         shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
         print(f"importance: {shares or 'too few trials with different returns to tell'}")
-        counted = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
-        print(f"{len(tuned.trials)} trials ({counted}) in {time.monotonic() - began:.0f} s")
+        states = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
+        print(f"{len(tuned.trials)} trials ({states}) in {time.monotonic() - began:.0f} s")
         figures = f"{self.out / HISTORY}{f', {self.out / IMPORTANCE}' if tuned.importance else ''}"
         print(f"best settings: {self.out / BEST}; figures: {figures}")
         return {"folder": str(tuned.folder), "best_toml": str(self.out / BEST), **tuned.to_dict()}

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from animat.cli.responses import ResponseOptions, naming, print_warnings
-from animat.errors import InvalidArgument
+from animat.cli.responses import ResponseOptions, print_warnings
+from animat.errors import Mismatch, UnusableData, expect_at_least, within
 from animat.writing import expect_writable
 
 
@@ -47,8 +47,7 @@ class Validate(ResponseOptions):
 
         if self.out is not None:
             expect_writable(self.out)
-        if self.seed < 0:
-            raise InvalidArgument(f"--seed: expected 0 or more, got {self.seed}")
+        expect_at_least("--seed", self.seed, 0)
         by = None if self.conditions is None else conditions_named(self.conditions)
         readouts = read_readouts(self.readouts)
         files = list_recordings(self.recordings)
@@ -59,7 +58,7 @@ class Validate(ResponseOptions):
         with Bar("validating") as progress:
             for number, file in enumerate(files):
                 progress.update(number, len(files), file.name)
-                with naming(file):
+                with within(file, (UnusableData, Mismatch)):
                     (responses,) = extract_series(
                         [read_source(file)],
                         by,

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, as_invalid_file
 from animat.plain_file import expect_plain_file
 from animat.writing import sync_folder
 
@@ -58,17 +58,14 @@ class LogWriter:
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
         self._path, self._header = path, dict(header)
         self._places, self._whole = array("Q"), 0
-        with ExitStack() as stack:
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
-                stack.callback(self.close)
-                self._write(MAGIC)
-                self.append(Record(self._header))
-                self.sync()
-                sync_folder(path.parent)
-            except OSError as error:
-                raise InvalidFile(f"{path}: cannot be written: {error.strerror or error}") from error
+        with as_invalid_file(path, "cannot be written"), ExitStack() as stack:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
+            stack.callback(self.close)
+            self._write(MAGIC)
+            self.append(Record(self._header))
+            self.sync()
+            sync_folder(path.parent)
             stack.pop_all()
 
     def append(self, record: Record) -> None:
@@ -178,11 +175,8 @@ def read_log(path: str | os.PathLike[str]) -> Log:
 @contextmanager
 def open_file(path: Path) -> Iterator[BinaryIO]:
     """Open a log, or a table beside it, for reading; raises InvalidFile if it cannot be read."""
-    try:
-        with path.open("rb", buffering=_BUFFER_BYTES) as file:
-            yield file
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
+    with as_invalid_file(path), path.open("rb", buffering=_BUFFER_BYTES) as file:
+        yield file
 
 
 def _end_of_intact(file: BinaryIO, at: int, n_bytes: int) -> int | None:

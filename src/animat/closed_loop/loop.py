@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from animat.coding.decoder import Decoder, expect_fit
 from animat.coding.encoder import Encoder
 from animat.coding.mapping import N_PERCENTILES, Mapping, mapping_to_data
-from animat.errors import InvalidArgument, UnusableData
+from animat.errors import InvalidArgument, UnusableData, expect_at_least
 from animat.evaluation.transfer import describe_window, other_presentation
 from animat.goals.robot import body_and_goal
 from animat.neurons.adjusted_rank import AdjustedRanks
@@ -126,8 +126,7 @@ class Loop:
                 raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
         if self.patience_s == 0:
             raise InvalidArgument("patience_s: expected above 0 s, got 0: no answer is immediate")
-        if self.patterns is not None and self.patterns < 1:
-            raise InvalidArgument(f"patterns: expected at least 1, got {self.patterns}")
+        expect_at_least("patterns", self.patterns, 1)
 
     def _check_start(self, recorded: AdjustedRanks) -> None:
         """Check the responses from which adaptive thresholds start."""

@@ -35,7 +35,7 @@ from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.observed import more_left_out
 from animat.cultures.safety import Guard
-from animat.errors import AnimatError, InvalidArgument, Mismatch, shown, some_of
+from animat.errors import AnimatError, InvalidArgument, Mismatch, expect_at_least, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
 from animat.writing import UNCHANGED
@@ -352,8 +352,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
         )
     for number in episodes:
         check_episodes("episodes", number)
-    if seed < 0:
-        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    expect_at_least("seed", seed, 0)
     if loop.patterns is not None and loop.patterns > len(culture.patterns):
         raise InvalidArgument(f"patterns: expected at most the culture's {len(culture.patterns)}, got {loop.patterns}")
     seeing = [agent.name for agent, n in zip(agents, episodes, strict=True) if any(map(agent.sees_neurons, range(n)))]

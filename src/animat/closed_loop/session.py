@@ -16,7 +16,7 @@ from animat.closed_loop.log import Log, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
 from animat.closed_loop.tick import Ending, Tick, TickTable
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, as_invalid_file
 from animat.folder_kinds import expect_no_other
 from animat.plain_file import expect_no_file, is_absent, is_folder
 from animat.progress import Progress
@@ -175,10 +175,8 @@ def expect_no_session(folder: str | os.PathLike[str]) -> None:
         state = "" if (folder / RECORDING_FILE).exists() else state
         raise InvalidArgument(f"{folder / LOG_FILE}: expected no session, got one{state}; choose another folder")
     expect_no_other(folder, "session")
-    try:
+    with as_invalid_file(folder, "cannot be made"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidFile(f"{folder}: cannot be made: {error.strerror or error}") from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InvalidFile(f"{folder}: cannot be written to: permission denied")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from animat.cultures.base import Culture
-from animat.errors import AnimatError, BudgetSpent, InvalidArgument
+from animat.errors import AnimatError, BudgetSpent, expect_at_least
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Recording
 from animat.stimulation.plain import whole_number
@@ -35,8 +35,8 @@ class Budget:
     def __post_init__(self) -> None:
         for name in ("pulses", "pulses_per_electrode"):
             if (value := getattr(self, name)) is not None:
-                if (value := whole_number(f"budget.{name}", value)) < 0:
-                    raise InvalidArgument(f"budget.{name}: expected 0 or more, got {value}")
+                value = whole_number(f"budget.{name}", value)
+                expect_at_least(f"budget.{name}", value, 0)
                 object.__setattr__(self, name, value)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from animat.cultures.base import Culture
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.progress import Progress
 from animat.recordings.recording import Recording
 from animat.stimulation.pulse import BALANCED_PULSE, PUBLISHED_PULSE, Pulse
@@ -40,8 +40,7 @@ def culture_of(
             MaxOne without a selection.
         InvalidFile, Mismatch: if the state is damaged, or another culture's.
     """
-    if seed < 0:
-        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    expect_at_least("seed", seed, 0)
     for name, value, taken_by in (("state", state, "virtual"), ("selection", selection, "maxone")):
         if value is not None and kind != taken_by:
             raise InvalidArgument(f"{name}: expected none for a culture of kind {kind!r}, got {value}")

@@ -11,7 +11,7 @@ from jaxtyping import Int64
 from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
-from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
+from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_least, in_min
 from animat.recordings.recording import Channels, RecordedCulture, Recording
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
@@ -46,8 +46,7 @@ class ReplayCulture(ComputedCulture):
         super().__init__(limits)
         if not recordings:
             raise InvalidArgument("recordings: expected at least one to answer from, got none")
-        if seed < 0:
-            raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+        expect_at_least("seed", seed, 0)
         self._recordings = sorted(recordings, key=lambda recording: recording.start_min)
         first = self._recordings[0]
         for recording in self._recordings:

@@ -17,7 +17,7 @@ from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
-from animat.errors import InvalidArgument, Mismatch, shown
+from animat.errors import InvalidArgument, Mismatch, expect_at_least, shown
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
@@ -85,8 +85,7 @@ def record_series(
             file cannot be written, or the state or an existing recording is damaged.
         UnsafeStimulus, DeviceFailed: as the culture raises them; earlier recordings are kept.
     """
-    if seed is not None and seed < 0:
-        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    expect_at_least("seed", seed, 0)
     folder, progress = Path(folder), progress or Silent()
     with exclusive_lock(folder), ExitStack() as opened:
         culture, recorded, zero_s = make_culture(), 0, 0.0

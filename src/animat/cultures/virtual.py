@@ -15,7 +15,7 @@ from animat.cultures.failures import once_opened
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture
@@ -70,8 +70,7 @@ class VirtualCulture(ComputedCulture):
         progress: Progress | None = None,
     ) -> None:
         super().__init__(limits)
-        if (seed := whole_number("seed", seed)) < 0:
-            raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+        expect_at_least("seed", seed := whole_number("seed", seed), 0)
         if not 0 < scan_s <= 3600:
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")
         self.seed = seed

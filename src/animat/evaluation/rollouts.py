@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Key, PRNGKeyArray
 
 from animat.compilation import COMPILER_OPTIONS
 from animat.environment import Environment
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, expect_at_least, shown
 from animat.evaluation.host_rollouts import roll_out_on_host
 from animat.goals.robot import RobotWithGoal
 from animat.goals.tally import Outcome
@@ -128,8 +128,7 @@ def check_seed(seed: int) -> None:
 
 def check_at_once(name: str, episodes: int, n_actors: int) -> None:
     """Refuse fewer than one episode, or more than fit side by side (InvalidArgument, with the argument's name)."""
-    if episodes < 1:
-        raise InvalidArgument(f"{name}: expected at least 1, got {episodes}")
+    expect_at_least(name, episodes, 1)
     if episodes * n_actors > MOST_AT_ONCE:
         raise InvalidArgument(
             f"{name}: expected at most {MOST_AT_ONCE // n_actors:,} each, as {n_actors} run side by side, got "

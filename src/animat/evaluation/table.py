@@ -11,7 +11,7 @@ import numpy as np
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.columns import align_columns
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
+from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
@@ -134,7 +134,6 @@ class Evaluation:
         on = "without neurons" if at_min is None else f"{self.mapping}, recording at {in_min(at_min)}"
         if self.fixed_from_min is not None:
             on += f", percentiles fixed from {in_min(self.fixed_from_min)}"
-        count = f"{first.shape[0]} {'policy' if first.shape[0] == 1 else 'policies'}"
         goal = MEANS if self.objectives else ()
         are_counted, cost = first_row.electrode_pulses is not None, first_row.pulse_cost
         pulse_keys = [*["electrode_pulses"] * are_counted, *["net_return"] * bool(cost)]
@@ -152,8 +151,8 @@ class Evaluation:
         if self.optimum is None:
             for line in (head, *cells):
                 del line[-2]
-        episodes = f"{first.shape[1]} episode{'' if first.shape[1] == 1 else 's'}"
-        lines = [f"{self.robot}, {on}: {count}, {episodes} each", *align_columns(head, cells)]
+        policies, episodes = counted(len(first), "policy", "policies"), counted(first.shape[1], "episode")
+        lines = [f"{self.robot}, {on}: {policies}, {episodes} each", *align_columns(head, cells)]
         each = ", ".join(f"{name} {x:.1f}" for name, x in zip(self.names, self.rows[0].mean_returns, strict=True))
         lines.append(f"  each policy: {each}")
         if cost:

@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from animat.errors import counted
 from animat.evaluation.statistics import mann_whitney, p_of_u
 
 OUTPERFORMED_P = 0.01
@@ -82,7 +83,7 @@ class Verdict:
         if few:
             fewest = min(few.values(), key=lambda each: each.control)
             parts.append(
-                f"{fewest.policies} episode{'' if fewest.policies == 1 else 's'} of the policies and "
+                f"{counted(fewest.policies, 'episode')} of the policies and "
                 f"{fewest.control} of a control are too few to show (p < {OUTPERFORMED_P:g}) whether the policies "
                 f"outperform {', '.join(few)}"
             )

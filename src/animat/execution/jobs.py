@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from animat.errors import AnimatError, InvalidArgument
+from animat.errors import AnimatError, InvalidArgument, counted, expect_at_least
 from animat.execution.cluster import Cluster
 from animat.execution.gpu import submit_with_gpu
 from animat.execution.pinned import PinnedProcesses, own_cores
@@ -55,8 +55,7 @@ def in_order(jobs: Sequence[Job]) -> list[Job]:
 
 def expect_workers(workers: int | None, executor: Executor | None) -> None:
     """Refuse fewer than one worker, and any number together with an executor (InvalidArgument)."""
-    if workers is not None and workers < 1:
-        raise InvalidArgument(f"workers: expected at least 1, got {workers}")
+    expect_at_least("workers", workers, 1)
     if workers is not None and executor is not None:
         raise InvalidArgument(f"workers: expected None with an executor, which has its own, got {workers}")
 
@@ -112,8 +111,7 @@ class Jobs:
             n_jobs = len(self._done) + len(running) + len(self.waiting) + len(failed)
             if failed:
                 parts.append(f"{len(failed)} failed")
-            jobs = "1 job" if n_jobs == 1 else f"{n_jobs} jobs"
-            note = f"{len(self._done)} of {jobs}; {'; '.join(parts)}" if parts else ""
+            note = f"{len(self._done)} of {counted(n_jobs, 'job')}; {'; '.join(parts)}" if parts else ""
             progress.update(total_s - left_s, total_s, note)
 
         with _executors_for(executor, workers, running, has_gpu) as (cores, gpu):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, shown, within
 from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
@@ -98,10 +98,8 @@ class RobotWithGoal(Robot[GoalState]):
         """The objectives in the robot's units."""
         converted = []
         for objective in self.goal.objectives:
-            try:
+            with within(f"goal: {str(objective)!r} of {self.robot.name}"):
                 converted.append(replace(objective, region=region_in_units(objective.region, self._spec)))
-            except InvalidArgument as error:
-                raise InvalidArgument(f"goal: {str(objective)!r} of {self.robot.name}: {error}") from error
         return tuple(converted)
 
     @cached_property

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from animat.errors import InvalidArgument, did_you_mean, shown
+from animat.errors import InvalidArgument, did_you_mean, shown, within
 from animat.goals.goal import KINDS, Goal, Objective
 from animat.goals.region import Ball, Range
 
@@ -41,15 +41,11 @@ def read_goal(text: Any) -> Goal:
     if not clauses:
         raise InvalidArgument(f"goal: expected an objective, such as {_EXAMPLE!r}, got nothing")
     objectives = []
-    for clause in clauses:
-        try:
-            objectives.append(_objective(" ".join(_TOKEN.findall(clause))))
-        except InvalidArgument as error:
-            raise InvalidArgument(f"goal: {clause[:200]!r}: {error}") from error
-    try:
+    with within("goal"):
+        for clause in clauses:
+            with within(repr(clause[:200])):
+                objectives.append(_objective(" ".join(_TOKEN.findall(clause))))
         return Goal(tuple(objectives))
-    except InvalidArgument as error:
-        raise InvalidArgument(f"goal: {error}") from error
 
 
 def _objective(text: str) -> Objective:

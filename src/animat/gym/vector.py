@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from animat.errors import InvalidArgument, expect_kind
+from animat.errors import InvalidArgument, expect_at_least, expect_kind
 from animat.gym.compiled import CompiledAnimats, Rows
 
 Actions = Int64[np.ndarray, " environments"]
@@ -40,8 +40,7 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Rows, Actions, Rewards]):
 
     def __init__(self, robot: str = "", num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
         expect_kind("num_envs", num_envs, int | np.integer, "a whole number")
-        if num_envs < 1:
-            raise InvalidArgument(f"num_envs: expected at least 1, got {num_envs}")
+        expect_at_least("num_envs", num_envs, 1)
         super().__init__(num_envs, robot, render_mode, options)
         self.num_envs = num_envs
         self.single_observation_space = self.setup.observation_space

@@ -18,7 +18,7 @@ from animat.cultures.budget import Account, record_within
 from animat.cultures.series import BYTES_PER_MIN, STATE_FILE, minutes_of, order_seed
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
-from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData
+from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file
 from animat.live.plan import (
     EXCHANGE,
     LOG_FILE,
@@ -191,10 +191,8 @@ class _Run:
     def __post_init__(self) -> None:
         self._zero_s, self._wall_zero_s = self.culture.now_s, time.monotonic()
         self._known_s = self._zero_s
-        try:
+        with as_invalid_file(self.folder, "cannot be made"):
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InvalidFile(f"{self.folder}: cannot be made: {error.strerror or error}") from error
         training = self.training
         self.write("begun", robot=training.robot.name, policies=training.policies, seed=training.seed)
 
@@ -321,11 +319,9 @@ class _Run:
             "what": what,
             **fields,
         }
-        try:
-            with (self.folder / LOG_FILE).open("a") as file:
-                file.write(json.dumps(line) + "\n")
-        except OSError as error:
-            raise InvalidFile(f"{self.folder / LOG_FILE}: cannot be written: {error.strerror or error}") from error
+        log = self.folder / LOG_FILE
+        with as_invalid_file(log, "cannot be written"), log.open("a") as file:
+            file.write(json.dumps(line) + "\n")
         return line
 
     def _now_s(self) -> float:

@@ -14,9 +14,8 @@ import threading
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
-from animat.errors import AnimatError, InvalidFile
+from animat.errors import AnimatError, InvalidFile, first_line
 from animat.process import Process
-from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 
 PROCESSOR_S, PROCESSOR_S_PER_MB = 2.0, 0.2

@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from animat.errors import InvalidArgument, InvalidFile, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, as_invalid_file, first_line, in_file
 from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
-from animat.recordings.formats.hdf5 import DAMAGE, first_line
+from animat.recordings.formats.hdf5 import DAMAGE
 from animat.recordings.formats.npz import read_npz
 from animat.recordings.formats.response_files import (
     is_response_npz,
@@ -84,11 +84,9 @@ def read_recording(
             f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read; "
             "this needs spike times"
         )
-    try:
+    with in_file(path):
         source = source if start_s is None else with_start(source, start_s)
         return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
-    except UnusableData as error:
-        raise InvalidFile(f"{path}: {error}") from error
 
 
 def read_source(
@@ -106,14 +104,13 @@ def read_source(
     if (stimuli is not None or part is not None) and not begin.startswith(HDF5):
         raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
     try:
-        if begin.startswith(HDF5):
-            return read_hdf5_in_subprocess(path, part=part, stimuli=stimuli)
-        if begin.startswith(ZIP):
-            return read_response_npz(path) if is_response_npz(path) else read_npz(path)
-        return _read_text(path, begin, stimuli_path)
-    except (UnusableData, InvalidArgument) as error:
-        # These name the column but not the file.
-        raise InvalidFile(f"{path}: {error}") from error
+        # Errors in the data name the column but not the file.
+        with in_file(path):
+            if begin.startswith(HDF5):
+                return read_hdf5_in_subprocess(path, part=part, stimuli=stimuli)
+            if begin.startswith(ZIP):
+                return read_response_npz(path) if is_response_npz(path) else read_npz(path)
+            return _read_text(path, begin, stimuli_path)
     except (*DAMAGE, RecursionError, AssertionError) as error:
         # Errors that no reader anticipated: report them in one line too.
         raise InvalidFile(f"{path}: expected a recording, but it cannot be read ({first_line(error)})") from error
@@ -180,11 +177,9 @@ def _files(path: Path) -> list[Path]:
         if is_absent(path):
             raise InvalidFile(f"{path}: no such file or folder of recordings; animat record makes them")
         return [expect_plain_file(path)]
-    try:
+    with as_invalid_file(path):
         # Hidden files are unfinished.
         listed = [file for file in path.iterdir() if not file.name.startswith(".")]
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
     files = sorted(file for file in listed if any(map(file.match, IN_FOLDERS)))
     if not files:
         raise InvalidFile(f"{path}: expected a folder of recordings ({', '.join(IN_FOLDERS)}), found none in it")
@@ -195,11 +190,8 @@ def first_bytes(path: Path) -> bytes:
     """A file's first bytes, which identify its format; raises InvalidFile if it is not a file, or empty."""
     if is_folder(path):
         raise InvalidFile(f"{path}: expected one recording, got a folder; read_recordings reads folders")
-    try:
-        with expect_plain_file(path).open("rb") as file:
-            begin = file.read(4096)
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read: {error.strerror or error}") from error
+    with as_invalid_file(path), expect_plain_file(path).open("rb") as file:
+        begin = file.read(4096)
     if not begin:
         raise InvalidFile(f"{path}: expected a recording (NWB, NPZ or CSV), got an empty file")
     return begin

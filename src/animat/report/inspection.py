@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, Mismatch, counted
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.array import draw_array
@@ -31,15 +31,15 @@ def inspection_text(inspection: Inspection) -> str:
     """Lines for a terminal: the verdict, the recording's contents, its responses, the conditions, and the findings."""
     responses = inspection.responses
     start_ms, end_ms = responses.window_ms
-    spikes = "rates" if inspection.n_spikes is None else _count(inspection.n_spikes, "spike")
+    spikes = "rates" if inspection.n_spikes is None else counted(inspection.n_spikes, "spike")
     duration_s = inspection.duration_s
     span = f" in {duration_s:,.1f} s ({duration_s / 60:.1f} min)" if math.isfinite(duration_s) else ""
     start = f"from {responses.start_min:g} min on the culture's clock"
     lines = [
         f"{inspection.name}: {inspection.verdict}",
-        f"  {spikes} on {_count(responses.n_channels, 'channel')}{span}, {start}",
-        f"  {inspection.n_stimuli:,} {'stimulus' if inspection.n_stimuli == 1 else 'stimuli'}"
-        + (f" in {_count(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
+        f"  {spikes} on {counted(responses.n_channels, 'channel')}{span}, {start}",
+        f"  {counted(inspection.n_stimuli, 'stimulus', 'stimuli')}"
+        + (f" in {counted(inspection.n_trials, 'trial')}" if inspection.n_trials != inspection.n_stimuli else "")
         + (f", {responses.presentation}" if responses.presentation else ""),
     ]
     if inspection.network_bursts is not None:
@@ -62,16 +62,12 @@ def inspection_text(inspection: Inspection) -> str:
     return "\n".join(lines)
 
 
-def _count(n: int, noun: str, plural: str = "") -> str:
-    return f"{n:,} {noun if n == 1 else plural or noun + 's'}"
-
-
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:
     lines = [f"  {inspection.spontaneous_rate_hz:.3g} Hz per channel"] if inspection.duration_s else []
     if len(bursts):
         per_min = 60 * len(bursts) / inspection.duration_s
         lines.append(
-            f"  {_count(len(bursts), 'network burst')} ({per_min:.3g} per minute) of {bursts.median_s:.2f} s (median) "
+            f"  {counted(len(bursts), 'network burst')} ({per_min:.3g} per minute) of {bursts.median_s:.2f} s (median) "
             f"{'contains' if len(bursts) == 1 else 'contain'} {100 * bursts.share:.0f} % of all spikes"
         )
     elif inspection.n_spikes:

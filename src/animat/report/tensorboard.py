@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
-from animat.errors import InvalidFile
+from animat.errors import as_invalid_file
 from animat.execution.curves import CurveRow
 from animat.extras import expect_extra
 
@@ -33,7 +31,7 @@ class TensorBoard:
         self._writers: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
-        with self._expect_writable():
+        with as_invalid_file(self._folder, "cannot be written"):
             self._folder.mkdir(parents=True, exist_ok=True)
         return self
 
@@ -41,7 +39,7 @@ class TensorBoard:
         """Write a row without its NaNs."""
         scalars = {"episodes": row.episodes, "return": row.mean_return}
         scalars |= {"entropy": row.entropy, "alpha": row.alpha, "critic_loss": row.critic_loss}
-        with self._expect_writable():
+        with as_invalid_file(self._folder, "cannot be written"):
             if row.policy not in self._writers:
                 self._writers[row.policy] = self._make(str(self._folder / row.policy))
             for name, number in scalars.items():
@@ -52,10 +50,3 @@ class TensorBoard:
         for writer in self._writers.values():
             writer.close()
         self._writers = {}
-
-    @contextmanager
-    def _expect_writable(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise InvalidFile(f"{self._folder}: cannot be written: {error.strerror or error}") from error

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int64
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, within
 from animat.responses.condition import RESTING, Condition, abbreviated, listed
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -213,7 +213,7 @@ def conditions_named(text: str) -> Conditions:
     Raises:
         InvalidArgument: for anything else.
     """
-    try:
+    with within("conditions"):
         parts = [_parse(part) for part in text.split(" x ")]
         if len(parts) == 1:
             return parts[0]
@@ -222,8 +222,6 @@ def conditions_named(text: str) -> Conditions:
             if isinstance(when, ByFrequency | ByInterval) and isinstance(where, ByElectrode | ByPattern):
                 return ByBoth(when, where)
         raise _invalid(text, "frequency or interval before x, and electrode or pattern after it")
-    except InvalidArgument as error:
-        raise InvalidArgument(f"conditions: {error}") from error
 
 
 def _parse(text: str) -> Conditions:

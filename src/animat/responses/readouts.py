@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from pydantic import Field
 
-from animat.errors import InvalidArgument, Mismatch, shown, some_of
+from animat.errors import InvalidArgument, Mismatch, in_file, shown, some_of
 from animat.recordings.recording import Channels
-from animat.records import in_file, json_data, read_record, record
+from animat.records import json_data, read_record, record
 from animat.responses.windows import Spiking, spikes_in
 from animat.stimulation.places import CUT, count_places, electrodes_of, read_groups
 from animat.stimulation.selection import Electrode

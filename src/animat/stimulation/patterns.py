@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from jaxtyping import Int64
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.stimulation.array import ElectrodeArray
 
 _TRIES_A_PATTERN = 200
@@ -39,11 +39,9 @@ def draw_patterns(
     Source: the paper's methods (5 of 32 electrodes, more than 100 um apart, 100 patterns).
     """
     electrodes = np.unique(np.asarray(electrodes, dtype=np.int64))
-    for name, number in (("patterns", patterns), ("size", size)):
-        if number < 1:
-            raise InvalidArgument(f"{name}: expected at least 1, got {number}")
-    if seed < 0:
-        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    expect_at_least("patterns", patterns, 1)
+    expect_at_least("size", size, 1)
+    expect_at_least("seed", seed, 0)
     rng = np.random.default_rng([seed, 5])
     is_far = array.distance_um(electrodes, electrodes) > spacing_um
     drawn: dict[tuple[int, ...], None] = {}

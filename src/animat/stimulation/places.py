@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument, InvalidFile, shown
+from animat.errors import InvalidArgument, InvalidFile, in_file, shown
 from animat.plain_file import is_absent, read_plain_text
-from animat.records import in_file, json_data
+from animat.records import json_data
 from animat.tables import evenly
 
 CUT = {"halves": (2, 1), "quadrants": (2, 2)}

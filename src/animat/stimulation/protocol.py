@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, SkipValidation
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
-from animat.records import Number, Whole, in_file, json_data, record
+from animat.records import Number, Whole, json_data, record
 from animat.stimulation.places import NONE, Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, expect_at_least
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli, Stimulus
 from animat.tables import UNKNOWN, padded
@@ -99,8 +99,7 @@ def make_schedule(
             f"patterns: expected at most the {len(patterns)} that the culture's electrode selection has, got "
             f"{protocol.patterns}: select more, or use fewer"
         )
-    if seed < 0:
-        raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+    expect_at_least("seed", seed, 0)
     rng = np.random.default_rng([seed, 7])
     n_frequencies, trials = len(protocol.frequencies_hz), protocol.trials
     n_conditions = n_frequencies * max(1, len(places))

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
-from animat.records import Number, Whole, in_file, json_data, read_record, record
+from animat.records import Number, Whole, json_data, read_record, record
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.scan import ScannedActivity

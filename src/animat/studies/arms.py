@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from animat.errors import counted
 from animat.report.html import Table
 from animat.studies.specification import Arm, Study
 
@@ -27,9 +28,8 @@ _SHUFFLED = "the delivered stimulus is drawn at random, whatever the policy choo
 
 def summarise_arms(study: Study) -> str:
     """What an arm is, then how many arms and policies there are; the second sentence is left open."""
-    arms = f"There {'is 1 arm' if len(study.arms) == 1 else f'are {len(study.arms)} arms'}"
-    policies = "1 policy" if study.policies == 1 else f"{study.policies} policies"
-    return f"An arm is one way to train policies. {arms} with {policies} each"
+    are, policies = "is" if len(study.arms) == 1 else "are", counted(study.policies, "policy", "policies")
+    return f"An arm is one way to train policies. There {are} {counted(len(study.arms), 'arm')} with {policies} each"
 
 
 def describe_mapping(arm: Arm) -> str:

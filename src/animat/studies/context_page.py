@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from animat.errors import counted
 from animat.report.context import draw_context, draw_whose_work
 from animat.report.html import Columns, Section, Table, cell, columns_of, table_of, write_page
 from animat.report.results import ContextRow, LostRow
@@ -95,8 +96,7 @@ def summarise_robot(rows: Sequence[ContextRow]) -> str:
     gaps = [row.gap for row in rows if row.gap is not None]
     least = "at least " if any(row.is_least for row in rows) else ""
     between = f" (context gap {least}{_range(gaps)})" if gaps else ""
-    cultures = "culture" if n == 1 else "cultures"
-    task = f"A reflex leaves half of the task or more undone on {needs} of {n} {cultures}{between}."
+    task = f"A reflex leaves half of the task or more undone on {needs} of {counted(n, 'culture')}{between}."
     scores = [row.score for row in rows if row.score is not None]
     scored = f" (context score {least}{_range(scores)})" if scores else ""
     return f"{task} The policies do significantly more than the best reflex on {has} of {n}{scored}."

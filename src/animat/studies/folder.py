@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, Mismatch, as_invalid_file
 from animat.execution.receipts import sha256
 from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
@@ -75,10 +75,8 @@ def hash_files(files: list[Path], base: Path) -> dict[str, str]:
             raise InvalidArgument(f"culture.files: expected each file once, got {file} twice")
         stimuli = stimuli_beside(file)
         for each in [file] if stimuli is None else [file, stimuli]:
-            try:
+            with as_invalid_file(each):
                 hashes[_relative(each, base)] = sha256(expect_plain_file(each))
-            except OSError as error:
-                raise InvalidFile(f"{each}: cannot be read: {error.strerror or error}") from error
     return dict(sorted(hashes.items()))
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, Strict, ValidatorFunctionWrapHandler, WrapValidator
 
 from animat.coding.mapping import Thresholds, mapping_named
-from animat.errors import InvalidArgument, shown
+from animat.errors import InvalidArgument, shown, within
 from animat.goals.robot import with_goal
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.registry import is_ours, place_of
@@ -114,15 +114,10 @@ class RobotSpec:
     lessons: Annotated[tuple[Lesson, ...], LISTED] = ()
 
     def __post_init__(self) -> None:
-        key = "kind" if self.kind else "name"
-        try:
+        with within("kind" if self.kind else "name"):
             kind = REGISTRY.class_named(self.kind or self.name)
-        except InvalidArgument as error:
-            raise InvalidArgument(f"{key}: {error}") from error
-        try:
+        with within("parameters"):
             robot = robot_named(self.kind or self.name, **self.parameters)
-        except InvalidArgument as error:
-            raise InvalidArgument(f"parameters: {error}") from error
         if self.name == "culture":
             raise InvalidArgument("name: expected a name other than that of the culture's figures, got 'culture'")
         expect_lessons(self.lessons, self.robot(), draws_recordings=True)

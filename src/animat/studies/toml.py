@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from animat import plain_file
-from animat.errors import InvalidArgument, InvalidFile
-from animat.records import in_file, read_record
+from animat.errors import InvalidArgument, InvalidFile, in_file
+from animat.records import read_record
 from animat.studies.source import MOST_ENTRIES
 from animat.studies.specification import Study
 from animat.training.settings import FORMER as FORMER_SETTINGS

@@ -12,10 +12,10 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from animat.errors import InvalidArgument, did_you_mean
+from animat.errors import InvalidArgument, did_you_mean, in_file, within
 from animat.goals.robot import without_goal
 from animat.plain_file import read_toml
-from animat.records import Number, in_file, read_record, record
+from animat.records import Number, read_record, record
 from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 
@@ -97,15 +97,12 @@ def expect_lessons(lessons: Sequence[Lesson], robot: Robot[Any], *, draws_record
             f"lessons: expected a robot that is stepped by JAX, got {robot.name}, which its own library steps"
         )
     for number, lesson in enumerate(lessons, 1):
-        try:
+        with within(f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"):
             if number < len(lessons) and not lesson.has_threshold:
                 raise InvalidArgument(
                     "expected success or until_return, which say when to move on to the next lesson, got neither"
                 )
             _expect_lesson(lesson, robot, draws_recordings)
-        except InvalidArgument as error:
-            where = f"lesson {number} ({lesson.name})" if lesson.name else f"lesson {number}"
-            raise InvalidArgument(f"{where}: {error}") from error
 
 
 def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) -> None:
@@ -137,12 +134,10 @@ def _expect_lesson(lesson: Lesson, robot: Robot[Any], draws_recordings: bool) ->
     most = -math.inf
     for corner in itertools.product(*lesson.parameters.values()):
         values = dict(zip(lesson.parameters, corner, strict=True))
-        try:
+        corner_text = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+        with within(f"parameters: {robot.name} cannot have {corner_text}"):
             varied: Robot[Any] = dataclasses.replace(body, **values)
             most = max(most, (varied if body is robot else robot).return_range[1])
-        except InvalidArgument as error:
-            corner_text = ", ".join(f"{name} = {value:g}" for name, value in values.items())
-            raise InvalidArgument(f"parameters: {robot.name} cannot have {corner_text}: {error}") from error
     if lesson.until_return is not None and lesson.until_return > most:
         raise InvalidArgument(
             f"until_return: expected at most {most:g}, the highest return of {robot.name}, got {lesson.until_return:g}"

@@ -19,11 +19,11 @@ from pydantic import Field
 from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, shown
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_file, shown
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
-from animat.records import Flag, Number, in_file, json_data, read_record
+from animat.records import Flag, Number, json_data, read_record
 from animat.responses.condition import Condition, abbreviated
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window

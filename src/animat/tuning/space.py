@@ -8,7 +8,7 @@ from dataclasses import asdict, fields, replace
 from typing import Any
 
 from animat.coding.mapping import mapping_named
-from animat.errors import InvalidArgument, did_you_mean, shown
+from animat.errors import InvalidArgument, did_you_mean, shown, within
 from animat.records import Flag, Number, read_record, record
 from animat.studies.specification import Study
 from animat.training.settings import SAC
@@ -121,24 +121,20 @@ def read_space(table: Mapping[str, Any], study: Study) -> Space:
                 f"{shown(among)}"
             )
     for chosen in itertools.product(*(choices_of(name, space, study) for name in FITTING)):
-        try:
+        with within("tune.search"):
             with_settings(study, dict(zip(FITTING, chosen, strict=True)))
-        except InvalidArgument as error:
-            raise InvalidArgument(f"tune.search: {error}") from error
     return space
 
 
 def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], where: str) -> None:
     """Refuse a search with settings that the study could not run with; of a range its ends are checked."""
     for value in (among.low, among.high) if isinstance(among, Range) else among:
-        try:
+        with within(where):
             if name == "mapping" and value == "none":
                 raise InvalidArgument("expected mappings, got 'none': tune policies without neurons separately")
             changed = with_settings(study, {name: _whole(value, own_settings(study)[name])})
             if name == "mapping":
                 mapping_named(changed.arms[0].mapping)
-        except InvalidArgument as error:
-            raise InvalidArgument(f"{where}: {error}") from error
 
 
 def _whole(value: Any, own: Any) -> Any:

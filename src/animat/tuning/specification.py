@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from animat.errors import InvalidArgument, InvalidFile
-from animat.records import Seed, Whole, in_file, read_record, record
+from animat.errors import InvalidArgument, InvalidFile, in_file
+from animat.records import Seed, Whole, read_record, record
 from animat.robots.host import HostRobot
 from animat.studies.specification import Episodes, Study
 from animat.studies.toml import read_toml, study_from

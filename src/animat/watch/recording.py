@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from animat.cultures.under_way import UNDER_WAY
-from animat.errors import AnimatError, InvalidFile
+from animat.errors import AnimatError, InvalidFile, counted
 from animat.plain_file import expect_plain_file
 from animat.recordings.recording import Recording
 from animat.responses.inspection import Inspection, inspect_recording
@@ -56,7 +56,7 @@ class RecordingView(View):
             raster, span = _raster(recording, to_s, span_s)
             blocks += [raster, _rates(recording)]
         blocks += [_shares_table(self._shares, len(times_s)), *_inspected(inspection)]
-        state, message = "ended", "1 recording" if n_whole == 1 else f"{n_whole} recordings"
+        state, message = "ended", counted(n_whole, "recording")
         if running is False and in_progress:
             state = "silent"
             message = "the recording in progress was interrupted: its data so far are shown, but are not a recording"

@@ -16,7 +16,7 @@ from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, STOP_FILE
 from animat.coding.mapping import Thresholds
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, as_invalid_file
 from animat.progress import format_duration
 from animat.stimulation.stimulus import NOTHING
 from animat.watch.agents import by_agent
@@ -288,8 +288,6 @@ def stop_session(folder: Path) -> None:
         raise InvalidArgument(f"{folder.name}: expected a session to stop, got none")
     if (folder / RECORDING_FILE).exists():
         raise InvalidArgument(f"{folder.name}: the session has ended: there is nothing to stop")
-    try:
+    with as_invalid_file(folder / STOP_FILE, "cannot be created"):
         # Never through a link, which may lead anywhere.
         os.close(os.open(folder / STOP_FILE, os.O_CREAT | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
-    except OSError as error:
-        raise InvalidFile(f"{folder / STOP_FILE}: cannot be created: {error.strerror or error}") from error

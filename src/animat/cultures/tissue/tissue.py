@@ -17,7 +17,7 @@ from animat.cultures.tissue.network import grow
 from animat.cultures.tissue.parameters import TissueParameters
 from animat.cultures.tissue.preparation import arrivals_of, fresh_state, prepare_constants, prepare_wiring
 from animat.cultures.tissue.snapshot import Snapshot, expect_sound
-from animat.errors import InvalidArgument, Mismatch
+from animat.errors import InvalidArgument, Mismatch, expect_at_least
 
 NS = 1_000_000_000
 
@@ -49,8 +49,7 @@ class Tissue:
     """
 
     def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:
-        if seed < 0:
-            raise InvalidArgument(f"seed: expected 0 or more, got {seed}")
+        expect_at_least("seed", seed, 0)
         self.seed = seed
         self.parameters = parameters or TissueParameters()
         self._network = network = grow(seed, self.parameters)

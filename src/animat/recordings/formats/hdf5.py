@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from animat.errors import InvalidArgument, InvalidFile, UnusableData, some_of
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, first_line, some_of
 
 Column = np.ndarray[Any, Any]
 
@@ -195,12 +195,6 @@ def hdf5_file(path: Path) -> Iterator[Hdf5File]:
             f"{path}: expected a complete HDF5 recording, but it is cut off or damaged ({first_line(error)}); "
             "copy or record it again"
         ) from error
-
-
-def first_line(error: BaseException) -> str:
-    """The first line of an error's message, or its type if it has none."""
-    line = str(error).strip().partition("\n")[0]
-    return "".join(filter(str.isprintable, line))[:200] or type(error).__name__
 
 
 def is_positive(value: Any) -> bool:

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
+from animat.errors import InvalidFile, UnusableData, did_you_mean, first_line, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import left_out_findings
-from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 

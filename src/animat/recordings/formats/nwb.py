@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.compilation import pynwb_importable
-from animat.errors import InvalidFile, UnusableData
+from animat.errors import InvalidFile, UnusableData, in_file
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import (
@@ -27,7 +27,6 @@ from animat.recordings.formats.nwb_layout import (
 from animat.recordings.formats.nwb_spikes import SpikeBlock, SpikeCounts, write_spikes
 from animat.recordings.metadata import from_metadata
 from animat.recordings.recording import Channels, Recording
-from animat.records import in_file
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, counted
 from animat.plain_file import expect_plain_file
 from animat.recordings.findings import Finding, left_out_findings
 
@@ -131,9 +131,8 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
         while len(row) > len(header) and not row[-1].strip():
             row.pop()
         if len(row) != len(header):
-            fields = f"{len(header)} field{'' if len(header) == 1 else 's'}"
             raise InvalidFile(
-                f"{path}, line {line}: expected {fields}, as in the header, got {len(row)}: "
+                f"{path}, line {line}: expected {counted(len(header), 'field')}, as in the header, got {len(row)}: "
                 + (_advice(row, separator) if len(row) > len(header) else "is a field missing, or the file cut off?")
             )
     return TextTable(path, header, rows, lines)

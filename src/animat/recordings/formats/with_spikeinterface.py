@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from animat.errors import InvalidArgument, InvalidFile
+from animat.errors import InvalidArgument, InvalidFile, first_line
 from animat.extras import install_command
 from animat.recordings.columns import PlainColumns
 from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
-from animat.recordings.formats.hdf5 import first_line
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Recording
 

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool
 
-from animat.errors import some_of
+from animat.errors import counted, some_of
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -213,10 +213,8 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
-            message = (
-                f"condition {condition.label}: {n} non-burst response{'' if n == 1 else 's'}; a distribution needs "
-                f"{FEW_SAMPLES} or more"
-            )
+            few = counted(n, "non-burst response")
+            message = f"condition {condition.label}: {few}; a distribution needs {FEW_SAMPLES} or more"
             yield Finding("few-samples", "warning", message, float(n))
 
 
