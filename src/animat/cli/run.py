@@ -91,7 +91,6 @@ class Run(StimulationOptions):
         from animat.reality_gap import Calibration, check_conditions, check_policies, run_policies
         from animat.recordings.reading import read_recordings
         from animat.responses.series import extract_series
-        from animat.responses.windows import DEFAULT_WINDOW_MS
         from animat.robots.host import HostRobot
 
         # Everything is checked before the culture is opened.
@@ -121,7 +120,7 @@ class Run(StimulationOptions):
         series = extract_series(
             recordings,
             _conditions(recordings, first),
-            window_ms=first.window_ms or DEFAULT_WINDOW_MS,
+            window_ms=first.window_ms,
             burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,
             readouts=first.readouts,
