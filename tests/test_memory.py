@@ -29,8 +29,7 @@ from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
-from animat.neurons.timeline import fit_timeline
-from animat.neurons.timeline_file import load_timeline, save_timeline
+from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.responses.condition import Condition

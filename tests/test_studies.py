@@ -37,8 +37,7 @@ from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
 from animat.neurons.synthetic import synthetic_simulator
-from animat.neurons.timeline import fit_timeline
-from animat.neurons.timeline_file import load_timeline
+from animat.neurons.timeline import fit_timeline, load_timeline
 from animat.progress import Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording, read_recordings

@@ -13,8 +13,7 @@ import pytest
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument
 from animat.execution.training import train
-from animat.neurons.timeline import fit_timeline
-from animat.neurons.timeline_file import load_timeline
+from animat.neurons.timeline import fit_timeline, load_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -39,7 +38,8 @@ class Inspect(ResponseOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.reading import list_recordings, read_source
-        from animat.report.inspection import draw_inspection, expect_unique_stems, inspection_text
+        from animat.recordings.recording import Recording
+        from animat.report.inspection import draw_inspection, draw_series, expect_unique_stems, inspection_text
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.inspection import inspect_recording
@@ -96,28 +96,21 @@ class Inspect(ResponseOptions):
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")
+                first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
+                recording = first if isinstance(first, Recording) else None
                 try:
-                    results["figures"] = self._draw_series(series, self.out)
+                    drawn = draw_series(recording, [one[2] for one in series], self.out, self.format)
                 except Mismatch as unlike:
                     print(f"no figures of the series: {unlike}")
+                else:
+                    if drawn:
+                        print(f"figures of the series: {', '.join(map(str, drawn))}")
+                    results["figures"] = [str(figure) for figure in drawn]
         if unreadable:
             others = "; the rest were inspected" if inspected else ""
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"
             print(f"animat: {count}{others}", file=sys.stderr)
         return results
-
-    def _draw_series(self, series: Sequence[tuple[float, Path, Responses]], out: Path) -> list[str]:
-        """Draw all recordings together, each with its minute, file and responses; returns the figures."""
-        from animat.recordings.reading import read_source
-        from animat.recordings.recording import Recording
-        from animat.report.inspection import draw_series
-
-        first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
-        recording = first if isinstance(first, Recording) else None
-        figures = [str(figure) for figure in draw_series(recording, [one[2] for one in series], out, self.format)]
-        if figures:
-            print(f"figures of the series: {', '.join(figures)}")
-        return figures
 
 
 def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[str, Any]] | None:

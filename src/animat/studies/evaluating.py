@@ -11,8 +11,7 @@ from animat.evaluation.controls import controls_of
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.rollouts import Actor, Episodes, Networks, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import SimulatorTimeline
-from animat.neurons.timeline_file import load_timeline
+from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
 from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
-from animat.neurons.timeline_file import load_timeline
+from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page

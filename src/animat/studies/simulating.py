@@ -8,8 +8,7 @@ from typing import final
 
 from animat.errors import UnusableData
 from animat.neurons.fidelity import Fidelity
-from animat.neurons.timeline import SimulatorTimeline, fit_timeline
-from animat.neurons.timeline_file import save_timeline
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline, save_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings

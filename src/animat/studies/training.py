@@ -10,8 +10,7 @@ from animat.coding.mapping import mapping_named
 from animat.devices import gpu_here
 from animat.execution.task import UNFINISHED
 from animat.execution.training_task import TrainingTask, TrainingWork, train_alone
-from animat.neurons.timeline import SimulatorTimeline
-from animat.neurons.timeline_file import load_timeline
+from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.studies.places import TIMELINE, policies_folder
 from animat.studies.specification import Arm, RobotSpec, Study

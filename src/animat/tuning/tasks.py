@@ -14,8 +14,7 @@ import numpy as np
 
 from animat.errors import UnusableData
 from animat.evaluation.rollouts import roll_out
-from animat.neurons.timeline import SimulatorTimeline
-from animat.neurons.timeline_file import load_timeline, save_timeline
+from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
 from animat.studies.simulating import fit_simulators, one_condition, read_series
 from animat.studies.specification import Study
