@@ -29,7 +29,7 @@ from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
 from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
 from animat.responses.condition import Condition
@@ -42,7 +42,6 @@ from animat.robots.navigation import Navigation
 from animat.stimulation.protocol import Presentation
 from animat.studies.differences import decisions
 from animat.studies.paper import paper_study
-from animat.studies.simulating import load_timeline, save_timeline
 from animat.studies.specification import Simulators
 from animat.training.specification import Training
 from animat.wrappers import ShuffledDelivery

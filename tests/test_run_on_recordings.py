@@ -265,7 +265,7 @@ def test_policies_on_some_of_the_frequencies_are_calibrated_by_those(
     (calibration,) = taken
     assert calibration.conditions == policy.conditions
     # As animat train --conditions has it, whose percentiles are those of the responses to these frequencies.
-    (trained_on,) = extract_series([recording], conditions_named(f"frequency:{','.join(map(str, frequencies_hz))}"))
+    (trained_on,) = extract_series([recording], f"frequency:{','.join(map(str, frequencies_hz))}")
     np.testing.assert_allclose(calibration.percentiles, pooled_percentiles(trained_on), rtol=1e-6)
     for own, read in enumerate(calibration.responses_hz):
         np.testing.assert_array_equal(read, trained_on.rates_of(own))

@@ -37,7 +37,7 @@ from animat.execution.jobs import in_order
 from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
 from animat.neurons.synthetic import synthetic_simulator
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import fit_timeline, load_timeline
 from animat.progress import Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording, read_recordings
@@ -53,7 +53,7 @@ from animat.studies.places import controls_file, episodes_file, paths_file
 from animat.studies.plan import plan_study
 from animat.studies.recording import Record
 from animat.studies.run import StudyRun, run_study
-from animat.studies.simulating import Fit, load_timeline
+from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml

@@ -13,7 +13,7 @@ import pytest
 from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument
 from animat.execution.training import train
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.timeline import fit_timeline, load_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.responses.series import extract_series
@@ -21,7 +21,7 @@ from animat.robots import Wheels
 from animat.stimulation.protocol import TWO_COMMANDS
 from animat.studies.recording import Record
 from animat.studies.run import run_study
-from animat.studies.simulating import Fit, controllability, load_timeline
+from animat.studies.simulating import Fit, controllability
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.task import draw_seed

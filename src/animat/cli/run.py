@@ -22,7 +22,7 @@ from animat.writing import exclusive_lock
 
 if TYPE_CHECKING:
     from animat.cultures.base import Culture
-    from animat.reality_gap import RealityGap
+    from animat.reality_gap import Calibration, RealityGap
     from animat.recordings.recording import Recording
     from animat.responses.conditions import Conditions
     from animat.stimulation.protocol import Protocol
@@ -82,33 +82,16 @@ class Run(StimulationOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.closed_loop.loop import Loop
-        from animat.closed_loop.running import check_episodes
         from animat.closed_loop.session import expect_no_session
         from animat.compilation import keep_compilations
         from animat.cultures.budget import Account, Budget
         from animat.cultures.same_culture import other_culture, other_patterns
         from animat.neurons.simulator import check_binning
-        from animat.reality_gap import Calibration, check_conditions, check_policies, run_policies
+        from animat.reality_gap import run_policies
         from animat.recordings.reading import read_recordings
-        from animat.responses.series import extract_series
-        from animat.responses.windows import DEFAULT_WINDOW_MS
-        from animat.robots.host import HostRobot
 
         # Everything is checked before the culture is opened.
-        check_episodes("--episodes", self.episodes)
-        expect_at_least("--seed", self.seed, 0)
-        self._expect_culture_seed()
-        policies = policies_for(self.robot, self.mapping, self.policies)
-        first = check_policies(policies)
-        if not self.recordings:
-            raise InvalidArgument(
-                "--recordings: expected those that the policies were trained on, got none: make some with "
-                "`animat record`, and train on them"
-            )
-        if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
-            raise InvalidArgument(
-                f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
-            )
+        policies, first = self._policies()
         fit = simulator_settings(first.fitted, self.simulator, self.bins, self.range_hz)
         if fit["kind"] in ("histogram", None):
             check_binning(fit["bins"], fit["range_hz"])
@@ -116,18 +99,7 @@ class Run(StimulationOptions):
         account = Account(Budget(self.budget_pulses, self.budget_per_electrode))
         keep_compilations()
         recordings = read_recordings(self.recordings)
-        trained = first.fitted.get("burst_threshold")
-        series = extract_series(
-            recordings,
-            _conditions(recordings, first),
-            window_ms=first.window_ms or DEFAULT_WINDOW_MS,
-            burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
-            allow=self.allow,
-            readouts=first.readouts,
-        )
-        adaptive = self.thresholds == "adaptive"
-        calibration = Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
-        check_conditions(first, calibration)
+        calibration = self._calibration(recordings, first, fit)
         calibrating = next(recording for recording in recordings if recording.start_min == calibration.start_min)
         protocol, unknown = self._protocol(recordings, calibrating)
         loop, _ = Loop.of_policy(
@@ -164,6 +136,47 @@ class Run(StimulationOptions):
                 # Reported even if closing the culture fails.
                 stack.callback(self._report, gap)
         return gap.to_dict()
+
+    def _policies(self) -> tuple[dict[str, Policy], Policy]:
+        """The policies and the first of them, which represents all; refuses options that do not suit them."""
+        from animat.closed_loop.running import check_episodes
+        from animat.reality_gap import check_policies
+        from animat.robots.host import HostRobot
+
+        check_episodes("--episodes", self.episodes)
+        expect_at_least("--seed", self.seed, 0)
+        self._expect_culture_seed()
+        policies = policies_for(self.robot, self.mapping, self.policies)
+        first = check_policies(policies)
+        if not self.recordings:
+            raise InvalidArgument(
+                "--recordings: expected those that the policies were trained on, got none: make some with "
+                "`animat record`, and train on them"
+            )
+        if isinstance(first.robot, HostRobot) and (self.interventions or self.controls == "coupling"):
+            raise InvalidArgument(
+                f"--interventions, --controls coupling: expected a robot in JAX, got {first.robot.name}; leave them out"
+            )
+        return policies, first
+
+    def _calibration(self, recordings: Sequence[Recording], first: Policy, fit: dict[str, Any]) -> Calibration:
+        """The calibration by the recordings' responses, read by the options and otherwise as in the training."""
+        from animat.reality_gap import Calibration, check_conditions
+        from animat.responses.series import extract_series
+
+        trained = first.fitted.get("burst_threshold")
+        series = extract_series(
+            recordings,
+            _conditions(recordings, first),
+            window_ms=first.window_ms,
+            burst_threshold=trained if self.burst_threshold is None else self.burst_threshold,
+            allow=self.allow,
+            readouts=first.readouts,
+        )
+        adaptive = self.thresholds == "adaptive"
+        calibration = Calibration.of_series(series, first, at_min=self.at_min, adaptive=adaptive, **fit)
+        check_conditions(first, calibration)
+        return calibration
 
     def _report(self, gap: RealityGap) -> None:
         print(gap.to_text())

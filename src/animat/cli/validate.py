@@ -43,7 +43,6 @@ class Validate(ResponseOptions):
         from animat.responses.conditions import conditions_named
         from animat.responses.readouts import read_readouts
         from animat.responses.series import extract_series
-        from animat.responses.windows import DEFAULT_WINDOW_MS
 
         if self.out is not None:
             expect_writable(self.out)
@@ -62,7 +61,7 @@ class Validate(ResponseOptions):
                     (responses,) = extract_series(
                         [read_source(file)],
                         by,
-                        self.window_ms or DEFAULT_WINDOW_MS,
+                        self.window_ms,
                         burst_threshold=self.burst_threshold,
                         allow=self.allow,
                         readouts=readouts,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
+from animat.recordings.columns import columns_of
 from animat.recordings.recording import Recording
 from animat.writing import atomic_write, clear_away
 
@@ -37,7 +37,7 @@ class PartialRecording:
             return
         # A failed write must not end the recording, which reports its own errors.
         with suppress(Exception), atomic_write(self._path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **_columns(so_far()))
+            np.savez(file, **columns_of(so_far()))
         self._written_s = time.monotonic()
 
     def __exit__(self, *_: object) -> None:
@@ -47,18 +47,3 @@ class PartialRecording:
         """Remove the file, and the remains of killed runs."""
         for file in (self._path, *self._path.parent.glob(f".{UNDER_WAY}.*.partial*")):
             clear_away(file)
-
-
-def _columns(recording: Recording) -> dict[str, Any]:
-    """A recording with the keys of `animat.recordings.columns.PlainColumns`."""
-    channels, stimuli, presentation = recording.channels, recording.stimuli, recording.presentation
-    return {
-        "spike_time_s": recording.spike_times_s,
-        "spike_channel": recording.spike_channels,
-        "channel_label": channels.label,
-        "channel_electrode": channels.electrode,
-        "channel_xy_um": np.column_stack([channels.x_um, channels.y_um]),
-        **{f"stimulus_{each.name}": getattr(stimuli, each.name) for each in fields(stimuli)},
-        **{name: getattr(recording, name) for name in ("sampling_rate_hz", "start_min", "start_s", "duration_s")},
-        **({} if presentation is None else {f"presentation_{name}": of for name, of in vars(presentation).items()}),
-    }

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float64
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
-from animat.errors import InvalidArgument, Mismatch, expect_several, in_min
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, expect_several, in_min
 from animat.neurons.fidelity import Fidelity, fidelity
+from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.kinds import Kind, fit_simulator
-from animat.neurons.simulator import NeuronSimulator, stacked, to_jax
+from animat.neurons.memory import MemorySimulator
+from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, stacked, to_jax
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 from animat.tables import briefly
+from animat.writing import write_whole
 
 _MEMORY_OF_BLOCKS = Finding(
     "memory-of-blocks",
@@ -27,6 +34,10 @@ _MEMORY_OF_BLOCKS = Finding(
     "in recordings presented in blocks each condition follows only itself: the simulator does not know how a culture "
     "responds after a different one; record with --order mixed",
 )
+
+_KINDS = {
+    kind.__name__: kind for kind in (HistogramSimulator, JointHistogramSimulator, EmpiricalSimulator, MemorySimulator)
+}
 
 ALONE_MIN = 10.0
 """How long the simulator of a single recording holds: the paper's interval."""
@@ -181,3 +192,48 @@ def _words(value: object) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], Condition):
         return ", ".join(condition.label for condition in value)
     return ", ".join(value.names) if isinstance(value, Readouts) else str(value)
+
+
+def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
+    """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
+    arrays = {name: np.ascontiguousarray(array) for name, array in vars(timeline.simulators).items()}
+    metadata = {
+        "kind": type(timeline.simulators).__name__,
+        "start_min": timeline.start_min.tolist(),
+        "conditions": [asdict(condition) for condition in timeline.conditions],
+        "window_ms": timeline.window_ms,
+        "presentation": None if timeline.presentation is None else asdict(timeline.presentation),
+        "in_data": [kept.in_data.tolist() for kept in timeline.fidelities],
+        "in_simulator": [kept.in_simulator.tolist() for kept in timeline.fidelities],
+        "n_above_range": [kept.n_above_range for kept in timeline.fidelities],
+        "findings": [asdict(finding) for finding in timeline.findings],
+        "fitted": timeline.fitted,
+        **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
+    }
+    return write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
+
+
+def load_timeline(path: Path) -> SimulatorTimeline:
+    """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata: dict[str, Any] = json.loads(file.metadata()["animat"])
+            arrays = {name: to_jax(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
+        conditions = tuple(Condition(**each) for each in metadata["conditions"])
+        labels = tuple(condition.label for condition in conditions)
+        presentation = metadata["presentation"]
+        kept = zip(metadata["in_data"], metadata["in_simulator"], metadata["n_above_range"], strict=True)
+        readouts = Readouts.from_dict(metadata.get("readouts"))
+        return SimulatorTimeline(
+            simulators=_KINDS[metadata["kind"]](**arrays),
+            start_min=np.array(metadata["start_min"], np.float64),
+            conditions=conditions,
+            window_ms=tuple(metadata["window_ms"]),
+            presentation=None if presentation is None else Presentation(**presentation),
+            fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n, readouts.names) for a, b, n in kept),
+            findings=tuple(Finding.from_dict(each) for each in metadata["findings"]),
+            fitted=metadata["fitted"],
+            readouts=readouts,
+        )
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
+        raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -181,6 +181,21 @@ class PlainColumns:
         if (pulses := self.presentation_pulses or 1) > 1 and n:
             raise UnusableData(f"stimulus_presentation: required to know which {pulses} pulses are one trial, got none")
         return np.arange(n)
+
+
+def columns_of(recording: Recording) -> dict[str, Any]:
+    """A recording as the arguments of `PlainColumns`, without those it does not state."""
+    channels, stimuli, presentation = recording.channels, recording.stimuli, recording.presentation
+    return {
+        "spike_time_s": recording.spike_times_s,
+        "spike_channel": recording.spike_channels,
+        "channel_label": channels.label,
+        "channel_electrode": channels.electrode,
+        "channel_xy_um": np.column_stack([channels.x_um, channels.y_um]),
+        **{f"stimulus_{each.name}": getattr(stimuli, each.name) for each in fields(stimuli)},
+        **{name: getattr(recording, name) for name in ("sampling_rate_hz", "start_min", "start_s", "duration_s")},
+        **({} if presentation is None else {f"presentation_{name}": of for name, of in vars(presentation).items()}),
+    }
 
 
 def with_start(recording: Recording, start_s: float) -> Recording:

@@ -8,7 +8,7 @@ from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_severa
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
-from animat.responses.conditions import Conditions
+from animat.responses.conditions import Conditions, conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses
@@ -33,8 +33,8 @@ _NOTHING_TO_FIT = ("no-condition", "empty-condition")
 
 def extract_series(
     recordings: Sequence[Recording | ResponseTable],
-    by: Conditions | None = None,
-    window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
+    by: Conditions | str | None = None,
+    window_ms: tuple[float, float] | None = None,
     *,
     burst_threshold: float | None = None,
     allow: Sequence[str] = (),
@@ -44,8 +44,9 @@ def extract_series(
 
     Args:
         recordings: of one culture; or response tables.
-        by: the rule of the conditions; None: by frequency if it is known, by place if the protocol has places.
-        window_ms: start and end of the window after the pulse.
+        by: the rule of the conditions, or its text form (`conditions_named`); None: by frequency if it is known, by
+            place if the protocol has places.
+        window_ms: start and end of the window after the pulse; None: the paper's, 2 to 10 ms.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         allow: names of findings (`"dead-window"`) to ignore.
         readouts: groups of channels, the same electrodes in all recordings; `halves` and `quadrants` are those of the
@@ -54,12 +55,15 @@ def extract_series(
     Raises:
         UnusableData: if a finding refuses a recording, or simulated recordings have different seeds, unless `allow`
             names it.
-        InvalidArgument: for a name in `allow` that is not a refusing finding, or channels that do not form readouts.
+        InvalidArgument: for conditions that cannot be read, a name in `allow` that is not a refusing finding, or
+            channels that do not form readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
     kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings returns"
     recordings = expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
+    by = conditions_named(by) if isinstance(by, str) else by
+    window_ms = DEFAULT_WINDOW_MS if window_ms is None else window_ms
     cultures = [each.culture for each in recordings if isinstance(each, Recording)]
     seeds = {str(culture.seed) for culture in cultures if culture and culture.kind in ("virtual", "synthetic")}
     if len(seeds) > 1 and "several-cultures" not in allow:

@@ -11,14 +11,13 @@ from animat.evaluation.controls import controls_of
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.rollouts import Actor, Episodes, Networks, Uniform, networks_of, roll_out
 from animat.neurons.simulator import NeuronSimulator
-from animat.neurons.timeline import SimulatorTimeline
+from animat.neurons.timeline import SimulatorTimeline, load_timeline
 from animat.progress import Progress
 from animat.robots.host import HostRobot
 from animat.studies.episodes import COUPLING, RANDOM, episode_rows, write_episodes
 from animat.studies.paths import record_paths
 from animat.studies.places import TIMELINE, controls_file, episodes_file, paths_file, policies_folder
 from animat.studies.results import write_arrays
-from animat.studies.simulating import load_timeline
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.task import StudyTask, draw_seed
 from animat.studies.training import training_of

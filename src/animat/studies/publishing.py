@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
+from animat.neurons.timeline import load_timeline
 from animat.progress import Progress
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, cell, write_page
@@ -33,7 +34,7 @@ from animat.studies.pictures import round_of
 from animat.studies.places import REPORT, TIMELINE, results_file
 from animat.studies.reflex import describe_reflexes
 from animat.studies.results import read_typed
-from animat.studies.simulating import controllability, load_timeline, read_series
+from animat.studies.simulating import controllability, read_series
 from animat.studies.specification import Arm, Study
 from animat.studies.tabulating import FIRST, LEFT_OUT, LEVEL, NONE, SECOND, all_episodes, performances
 from animat.studies.task import StudyTask

@@ -1,40 +1,24 @@
-"""The study's neuron simulators: fitted once, and saved to a file without code that needs no recordings."""
+"""The study's neuron simulators: fitted once to its recordings."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
-import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
-
-from animat.errors import AnimatError, InvalidFile, UnusableData
+from animat.errors import UnusableData
 from animat.neurons.fidelity import Fidelity
-from animat.neurons.joint_histogram import JointHistogramSimulator
-from animat.neurons.memory import MemorySimulator
-from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, to_jax
-from animat.neurons.timeline import SimulatorTimeline, fit_timeline
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline, save_timeline
 from animat.progress import Progress
 from animat.recordings.findings import Finding
 from animat.recordings.reading import read_recordings
-from animat.responses.condition import Condition
-from animat.responses.conditions import conditions_named
-from animat.responses.readouts import ALL, Readouts, readouts_named
+from animat.responses.readouts import ALL, readouts_named
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
-from animat.stimulation.protocol import Presentation
 from animat.studies.places import RECORDINGS, RESPONSES, TIMELINE
 from animat.studies.results import write_table
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
-from animat.writing import write_whole
-
-_KINDS = {
-    kind.__name__: kind for kind in (HistogramSimulator, JointHistogramSimulator, EmpiricalSimulator, MemorySimulator)
-}
 
 
 @final
@@ -103,7 +87,7 @@ def read_series(study: Study, folder: Path, *, as_one: bool = False) -> list[Res
     settings = study.simulators
     return extract_series(
         read_recordings(folder / RECORDINGS),
-        conditions_named(settings.conditions) if settings.conditions else None,
+        settings.conditions or None,
         settings.window_ms,
         burst_threshold=settings.burst_threshold,
         allow=settings.allow,
@@ -120,48 +104,3 @@ def controllability(timeline: SimulatorTimeline) -> dict[float, Fidelity]:
             kept = replace(kept, labels=labels, in_data=kept.in_data.ravel(), in_simulator=kept.in_simulator.ravel())
         fidelities[at_min] = kept
     return fidelities
-
-
-def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
-    """Write the simulators as safetensors, with everything but arrays as JSON metadata; always the same bytes."""
-    arrays = {name: np.ascontiguousarray(array) for name, array in vars(timeline.simulators).items()}
-    metadata = {
-        "kind": type(timeline.simulators).__name__,
-        "start_min": timeline.start_min.tolist(),
-        "conditions": [asdict(condition) for condition in timeline.conditions],
-        "window_ms": timeline.window_ms,
-        "presentation": None if timeline.presentation is None else asdict(timeline.presentation),
-        "in_data": [kept.in_data.tolist() for kept in timeline.fidelities],
-        "in_simulator": [kept.in_simulator.tolist() for kept in timeline.fidelities],
-        "n_above_range": [kept.n_above_range for kept in timeline.fidelities],
-        "findings": [asdict(finding) for finding in timeline.findings],
-        "fitted": timeline.fitted,
-        **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
-    }
-    return write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
-
-
-def load_timeline(path: Path) -> SimulatorTimeline:
-    """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata: dict[str, Any] = json.loads(file.metadata()["animat"])
-            arrays = {name: to_jax(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
-        conditions = tuple(Condition(**each) for each in metadata["conditions"])
-        labels = tuple(condition.label for condition in conditions)
-        presentation = metadata["presentation"]
-        kept = zip(metadata["in_data"], metadata["in_simulator"], metadata["n_above_range"], strict=True)
-        readouts = Readouts.from_dict(metadata.get("readouts"))
-        return SimulatorTimeline(
-            simulators=_KINDS[metadata["kind"]](**arrays),
-            start_min=np.array(metadata["start_min"], np.float64),
-            conditions=conditions,
-            window_ms=tuple(metadata["window_ms"]),
-            presentation=None if presentation is None else Presentation(**presentation),
-            fidelities=tuple(Fidelity(labels, np.array(a), np.array(b), n, readouts.names) for a, b, n in kept),
-            findings=tuple(Finding.from_dict(each) for each in metadata["findings"]),
-            fitted=metadata["fitted"],
-            readouts=readouts,
-        )
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
-        raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64, PRNGKeyArray
 
-from animat.compilation import COMPILER_OPTIONS
+from animat.compilation import jit_side_by_side
 from animat.environment import Environment
 from animat.errors import InvalidArgument
 from animat.neurons.simulator import NeuronSimulator
@@ -110,9 +110,9 @@ def programs_with_ranges(
         return assess(varied(ranges), episodes, actor, simulator, key)
 
     return (
-        jax.jit(jax.vmap(beginning), compiler_options=COMPILER_OPTIONS),
-        jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=1, compiler_options=COMPILER_OPTIONS),
-        jax.jit(jax.vmap(assessment, in_axes=(0, 0, None, None)), compiler_options=COMPILER_OPTIONS),
+        jit_side_by_side(beginning),
+        jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1),
+        jit_side_by_side(assessment, (0, 0, None, None)),
     )
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from animat.compilation import COMPILER_OPTIONS
+from animat.compilation import jit_side_by_side
 from animat.environment import Environment
 from animat.training.exploration import entropy_factor
 from animat.training.networks import forward, squashed_normal
@@ -55,6 +55,4 @@ def diagnose(environment: Environment[Any], settings: SAC, learner: Learner, ava
 @lru_cache(maxsize=8)
 def diagnosis_program(environment: Environment[Any], algorithm: SAC) -> Callable[..., Any]:
     """`diagnose` for several policies, compiled when it is first called."""
-    return jax.jit(
-        jax.vmap(partial(diagnose, environment, algorithm), in_axes=(0, None)), compiler_options=COMPILER_OPTIONS
-    )
+    return jit_side_by_side(partial(diagnose, environment, algorithm), (0, None))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from animat.compilation import COMPILER_OPTIONS
+from animat.compilation import jit_side_by_side
 from animat.environment import Environment
 from animat.errors import InvalidFile, UnusableData
 from animat.neurons.simulator import NeuronSimulator
@@ -156,11 +156,10 @@ def programs(
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """`begin` and `train_chunk` for several policies, traced once per process; each may have its own simulator."""
     limited = EpisodeLimit(environment)
-    beginning = jax.vmap(partial(begin, limited, algorithm))
-    chunk = jax.vmap(partial(train_chunk, limited, algorithm), in_axes=(0, 0 if own_simulators else None, None, None))
+    in_axes = (0, 0 if own_simulators else None, None, None)
     return (
-        jax.jit(beginning, compiler_options=COMPILER_OPTIONS),
-        jax.jit(chunk, donate_argnums=0, compiler_options=COMPILER_OPTIONS),
+        jit_side_by_side(partial(begin, limited, algorithm)),
+        jit_side_by_side(partial(train_chunk, limited, algorithm), in_axes, donate_argnums=0),
     )
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from animat.compilation import COMPILER_OPTIONS
+from animat.compilation import jit_side_by_side
 from animat.environment import Environment
 from animat.neurons.history import INITIAL_HISTORY
 from animat.neurons.simulator import NeuronSimulator
@@ -101,13 +101,10 @@ def _act(
 @lru_cache(maxsize=8)
 def _compiled(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..., Any], ...]:
     """`begin`, `act` and `learn_and_act` for several policies."""
-    beginning = jax.vmap(partial(begin, EpisodeLimit(environment), algorithm))
-    acting = jax.vmap(partial(act, environment, algorithm), in_axes=(0, None))
-    learning = jax.vmap(partial(learn_and_act, environment, algorithm), in_axes=(0, 0, 0, None, None))
     return (
-        jax.jit(beginning, compiler_options=COMPILER_OPTIONS),
-        jax.jit(acting, donate_argnums=0, compiler_options=COMPILER_OPTIONS),
-        jax.jit(learning, donate_argnums=(0, 1), compiler_options=COMPILER_OPTIONS),
+        jit_side_by_side(partial(begin, EpisodeLimit(environment), algorithm)),
+        jit_side_by_side(partial(act, environment, algorithm), (0, None), donate_argnums=0),
+        jit_side_by_side(partial(learn_and_act, environment, algorithm), (0, 0, 0, None, None), donate_argnums=(0, 1)),
     )
 
 

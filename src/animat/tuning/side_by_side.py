@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from animat.compilation import COMPILER_OPTIONS
+from animat.compilation import jit_side_by_side
 from animat.environment import Environment
 from animat.evaluation.rollouts import Networks
 from animat.neurons.simulator import NeuronSimulator
@@ -45,10 +45,7 @@ def programs(environment: Environment[Any], algorithm: SAC) -> tuple[Callable[..
         vars(settings).update({**vars(algorithm), **numbers})
         return train_chunk(limited, settings, learner, simulator, first, last)
 
-    return (
-        jax.jit(jax.vmap(beginning), compiler_options=COMPILER_OPTIONS),
-        jax.jit(jax.vmap(chunk, in_axes=(0, 0, None, None, None)), donate_argnums=1, compiler_options=COMPILER_OPTIONS),
-    )
+    return jit_side_by_side(beginning), jit_side_by_side(chunk, (0, 0, None, None, None), donate_argnums=1)
 
 
 class Trials(SideBySide):

@@ -14,9 +14,9 @@ import numpy as np
 
 from animat.errors import UnusableData
 from animat.evaluation.rollouts import roll_out
-from animat.neurons.timeline import SimulatorTimeline
+from animat.neurons.timeline import SimulatorTimeline, load_timeline, save_timeline
 from animat.progress import Progress
-from animat.studies.simulating import fit_simulators, load_timeline, one_condition, read_series, save_timeline
+from animat.studies.simulating import fit_simulators, one_condition, read_series
 from animat.studies.specification import Study
 from animat.studies.task import StudyTask
 from animat.studies.training import training_of
