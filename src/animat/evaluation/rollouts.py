@@ -197,7 +197,6 @@ def _roll_out(
     keys: Key[Array, " actors"],
 ) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    commands = () if environment.robot.n_commands == 1 else (environment.robot.n_commands,)
     n_drawn = environment.n_drawn
 
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
@@ -208,7 +207,7 @@ def _roll_out(
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),
             jnp.zeros(n_conditions, jnp.int32),
-            jnp.zeros((n_conditions, *commands)),
+            jnp.zeros((n_conditions, *environment.robot.command_shape)),
             jnp.zeros(episodes, bool),
         )
         return carry, jax.random.split(key, environment.robot.episode_limit)
