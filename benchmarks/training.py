@@ -333,7 +333,7 @@ def ours(folder: str, ladder: list[int], wanted: float) -> dict[str, Any]:
         simulator = culture.at(0.0)
         environment = Animat(Cartpole(), mapping_named("9-thresholds"), simulator.n_conditions)
         actors = networks_of(list(policies.values()), greedy=True)
-        returns = roll_out(environment, simulator, actors, 10, episodes=100, seed=7).returns.mean(axis=1)
+        returns = roll_out(environment, simulator, actors, episodes=100, seed=7).returns.mean(axis=1)
         tried.append(
             {
                 "iterations": iterations,

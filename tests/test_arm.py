@@ -162,8 +162,8 @@ def test_links_that_reach_nothing_and_too_long_steps_are_refused() -> None:
 @pytest.mark.oracle
 def test_the_heuristic_brings_the_tip_to_the_target() -> None:
     environment = WithoutNeurons(TwoLinkArm(), None)
-    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=100, seed=1).returns
-    at_random = roll_out(environment, None, Uniform(), 1, episodes=100, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), episodes=100, seed=1).returns
+    at_random = roll_out(environment, None, Uniform(), episodes=100, seed=1).returns
     assert by_rule.mean() > -40 and at_random.mean() < -80
     robot, state = TwoLinkArm(), TwoLinkArm().reset(jax.random.key(5))
     step = jax.jit(lambda state: robot.advance(NO_NOISE, state, robot.heuristic(robot.observe(state))))

@@ -24,6 +24,7 @@ from animat.closed_loop.runner import HostRunner
 from animat.coding.mapping import Thresholds
 from animat.environment import WithoutNeurons
 from animat.errors import BodyFailed, InvalidArgument
+from animat.evaluation.coupling import Coupling
 from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
@@ -210,10 +211,10 @@ def test_evaluation_counts_whole_episodes_whatever_their_number() -> None:
     robot = named("Slider")
     environment = WithoutNeurons(robot, (-0.5, 1.0))
     # -0.5 is an action of 0: it stays about where it starts; 1 is one of 3: it goes beyond 2 within 9 steps.
-    still, away = (roll_out(environment, None, Constant(jnp.array([i])), 1, episodes=70, seed=4) for i in (0, 1))
+    still, away = (roll_out(environment, None, Constant(jnp.array([i])), episodes=70, seed=4) for i in (0, 1))
     assert not still.terminated.any() and np.all(still.lengths == 20)
     assert away.terminated.all() and away.lengths.min() >= 5 and away.lengths.max() <= 9
-    fewer = roll_out(environment, None, Constant(jnp.array([0])), 1, episodes=64, seed=4)
+    fewer = roll_out(environment, None, Constant(jnp.array([0])), episodes=64, seed=4)
     np.testing.assert_array_equal(still.returns[:, :64], fewer.returns)
     bodies = Bodies(robot, [(4, 0, i) for i in range(70)])
     starts = np.abs(bodies.begin()[:, 0])
@@ -345,9 +346,9 @@ def test_mujoco_bodies_are_trained(tmp_path: Path) -> None:
     robot = robot_named("gymnasium:Reacher-v5")
     assert isinstance(robot, GymnasiumRobot) and robot.keeps_state and robot.n_commands == 2
     policies = trained(training(robot, policies=1, iterations=400), None, tmp_path)
-    row = roll_out(WithoutNeurons(robot, None), None, networks_of(list(policies.values())), 1, episodes=3, seed=1)
+    row = roll_out(WithoutNeurons(robot, None), None, networks_of(list(policies.values())), episodes=3, seed=1)
     assert np.all(row.lengths == 50) and np.all(np.isfinite(row.returns))
-    random = roll_out(WithoutNeurons(robot, None), None, Uniform(), 1, episodes=3, seed=1)
+    random = roll_out(WithoutNeurons(robot, None), None, Uniform(), episodes=3, seed=1)
     assert not np.array_equal(random.returns, row.returns)
 
 
@@ -445,7 +446,8 @@ def test_an_episode_of_two_commands_is_kept_whole() -> None:
     """What a study keeps of an episode: one number per command, and the body's resulting path."""
     robot = named("Pair")
     environment = WithoutNeurons(robot, None)
-    kept = record_paths(environment, None, Uniform(), 2, seed=3)
+    actors = Coupling(jnp.asarray([[[1.0, 0.5], [-2.0, 0.0]], [[0.0, -0.3], [3.0, 0.1]]]), None, None, "graded", (0,))
+    kept = record_paths(environment, None, actors, seed=3)
     assert kept.commands.shape == (2, 20, 2) and kept.observations.shape == (2, 21, 2)
     for actor, (observations, commands) in enumerate(kept.episodes()):
         body = Bodies(robot, [(3, actor)])

@@ -322,7 +322,7 @@ def test_too_little_memory_is_one_line(
     def roll_out(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("animat.evaluation.table.roll_out", roll_out)
+    monkeypatch.setattr("animat.evaluation.controls.roll_out", roll_out)
     assert main(["evaluate", str(policies), "--recordings", str(recordings), "--episodes", "2"]) == 1
     message = capsys.readouterr().err.splitlines()[-1]
     assert message.startswith("animat: out of memory") and message.endswith(": ask for fewer episodes (--episodes 2)")

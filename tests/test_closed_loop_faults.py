@@ -399,16 +399,16 @@ class Broken:
 
 @pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
 def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from animat.closed_loop import driver
+    from animat.closed_loop import runner
 
     broken = Broken(how)
 
-    class BrokenRunner(driver.RobotRunner):
+    class BrokenRunner(runner.RobotRunner):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             self.step = broken(self.step)  # type: ignore[method-assign]
 
-    monkeypatch.setattr(driver, "RobotRunner", BrokenRunner)
+    monkeypatch.setattr(runner, "RobotRunner", BrokenRunner)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "robot"
@@ -421,11 +421,11 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
 def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from animat.closed_loop import driver
+    from animat.closed_loop import runner
 
     released, steps = threading.Event(), [0]
 
-    class StuckRunner(driver.RobotRunner):
+    class StuckRunner(runner.RobotRunner):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             step = self.step
@@ -438,7 +438,7 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
 
             self.step = stuck  # type: ignore[method-assign]
 
-    monkeypatch.setattr(driver, "RobotRunner", StuckRunner)
+    monkeypatch.setattr(runner, "RobotRunner", StuckRunner)
     monkeypatch.setattr("animat.closed_loop.running._GRACE_S", 0.2)
     with FakeCulture() as culture:
         try:

@@ -69,7 +69,7 @@ class Siding(Sensing):
 
 
 def mean_return(environment: Any, simulator: Any, found: Coupling) -> float:
-    return float(roll_out(environment, simulator, found, 1, episodes=4000, seed=99).returns.mean())
+    return float(roll_out(environment, simulator, found, episodes=4000, seed=99).returns.mean())
 
 
 @pytest.mark.oracle

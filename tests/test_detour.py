@@ -117,7 +117,7 @@ def test_it_converts_to_data() -> None:
 @pytest.mark.oracle
 def test_the_heuristic_finds_the_way_round_and_that_of_wheels_often_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     def ran(actor: Actor, robot: Detour = ROBOT) -> tuple[float, float]:
-        ran = roll_out(WithoutNeurons(robot, None), None, actor, 1, episodes=400, seed=1)
+        ran = roll_out(WithoutNeurons(robot, None), None, actor, episodes=400, seed=1)
         return float(ran.terminated.mean()), float(ran.returns.mean())
 
     by_rule, at_random = ran(HeuristicPolicy()), ran(Uniform())

@@ -60,9 +60,7 @@ def policy_of(timeline: SimulatorTimeline, robot: Robot = Cartpole(), seed: int 
 
 def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
     simulator = silenced(synthetic_simulator())
-    episodes = roll_out(
-        Animat(Cartpole(force_noise=0.0), Thresholds(1), 5), simulator, Uniform(), 1, episodes=5, seed=0
-    )
+    episodes = roll_out(Animat(Cartpole(force_noise=0.0), Thresholds(1), 5), simulator, Uniform(), episodes=5, seed=0)
     # By hand: u = -1 always. The same equations stepped in numpy until 12 degrees.
     x = np.zeros(4)
     n = 0
@@ -78,9 +76,8 @@ def test_a_silent_culture_drives_the_cartpole_one_way_until_it_falls() -> None:
 
 
 def test_truncated_episodes_count_to_the_limit_and_are_not_terminated() -> None:
-    episodes = roll_out(
-        Animat(Navigation(episode_limit=20), Linear(), 5), synthetic_simulator(), Uniform(), 3, episodes=7, seed=0
-    )
+    environment = Animat(Navigation(episode_limit=20), Linear(), 5)
+    episodes = roll_out(environment, synthetic_simulator(), Constant(jnp.arange(3)), episodes=7, seed=0)
     assert np.all(episodes.lengths == 20)
     assert not episodes.terminated.any()
     assert episodes.returns.shape == (3, 7)
@@ -93,7 +90,7 @@ def test_episodes_agree_with_a_plain_loop_of_single_steps() -> None:
     policy = policy_of(timeline)
     simulator = timeline.at(0.0)
     environment = Animat(policy.robot, policy.mapping, 3)
-    rolled = roll_out(environment, simulator, networks_of([policy]), 1, episodes=2_000, seed=0)
+    rolled = roll_out(environment, simulator, networks_of([policy]), episodes=2_000, seed=0)
     many = rolled.returns[0]
 
     step = jax.jit(environment.step)
@@ -128,7 +125,7 @@ def test_actors_have_random_numbers_of_their_own_and_a_seed_decides_them() -> No
     environment = Animat(policy.robot, policy.mapping, 3)
 
     def run(seed: int) -> np.ndarray:
-        return roll_out(environment, timeline.at(0.0), networks_of([policy] * 2), 2, episodes=50, seed=seed).returns
+        return roll_out(environment, timeline.at(0.0), networks_of([policy] * 2), episodes=50, seed=seed).returns
 
     assert np.array_equal(run(3), run(3))
     assert not np.array_equal(run(3), run(4))
@@ -145,7 +142,7 @@ def test_a_constant_actor_is_the_condition_itself() -> None:
     # Condition 0 always gives low responses, condition 1 high ones: u = -1 or +1 throughout, mirror images.
     timeline = fit_timeline([responses_of([10.0] * 9, [50.0] * 9)], kind="empirical")
     environment = Animat(Cartpole(force_noise=0.0), Thresholds(1), 2)
-    both = roll_out(environment, timeline.at(0.0), Constant(jnp.array([0, 1])), 2, episodes=3, seed=0)
+    both = roll_out(environment, timeline.at(0.0), Constant(jnp.array([0, 1])), episodes=3, seed=0)
     assert np.array_equal(both.returns[0], both.returns[1])
     assert len(np.unique(both.returns)) == 1
 
@@ -210,7 +207,7 @@ def test_policies_are_evaluated_with_the_percentiles_they_were_trained_with() ->
     found = evaluate({"a": held}, timeline, at_min=14.0, episodes=50, seed=3)
     simulator = replace(timeline.at(14.0), percentiles=timeline.at(0.0).percentiles)
     environment = Animat(Cartpole(), Thresholds(1), 3)
-    wanted = roll_out(environment, simulator, networks_of([held], greedy=True), 1, episodes=50, seed=3).returns
+    wanted = roll_out(environment, simulator, networks_of([held], greedy=True), episodes=50, seed=3).returns
     np.testing.assert_array_equal(found.rows[0].episodes.returns, wanted)
     assert np.any(
         wanted != evaluate({"a": moving}, timeline, at_min=14.0, episodes=50, seed=3).rows[0].episodes.returns
@@ -261,7 +258,7 @@ def test_the_heuristic_policy_goes_through_the_same_mapping_and_neurons() -> Non
     environment, simulator = Animat(Cartpole(), Thresholds(1), 3), timeline.at(14.0)
     rule = heuristic_policy(environment, simulator)
     np.testing.assert_array_equal(
-        row.episodes.returns, roll_out(environment, simulator, rule, 1, episodes=50, seed=3).returns
+        row.episodes.returns, roll_out(environment, simulator, rule, episodes=50, seed=3).returns
     )
 
 

@@ -103,7 +103,7 @@ def test_the_information_of_a_constructed_policy_is_that_of_the_closed_form(
     # The goals of an actor's episodes are a sample of the four: more episodes than usual make it more even.
     monkeypatch.setattr(information, "EPISODES", 384)
     actors = Choosing(jnp.asarray(np.tile(CASES[case], (4, 1, 1, 1)), jnp.float32))
-    found = goal_information(ENVIRONMENT, None, actors, 4, draws=32)
+    found = goal_information(ENVIRONMENT, None, actors, draws=32)
     bits = found.bits
     assert bits.low - 0.01 < closed_form(CASES[case]) < bits.high + 0.01
     assert bits.value == pytest.approx(closed_form(CASES[case]), abs=0.01)
@@ -124,7 +124,7 @@ def test_few_draws_and_few_goals_are_corrected_for() -> None:
 def test_the_permutation_null_holds_at_five_percent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(information, "PERMUTATIONS", 39)
     blind = Choosing(jnp.asarray(CASES["blind"][None], jnp.float32))
-    p = np.array([goal_information(ENVIRONMENT, None, blind, 1, draws=2, seed=seed).p for seed in range(200)])
+    p = np.array([goal_information(ENVIRONMENT, None, blind, draws=2, seed=seed).p for seed in range(200)])
     # 10 expected; 99.9 % of binomial counts lie between.
     assert 2 <= np.sum(p <= 0.05) <= 22
     assert abs(p.mean() - 0.5125) < 4 * 0.29 / np.sqrt(200)
@@ -133,6 +133,6 @@ def test_the_permutation_null_holds_at_five_percent(monkeypatch: pytest.MonkeyPa
 def test_what_has_one_goal_or_continuous_actions_has_none() -> None:
     actors = Choosing(jnp.asarray(CASES["blind"][None], jnp.float32))
     with pytest.raises(InvalidArgument, match="cartpole has no method `with_goal_of`"):
-        goal_information(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, actors, 1)
+        goal_information(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, actors)
     with pytest.raises(InvalidArgument, match="expected discrete actions"):
-        goal_information(WithoutNeurons(Telling(), None), None, actors, 1)
+        goal_information(WithoutNeurons(Telling(), None), None, actors)

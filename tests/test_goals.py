@@ -346,14 +346,13 @@ def test_its_own_goal_can_be_switched_where_the_body_s_can() -> None:
 def test_rollouts_report_the_outcome_of_each_episode() -> None:
     robot = with_goal(Slider(4), "drive x above 0 m; avoid x below -0.5 m")
     actors = Constant(jnp.array([0, 1, 2]))
-    ran = roll_out(WithoutNeurons(robot, (-0.9, -0.2, 0.4)), None, actors, 3, episodes=2, seed=1)
+    ran = roll_out(WithoutNeurons(robot, (-0.9, -0.2, 0.4)), None, actors, episodes=2, seed=1)
     assert ran.outcome is not None
     assert ran.outcome.succeeded.tolist() == [[False] * 2, [False] * 2, [True] * 2]
     np.testing.assert_allclose(ran.outcome.margin[:, 0], [-0.45, -0.1, 0.2], atol=1e-6)
     np.testing.assert_allclose(ran.outcome.satisfaction[:, 0], [[0, 0], [0, 100], [100, 100]], atol=1e-4)
     assert (
-        roll_out(WithoutNeurons(Cartpole(), (0.0,)), None, Constant(jnp.array([0])), 1, episodes=1, seed=1).outcome
-        is None
+        roll_out(WithoutNeurons(Cartpole(), (0.0,)), None, Constant(jnp.array([0])), episodes=1, seed=1).outcome is None
     )
 
 

@@ -129,7 +129,7 @@ def test_a_study_tabulates_how_far_each_objective_was_met(tmp_path: Path) -> Non
     parts, ran = [], {}
     for spec in specs:
         ran[spec.name] = roll_out(
-            WithoutNeurons(spec.robot(), (-0.1, 0.1)), None, Constant(jnp.array([0, 1])), 2, episodes=2, seed=1
+            WithoutNeurons(spec.robot(), (-0.1, 0.1)), None, Constant(jnp.array([0, 1])), episodes=2, seed=1
         )
         told = {"robot": spec.name, "arm": "a", "at_min": 0.0}
         parts.append(write_episodes(tmp_path / f"{spec.name}.npz", [episode_rows(ran[spec.name], **told)]))

@@ -74,13 +74,13 @@ BEST = Best(jnp.zeros(1))
 
 
 def episodes_of(environment: Any, simulator: Any = SIMULATOR, actor: Actor = BEST) -> np.ndarray:
-    return roll_out(environment, simulator, actor, 1, episodes=2000, seed=5).returns[0]
+    return roll_out(environment, simulator, actor, episodes=2000, seed=5).returns[0]
 
 
 @pytest.mark.oracle
 def test_each_intervention_does_what_it_says() -> None:
     usual = episodes_of(ENVIRONMENT)
-    found = {each.name: each for each in interventions_of(ENVIRONMENT, SIMULATOR, BEST, 1, switch_at=4)}  # type: ignore[arg-type]
+    found = {each.name: each for each in interventions_of(ENVIRONMENT, SIMULATOR, BEST, switch_at=4)}  # type: ignore[arg-type]
     returns = {name: episodes_of(*each.within(ENVIRONMENT, SIMULATOR)) for name, each in found.items()}
     assert [*found] == [
         "ideal actuator", "random spikes", "silent", "shuffled", "yoked", "turned round", "goal switched"
@@ -111,7 +111,7 @@ def test_random_spikes_have_the_rates_of_the_culture_and_do_not_depend_on_stimul
 
 def test_yoked_stimuli_are_those_of_the_episode_that_is_observed() -> None:
     yoked = YokedDelivery(Animat(Aiming(), Linear(), 5))
-    traced = trace(yoked, SIMULATOR, BEST, 1, episodes=50, seed=2)
+    traced = trace(yoked, SIMULATOR, BEST, episodes=50, seed=2)
     other = traced.states.info["other_episode"].robot
     agree = np.asarray(other.goal * other.sensed)[:, :, :-1] > 0
     np.testing.assert_array_equal(traced.actions == 4, agree)
@@ -128,7 +128,7 @@ def test_the_goal_is_switched_once_and_nothing_else() -> None:
     assert switched[:3] == body[:3] and switched[3:] == other[3:]
     assert plain.robot == GoalSwitch(plain, 3).robot
     environment = GoalSwitch(ENVIRONMENT, 3)
-    once, usual = (trace(each, SIMULATOR, BEST, 1, episodes=40, seed=3) for each in (environment, ENVIRONMENT))
+    once, usual = (trace(each, SIMULATOR, BEST, episodes=40, seed=3) for each in (environment, ENVIRONMENT))
     goals, sensed = (np.asarray(each) for each in (once.states.robot.goal, once.states.robot.sensed))
     np.testing.assert_array_equal(sensed, usual.states.robot.sensed)
     np.testing.assert_array_equal(goals[..., :3], np.asarray(usual.states.robot.goal)[..., :3])
@@ -153,7 +153,7 @@ def linear_networks(*weights: np.ndarray) -> Networks:
 @pytest.mark.oracle
 def test_the_table_distinguishes_a_policy_that_knows_its_goal_from_one_that_does_not() -> None:
     towards = np.array([[0.0] * 5, [-1.0, 0.0, 0.0, 0.0, 1.0]])
-    knows = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), 2, episodes=50, seed=1)
+    knows = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards, 2 * towards), episodes=50, seed=1)
     rows = {row["name"]: row for row in knows.to_dict()["rows"]}
     # Two equally likely goals, each with its own action: 1 bit, whether stimuli have an effect or not.
     for name in ("as they are", "silent", "shuffled"):
@@ -161,7 +161,7 @@ def test_the_table_distinguishes_a_policy_that_knows_its_goal_from_one_that_does
     turning = knows.turning
     assert turning is not None and (turning.at, turning.episodes, turning.after) == (5, 64, 1.0)
     assert turning.turned == 1.0
-    blind = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), 1, episodes=50, seed=1)
+    blind = run_interventions(ENVIRONMENT, SIMULATOR, linear_networks(towards[::-1]), episodes=50, seed=1)
     information = blind.rows[0].information
     assert information is not None and (information.bits.value, information.p) == (0.0, 1.0)
     assert blind.turning is not None and (blind.turning.turned, blind.turning.after) == (0.0, None)
@@ -174,8 +174,8 @@ def test_the_table_distinguishes_a_policy_that_knows_its_goal_from_one_that_does
 @pytest.mark.oracle
 def test_a_single_goal_and_missing_neurons_are_reported() -> None:
     falling = linear_networks(np.zeros((4, 5)))
-    made = run_interventions(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, 1, episodes=5, seed=1)
+    made = run_interventions(Animat(Cartpole(), Thresholds(1), 5), SIMULATOR, falling, episodes=5, seed=1)
     assert made.turning is None and "the robot has only one goal" in made.to_text()
     assert [row.name for row in made.rows][-1] == "turned round"
     with pytest.raises(InvalidArgument, match="expected policies that act through neurons"):
-        run_interventions(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, 1, episodes=5, seed=1)
+        run_interventions(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, falling, episodes=5, seed=1)

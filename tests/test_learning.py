@@ -92,8 +92,8 @@ def test_policies_are_as_good_as_the_optimum_allows(
         simulator = timeline.at(0.0)
         environment = training.environment(simulator.n_conditions)
         actors = networks_of(list(policies.values()), greedy=True)
-        trained = roll_out(environment, simulator, actors, 4, episodes=2_000, seed=5).returns.mean()
-        random = roll_out(environment, simulator, Uniform(), 1, episodes=20_000, seed=3).returns.mean()
+        trained = roll_out(environment, simulator, actors, episodes=2_000, seed=5).returns.mean()
+        random = roll_out(environment, simulator, Uniform(), episodes=20_000, seed=3).returns.mean()
         optimum = best_return(environment, simulator, episodes=0).value
         scores.append((trained - random) / (optimum - random))
     assert np.mean(scores) >= 0.97, scores

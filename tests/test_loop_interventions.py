@@ -35,14 +35,14 @@ SIMULATOR = synthetic_simulator()
 def changed(robot: Robot[Any]) -> list[Agent]:
     """The interventions that involve a culture, as agents."""
     environment, networks = Animat(robot, Thresholds(1), 5), linear_networks(np.zeros((len(robot.observation_spec), 5)))
-    found = interventions_of(environment, SIMULATOR, networks, 1, switch_at=5)
+    found = interventions_of(environment, SIMULATOR, networks, switch_at=5)
     asked = ("random spikes", "yoked", "turned round", "goal switched")
     return [agent_of(each, environment, POLICIES, POOL_HZ) for each in found if each.name in asked]
 
 
 def test_what_moves_the_robot_without_responses_is_no_agent_of_a_loop() -> None:
     environment, networks = Animat(ROBOT, Thresholds(1), 5), linear_networks(np.zeros((len(ROBOT.observation_spec), 5)))
-    ideal = interventions_of(environment, SIMULATOR, networks, 1)[0]
+    ideal = interventions_of(environment, SIMULATOR, networks)[0]
     with pytest.raises(InvalidArgument, match="expected one whose commands come from responses, got ideal actuator"):
         agent_of(ideal, environment, POLICIES, POOL_HZ)
 
@@ -113,7 +113,7 @@ def test_a_robot_with_one_goal_has_none_switched_and_yoked_ones_need_a_source(tm
 def test_controls_of_a_simulator_are_agents_of_a_loop() -> None:
     environment = Animat(Cartpole(), Thresholds(1), 5)
     networks = linear_networks(np.zeros((4, 5)))
-    found = controls_of(environment, SIMULATOR, list("abcde"), networks, 1)
+    found = controls_of(environment, SIMULATOR, list("abcde"), networks)
     agents = {each.name: agent_of(each, environment, POLICIES, POOL_HZ) for each in found}
     assert [*agents] == ["random", *(f"constant {x}" for x in "abcde"), "heuristic", "silent", "shuffled"]
     rng = np.random.default_rng(1)

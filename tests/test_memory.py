@@ -647,7 +647,7 @@ def test_intervals_of_predictions_with_memory_hold_what_they_say() -> None:
     rule = heuristic_policy(environment, culture)
 
     def returns(simulator: MemorySimulator, episodes: int, seed: int) -> np.ndarray:
-        return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()
+        return roll_out(environment, simulator, rule, episodes=episodes, seed=seed).returns.ravel()
 
     truth, covered = returns(culture, 20_000, 1).mean(), 0
     for seed in range(60):
@@ -675,7 +675,7 @@ def test_shuffled_delivery_leaves_nothing_to_choose() -> None:
     environment = ShuffledDelivery(Animat(Stairs(), Thresholds(1), 2))
     optimum = best_return(environment, simulator, grid=STEPS, episodes=0)
     played = [
-        roll_out(environment, simulator, actor, 1, episodes=4000, seed=1).returns
+        roll_out(environment, simulator, actor, episodes=4000, seed=1).returns
         for actor in (Uniform(), Constant(jnp.array([0])))
     ]
     for returns in played:
@@ -793,7 +793,7 @@ def test_training_through_a_memory_begins_each_episode_alike(tmp_path: Path) -> 
     trained = train(training, timeline, tmp_path / "policies")
     assert all(policy.fitted["kind"] == "memory" for policy in trained.values())
     played = roll_out(
-        training.environment(2), timeline.at(0.0), networks_of(list(trained.values())), 2, episodes=3, seed=1
+        training.environment(2), timeline.at(0.0), networks_of(list(trained.values())), episodes=3, seed=1
     )
     # Every episode is the same one, in training as in evaluation.
     assert len(set(played.returns.ravel().tolist())) == 1

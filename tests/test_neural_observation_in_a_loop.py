@@ -167,7 +167,6 @@ def test_policies_that_see_are_predicted_and_run(
         seeing,
         calibration.simulator,
         networks_of([policy], greedy=True),
-        1,
         episodes=EPISODES,
         seed=roll_out_seed(1, 0, 0),
     )

@@ -44,10 +44,10 @@ def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_st
     environment = Animat(ROBOT, Thresholds(9), 5)
     assert (found.robot, found.mapping) == ("cartpole", "9-thresholds")
     assert found.best == best_return(environment, simulator, resolution=0.25, episodes=1000)
-    random = roll_out(environment, simulator, Uniform(), 1, episodes=4000, seed=9).returns
+    random = roll_out(environment, simulator, Uniform(), episodes=4000, seed=9).returns
     assert abs(found.random - random.mean()) < 4 * found.random_standard_error * 1.2
     for i in (0, 4):
-        constant = roll_out(environment, simulator, Constant(jnp.array([i])), 1, episodes=300, seed=2).returns
+        constant = roll_out(environment, simulator, Constant(jnp.array([i])), episodes=300, seed=2).returns
         assert constant.mean() < found.best.value
     assert "cartpole, 9-thresholds: random -" in found.to_text()
     json.dumps(found.to_dict())

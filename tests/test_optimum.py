@@ -173,7 +173,7 @@ def test_where_nothing_can_be_chosen_the_optimum_is_the_mean_return(robot: Robot
     """With the delivered condition drawn at random all policies are equivalent; their mean return is measured."""
     environment = ShuffledDelivery(Animat(robot, Thresholds(1), 5))
     found = best_return(environment, SIMULATOR, resolution=resolution, episodes=0)
-    returns = roll_out(environment, SIMULATOR, Uniform(), 1, episodes=8000, seed=5).returns
+    returns = roll_out(environment, SIMULATOR, Uniform(), episodes=8000, seed=5).returns
     error = float(returns.std() / math.sqrt(returns.size))
     assert abs(found.value - returns.mean()) < 4 * error + found.grid_error
 
@@ -207,7 +207,7 @@ def test_the_controller_reaches_the_value(robot: Robot[Any], mapping: Any) -> No
     assert not found.findings()
     assert found.without_clock < found.value + 4 * found.without_clock_standard_error
     for action in range(5):
-        constant = roll_out(environment, SIMULATOR, Constant(jnp.array([action])), 1, episodes=1000, seed=2).returns
+        constant = roll_out(environment, SIMULATOR, Constant(jnp.array([action])), episodes=1000, seed=2).returns
         assert constant.mean() - 4 * constant.std() / math.sqrt(1000) < found.value
 
 

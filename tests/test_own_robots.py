@@ -235,13 +235,23 @@ def test_a_quantity_is_of_texts_and_numbers(given: Any, words: str) -> None:
 
 
 def test_bounds_hold_from_the_start_of_an_episode_to_its_end() -> None:
-    """The first step leaves the bounds, which is allowed after the end of an episode, but not at the end itself."""
-    bounded = {"observation_spec": (Quantity("x", "m", 1.0, -1.0, 1.0),), "reset": lambda self, key: At(jnp.float32(1))}
-    after_the_end = lambda self, uniforms, state, u: (At(state.x_m + (u > -1)), u, u < 2)  # noqa: E731
-    check_robot(slider(**bounded, advance=after_the_end))
-    at_the_end = lambda self, uniforms, state, u: (At(state.x_m + 1.0), u, u < 2)  # noqa: E731
-    with pytest.raises(InvalidArgument, match="x: expected from -1 to 1, the bounds of its Quantity, got 2"):
-        check_robot(slider(**bounded, advance=at_the_end))
+    """Each step goes on from the state of the last, or from a start if that was the end of an episode."""
+    spec = (Quantity("x", "m", 1.0, -1.0, 1.0),)
+
+    def moving(start_m: float, end: Callable[[Any], Any]) -> Robot[Any]:
+        return slider(
+            observation_spec=spec,
+            reset=lambda self, key: At(jnp.float32(start_m)),
+            advance=lambda self, uniforms, state, u: (At(state.x_m + 0.6), u, end(u)),
+        )
+
+    never, at_once = (lambda u: u > 2), (lambda u: u < 2)
+    with pytest.raises(InvalidArgument, match=r"x: expected from -1 to 1, the bounds of its Quantity, got 1\.2"):
+        check_robot(moving(0.0, never))
+    check_robot(moving(0.0, at_once))
+    check_robot(dataclasses.replace(moving(0.0, never), episode_limit=1))
+    with pytest.raises(InvalidArgument, match=r"x: expected from -1 to 1, the bounds of its Quantity, got 1\.6"):
+        check_robot(moving(1.0, at_once))
     # What float32 rounds is not held against it, at a bound of 0 either.
     just_below = {"observation_spec": (Quantity("x", "m", 1.0, 0.0, 1.0),), "observe": lambda *_: jnp.full(1, -1e-9)}
     check_robot(slider(**just_below))

@@ -393,7 +393,7 @@ def test_in_a_loop_nothing_is_lost(pulses: int, tmp_path: Path, monkeypatch: pyt
 def test_constant_agents_cost_what_they_should_on_a_simulator() -> None:
     """Twenty iterations of each condition: independent of the table's own count."""
     episodes = roll_out(
-        Animat(Flat(), Thresholds(1), 3), coins(1, 5, 9), Constant(jnp.array([0, 1, 2])), 3, episodes=7, seed=1
+        Animat(Flat(), Thresholds(1), 3), coins(1, 5, 9), Constant(jnp.array([0, 1, 2])), episodes=7, seed=1
     )
     np.testing.assert_array_equal(episodes.presented, np.eye(3, dtype=int) * 7 * 20)
 

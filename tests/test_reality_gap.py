@@ -146,7 +146,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
     both = networks_of(list(policies.values()), greedy=True)
     simulators = [*(calibration.simulator for _ in range(ROLL_OUTS)), *calibration.bootstraps]
     rolled = [
-        roll_out(environment, simulator, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, i))
+        roll_out(environment, simulator, both, episodes=EPISODES, seed=roll_out_seed(1, 0, i))
         for i, simulator in enumerate(simulators)
     ]
     predicted = np.concatenate([each.returns for each in rolled[:ROLL_OUTS]], axis=1)
@@ -168,7 +168,7 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
         ("silent", environment, silenced(calibration.simulator)),
         ("shuffled", ShuffledDelivery(environment), calibration.simulator),
     ):
-        returns = roll_out(in_, on, both, 2, episodes=ROLL_OUTS * EPISODES, seed=1).returns.ravel()
+        returns = roll_out(in_, on, both, episodes=ROLL_OUTS * EPISODES, seed=1).returns.ravel()
         error = np.hypot(*(each.std() / np.sqrt(each.size) for each in (returns, rows[name].predicted)))
         assert abs(returns.mean() - rows[name].predicted.mean()) <= 4 * error
     assert not np.array_equal(rows["shuffled"].predicted, rows["random"].predicted)
@@ -387,7 +387,7 @@ def test_fixed_percentiles_are_the_same_in_all_bootstraps(tmp_path: Path, series
     both = networks_of(list(policies.values()), greedy=True)
     environment = Animat(policies["p0"].robot, Thresholds(1), 5)
     recorded = fit_timeline(series).at(series[-1].start_min)
-    rolled = roll_out(environment, recorded, both, 2, episodes=EPISODES, seed=roll_out_seed(1, 0, 0))
+    rolled = roll_out(environment, recorded, both, episodes=EPISODES, seed=roll_out_seed(1, 0, 0))
     np.testing.assert_array_equal(gap.rows[1].predicted[:EPISODES], rolled.returns[0])
     other, _ = run(tmp_path / "adaptive", series, with_controls=False, adaptive=True)
     assert not np.array_equal(gap.rows[0].bootstrap_means, other.rows[0].bootstrap_means)
@@ -495,7 +495,7 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
     rule = heuristic_policy(environment, culture)
 
     def returns(simulator: NeuronSimulator, episodes: int, seed: int) -> np.ndarray:
-        return roll_out(environment, simulator, rule, 1, episodes=episodes, seed=seed).returns.ravel()
+        return roll_out(environment, simulator, rule, episodes=episodes, seed=seed).returns.ravel()
 
     recordings, covered = 120, 0
     for seed in range(recordings):
@@ -524,9 +524,7 @@ def test_a_prediction_is_more_certain_with_more_recorded_responses() -> None:
     rule = heuristic_policy(environment, fit_empirical(drawn_responses(rng, 5_000)))
     for n in (50, 800):
         calibration = Calibration.of_series([drawn_responses(rng, n)])
-        means = [
-            roll_out(environment, s, rule, 1, episodes=2_000, seed=1).returns.mean() for s in calibration.bootstraps
-        ]
+        means = [roll_out(environment, s, rule, episodes=2_000, seed=1).returns.mean() for s in calibration.bootstraps]
         widths.append(np.std(means))
         percentiles = [np.asarray(s.percentiles) for s in calibration.bootstraps]
         assert np.ptp(percentiles, axis=0).min() > 0

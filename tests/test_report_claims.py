@@ -18,7 +18,7 @@ from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, with_links, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.over_time import Course, Courses, draw_over_time
+from animat.report.over_time import Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
@@ -444,10 +444,10 @@ def test_files_that_a_page_names_are_links() -> None:
 
 def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> None:
     minutes = np.array([0.0, 10.0])
-    courses = tuple(Course(f"c{i}", minutes, np.zeros((2, 2))) for i in range(8))
+    returns = {f"c{i}": np.zeros((2, 2)) for i in range(8)}
     panels = [
-        Courses("1-threshold", courses, np.zeros(2), np.ones(2), ((0.0, 1.1),)),
-        Courses("linear", (Course("linear", minutes, np.zeros((2, 2))),), np.zeros(2)),
+        Courses("1-threshold", minutes, returns, np.zeros(2), np.ones(2), {0.0: 1.1}),
+        Courses("linear", minutes, {"linear": np.zeros((2, 2))}, np.zeros(2)),
     ]
     figure = draw_over_time(panels, "cartpole", trained_until_min=5.0)
     said = legend(figure)
@@ -468,8 +468,8 @@ def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> N
 def test_the_legend_of_a_single_panel_is_whole() -> None:
     minutes = np.array([0.0, 10.0])
     names = ("before training", "without shadowing", "1 threshold")
-    courses = tuple(Course(name, minutes, np.ones((4, 2))) for name in names)
-    panel = Courses("1-threshold", courses, minutes, minutes, ((0.0, 1.0),))
+    returns = {name: np.ones((4, 2)) for name in names}
+    panel = Courses("1-threshold", minutes, returns, minutes, minutes, {0.0: 1.0})
     figure = draw_over_time([panel], "cartpole", trained_until_min=5.0)
     figure.canvas.draw()
     within = figure.legends[0].get_window_extent()

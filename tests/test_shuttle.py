@@ -68,13 +68,13 @@ def test_what_is_right_at_one_place_is_wrong_at_the_other(cue: float) -> None:
 
 def test_the_heuristic_stays_at_its_place_and_no_constant_command_gains() -> None:
     environment = WithoutNeurons(Shuttle(), None)
-    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=200, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), episodes=200, seed=1).returns
     # The way to the place's edge takes five to eight iterations of its 120.
     assert 112 <= by_rule.min() <= by_rule.max() <= 116
-    at_random = roll_out(environment, None, Uniform(), 1, episodes=2000, seed=1).returns[0]
+    at_random = roll_out(environment, None, Uniform(), episodes=2000, seed=1).returns[0]
     assert abs(at_random.mean()) < 4 * at_random.std() / math.sqrt(2000)
     two_ways = WithoutNeurons(Shuttle(), (-1.0, 1.0))
-    always = roll_out(two_ways, None, Constant(jnp.array([1])), 1, episodes=2000, seed=1).returns[0]
+    always = roll_out(two_ways, None, Constant(jnp.array([1])), episodes=2000, seed=1).returns[0]
     assert abs(always.mean()) < 4 * always.std() / math.sqrt(2000)
 
 
@@ -96,7 +96,7 @@ def test_a_goal_that_is_switched_is_another_one() -> None:
 @pytest.mark.oracle
 def test_of_two_goals_there_is_a_bit_to_know() -> None:
     environment = WithoutNeurons(Shuttle(), (-1.0, -0.5, 0.0, 0.5, 1.0))
-    found = goal_information(environment, None, heuristic_policy(environment, None), 1, draws=2)
+    found = goal_information(environment, None, heuristic_policy(environment, None), draws=2)
     assert found.most == 1.0
     assert found.bits.value == pytest.approx(1.0, abs=0.05)
 

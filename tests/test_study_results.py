@@ -186,9 +186,9 @@ def test_policies_are_evaluated_as_they_are_trained_on_the_minute_s_own_neurons(
     for at_min in (0.0, 140.0):
         seed = draw_seed(study.seed, "navigation", "control", at_min)
         for name, answering in (("own", at_min), ("other", 140.0 - at_min)):
-            ran = roll_out(environment, timeline.at(answering), networks, 2, episodes=7, seed=seed)
+            ran = roll_out(environment, timeline.at(answering), networks, episodes=7, seed=seed)
             expected[name, at_min] = ran.returns
-        expected["turned", at_min] = roll_out(turned, timeline.at(at_min), networks, 2, episodes=7, seed=seed).returns
+        expected["turned", at_min] = roll_out(turned, timeline.at(at_min), networks, episodes=7, seed=seed).returns
         returns = got[got["at_min"] == at_min]["return"].to_numpy().reshape(2, 7)
         np.testing.assert_allclose(returns, expected["own", at_min], rtol=1e-6)
         # So that the test can fail.

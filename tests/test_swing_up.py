@@ -141,8 +141,8 @@ def test_a_motor_that_needs_no_swing_is_reported_and_too_long_a_step_refused() -
 
 def test_the_heuristic_swings_it_up_and_keeps_it_there() -> None:
     environment = WithoutNeurons(SwingUp(), None)
-    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=2, seed=1).returns
-    at_random = roll_out(environment, None, Uniform(), 1, episodes=200, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), episodes=2, seed=1).returns
+    at_random = roll_out(environment, None, Uniform(), episodes=200, seed=1).returns
     assert by_rule.min() > 135 and at_random.mean() < 5
 
 
@@ -168,7 +168,7 @@ def test_a_state_is_where_its_coordinates_are() -> None:
 def test_the_optimum_is_at_least_the_heuristic_and_is_achieved() -> None:
     environment = WithoutNeurons(SwingUp(), (-1.0, 1.0))
     found = best_return(environment, None, resolution=0.5, episodes=2)
-    by_rule = roll_out(environment, None, heuristic_policy(environment, None), 1, episodes=2, seed=1).returns.mean()
+    by_rule = roll_out(environment, None, heuristic_policy(environment, None), episodes=2, seed=1).returns.mean()
     assert found.value + found.grid_error > by_rule > 120
     assert found.monte_carlo >= by_rule
     assert abs(found.monte_carlo - found.value) < 5

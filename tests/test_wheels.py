@@ -237,8 +237,8 @@ def test_surroundings_are_data() -> None:
 @pytest.mark.oracle
 def test_the_heuristic_finds_the_goal_between_the_obstacles() -> None:
     environment = WithoutNeurons(Wheels(), None)
-    by_rule = roll_out(environment, None, HeuristicPolicy(), 1, episodes=200, seed=1).returns
-    at_random = roll_out(environment, None, Uniform(), 1, episodes=200, seed=1).returns
+    by_rule = roll_out(environment, None, HeuristicPolicy(), episodes=200, seed=1).returns
+    at_random = roll_out(environment, None, Uniform(), episodes=200, seed=1).returns
     assert by_rule.mean() > 30 and at_random.mean() < -60
     assert np.mean(by_rule > 0) > 0.97
 

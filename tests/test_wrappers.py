@@ -107,7 +107,7 @@ class Tired(Wrapper[Any]):
 def test_a_custom_wrapper_remembers() -> None:
     """Up, down, up, down: the stairs have no end, but for the limit."""
     for environment in (Tired(EpisodeLimit(DIRECT_FOR_SEVEN)), EpisodeLimit(Tired(DIRECT_FOR_SEVEN))):
-        up = roll_out(environment, None, Constant(jnp.array([1])), 1, episodes=2, seed=0)
+        up = roll_out(environment, None, Constant(jnp.array([1])), episodes=2, seed=0)
         assert up.lengths.tolist() == [[7, 7]]
         assert not up.terminated.any()
 
@@ -149,7 +149,7 @@ class ByThePast(Actor):
 
 
 def mean_return(environment: Environment[Any], actor: Actor) -> float:
-    return float(roll_out(environment, contrary(), actor, 1, episodes=4000, seed=1).returns.mean())
+    return float(roll_out(environment, contrary(), actor, episodes=4000, seed=1).returns.mean())
 
 
 @pytest.mark.oracle
@@ -171,7 +171,7 @@ def test_a_policy_learns_to_go_by_the_past() -> None:
             beginning(jax.random.split(jax.random.key(1), 2)), contrary(), jnp.int32(0), jnp.int32(1000)
         )
         networks = Networks(learners.deployed, jnp.tile(environment.scales, (2, 1)), greedy=True)
-        episodes = roll_out(environment, contrary(), networks, 2, episodes=4000, seed=1)
+        episodes = roll_out(environment, contrary(), networks, episodes=4000, seed=1)
         reached[type(environment)] = episodes.returns.mean(axis=1)
     # Four standard errors of 4,000 episodes.
     np.testing.assert_allclose(reached[NeuralObservation], UP_AT_BEST, atol=0.015)

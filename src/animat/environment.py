@@ -100,7 +100,7 @@ class Environment(abc.ABC, Generic[RobotState]):
 
     def reset(self, key: PRNGKeyArray) -> State:
         """Start an episode."""
-        rest = jnp.zeros(() if self.robot.n_commands == 1 else self.robot.n_commands)
+        rest = jnp.zeros(self.robot.command_shape)
         delivered = rest if self.n_actions is None else jnp.int32(0)
         return State(
             self.robot.reset(key),

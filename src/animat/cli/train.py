@@ -232,7 +232,7 @@ def _random_return(training: Training, timeline: SimulatorTimeline | None) -> fl
     environment = training.environment(0 if timeline is None else len(timeline.conditions))
     simulator = None if timeline is None else timeline.at(float(timeline.start_min[0]))
     # As many episodes as in the final evaluation, which then reuses the compiled program.
-    return float(roll_out(environment, simulator, Uniform(), 1, episodes=100, seed=1).returns.mean())
+    return float(roll_out(environment, simulator, Uniform(), episodes=100, seed=1).returns.mean())
 
 
 def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from animat.closed_loop.adaptive import AdaptiveThresholds
 from animat.closed_loop.agents import Agent, Controller
 from animat.closed_loop.log import Record
 from animat.closed_loop.loop import Loop
-from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
+from animat.closed_loop.runner import runner_of
 from animat.closed_loop.stopping import Stop, ending_of
 from animat.closed_loop.stretch import Request, Stretch, check_answer, read_response, stretch_record
 from animat.closed_loop.tick import EndedBy, Ending, Handled, Tick
@@ -29,7 +29,6 @@ from animat.cultures.failures import describe_error
 from animat.errors import AnimatError, BudgetSpent
 from animat.neurons.history_tracker import HistoryState
 from animat.responses.extraction import SILENCE_S
-from animat.robots.host import HostRobot
 from animat.stimulation.schedule import TICK_S, on_ticks
 from animat.stimulation.stimulus import Stimulus
 
@@ -67,8 +66,7 @@ class Driver:
         loop, culture = self.loop, self.culture
         self.records: deque[Record] = deque()
         self._rng = np.random.default_rng([self.seed, 21])
-        runs = HostRunner if isinstance(loop.robot, HostRobot) else RobotRunner
-        self._runner: Runner = runs(loop.robot, np.random.default_rng([self.seed, 22]))
+        self._runner = runner_of(loop.robot, np.random.default_rng([self.seed, 22]))
         if any(agent.switch_at is not None for agent in self.agents):
             # Compile now, like its step.
             self._runner.switch_goal(0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -64,7 +64,7 @@ class RobotRunner:
         self._goals = jax.random.split(self._key)[1]
         # Compile now: in the middle of an episode it would take some hundred milliseconds.
         self.reset(0)
-        self.step(np.zeros(() if robot.n_commands == 1 else robot.n_commands))
+        self.step(np.zeros(robot.command_shape))
 
     def reset(self, number: int) -> Float64[np.ndarray, " observations"]:
         """Start an episode where the robot draws it, in the same state for the same number; returns the observation."""
@@ -113,4 +113,6 @@ class HostRunner:
         return self._bodies.picture()
 
 
-Runner: TypeAlias = RobotRunner | HostRunner
+def runner_of(robot: Robot[Any], rng: np.random.Generator) -> RobotRunner | HostRunner:
+    """The runner of a robot, in JAX or on the host."""
+    return HostRunner(robot, rng) if isinstance(robot, HostRobot) else RobotRunner(robot, rng)

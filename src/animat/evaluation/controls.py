@@ -13,7 +13,7 @@ from animat.environment import Animat, Environment
 from animat.evaluation.commands import mean_commands
 from animat.evaluation.coupling import best_coupling
 from animat.evaluation.heuristic import heuristic_policy
-from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
+from animat.evaluation.rollouts import Actor, Constant, Episodes, Networks, Uniform, roll_out
 from animat.neurons.simulator import NeuronSimulator, indifferent, silenced
 from animat.robots.host import HostRobot
 from animat.wrappers import (
@@ -38,7 +38,6 @@ class Control:
         name: `random`, `constant 5 Hz`, `heuristic`, `silent` or `shuffled`, or the name of an intervention.
         meaning: a short description.
         actor: one actor, or the policies side by side.
-        n_actors: their number.
         delivery: `"chosen"`: neurons get what was chosen; `"shuffled"`: a condition drawn at random in each iteration;
             `"silent"`: nothing; `"yoked"`: the stimuli of another episode.
         is_drawn: whether a random recorded response replaces the neurons' own.
@@ -50,7 +49,6 @@ class Control:
     name: str
     meaning: str
     actor: Actor
-    n_actors: int = 1
     delivery: Delivered = "chosen"
     is_drawn: bool = False
     is_turned_round: bool = False
@@ -76,6 +74,12 @@ class Control:
             environment = GoalSwitch(environment, self.switch_at)
         return environment, simulator
 
+    def run(
+        self, environment: Environment[Any], simulator: NeuronSimulator | None, *, episodes: int, seed: int
+    ) -> Episodes:
+        """Its episodes in the policies' environment and simulator, changed for it; errors as in `roll_out`."""
+        return roll_out(*self.within(environment, simulator), self.actor, episodes=episodes, seed=seed)
+
 
 RANDOM = Control("random", "any action, equally likely", Uniform())
 
@@ -85,7 +89,6 @@ def controls_of(
     simulator: NeuronSimulator | None,
     labels: Sequence[str],
     policies: Networks | None = None,
-    n_policies: int = 0,
 ) -> list[Control]:
     """The controls of an environment.
 
@@ -103,7 +106,7 @@ def controls_of(
         meaning = f"no learning: {action} of the robot's heuristic"
         controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
     if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
-        controls += _without_influence(policies, n_policies)
+        controls += _without_influence(policies)
     return controls
 
 
@@ -117,7 +120,6 @@ def interventions_of(
     environment: Environment[Any],
     simulator: NeuronSimulator,
     policies: Networks,
-    n_policies: int,
     *,
     switch_at: int | None = None,
 ) -> list[Control]:
@@ -136,14 +138,14 @@ def interventions_of(
     ideal = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
 
     def control(name: str, meaning: str, **change: Any) -> Control:
-        return Control(name, meaning, policies, n_policies, **change)
+        return Control(name, meaning, policies, **change)
 
     by_means = "each condition's mean command, stretched to the full range, in place of the response"
     at_random = "no pulse; a random recorded response in place of the neurons' own"
     changed = [
         control("ideal actuator", by_means, commands=ideal),
         control("random spikes", at_random, delivery="silent", is_drawn=True),
-        *_without_influence(policies, n_policies),
+        *_without_influence(policies),
     ]
     if not isinstance(environment.robot, HostRobot):
         changed.append(control("yoked", "the stimuli of another episode", delivery="yoked"))
@@ -153,10 +155,10 @@ def interventions_of(
     return changed
 
 
-def _without_influence(policies: Networks, n_policies: int) -> list[Control]:
+def _without_influence(policies: Networks) -> list[Control]:
     """Policies whose choices have no effect."""
     silent = "no pulse; only spontaneous activity is read (0 on a simulator)"
     return [
-        Control("silent", silent, policies, n_policies, "silent"),
-        Control("shuffled", "the delivered condition is drawn at random", policies, n_policies, "shuffled"),
+        Control("silent", silent, policies, "silent"),
+        Control("shuffled", "the delivered condition is drawn at random", policies, "shuffled"),
     ]

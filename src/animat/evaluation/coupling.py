@@ -117,8 +117,7 @@ def best_coupling(
         return Coupling(jnp.asarray(shaped, jnp.float32), inputs, means, kind, seen)
 
     def mean_returns(coupling: Coupling, episodes: int, seed: int) -> Float64[np.ndarray, " actors"]:
-        n = len(coupling.weights)
-        ran = roll_out(environment, simulator, coupling, n, episodes=episodes, seed=seed, alike=True)
+        ran = roll_out(environment, simulator, coupling, episodes=episodes, seed=seed, alike=True)
         if progress is not None:
             progress.update(next(rounds), len(KINDS) * (RESTARTS * (1 + GENERATIONS) + 1))
         return ran.returns.mean(axis=1)  # type: ignore[no-any-return]
@@ -164,7 +163,7 @@ def _near_heuristic(
     if not hasattr(robot, "heuristic"):
         return np.zeros((0, 0))
     policy = heuristic_policy(environment, simulator)
-    ran = trace(environment, simulator, policy, 1, episodes=EPISODES, seed=seed)
+    ran = trace(environment, simulator, policy, episodes=EPISODES, seed=seed)
     running = np.arange(robot.episode_limit) < ran.lengths[..., None]
     observed = ran.observations[..., :-1, : len(robot.observation_spec)][running]
     wanted = np.asarray(jax.vmap(capability(robot, "heuristic"))(observed), np.float64).reshape(len(observed), -1)

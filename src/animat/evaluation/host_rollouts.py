@@ -77,14 +77,14 @@ def paths_on_host(
     robot, n = environment.robot, len(keys)
     assert isinstance(robot, HostRobot)
     observations = np.zeros((n, robot.episode_limit + 1, len(robot.observation_spec)), np.float32)
-    of_each = () if robot.n_commands == 1 else (robot.n_commands,)
-    commands, lengths = np.zeros((n, robot.episode_limit, *of_each), np.float32), np.zeros(n, np.int64)
+    commands = np.zeros((n, robot.episode_limit, *robot.command_shape), np.float32)
+    lengths = np.zeros(n, np.int64)
     for number, key in enumerate(keys):
         actor, alone = jax.tree.map(lambda part, number=number: part[number : number + 1], actors), key[None]
         bodies = Bodies(robot, [(seed, number)])
         observations[number] = bodies.begin()
         for command, _, stepped in _iterations(environment, simulator, actor, alone, bodies):
-            commands[number, lengths[number]] = command[0].reshape(of_each)
+            commands[number, lengths[number]] = command[0].reshape(robot.command_shape)
             lengths[number] += 1
             observations[number, lengths[number] :] = stepped.observation
             if stepped.ended[0]:
@@ -156,13 +156,12 @@ def _bodies(robot: HostRobot, seeds: Sequence[tuple[int, ...]]) -> Bodies:
 def _zeros(environment: Environment[Any], simulator: NeuronSimulator | None, shape: tuple[int, int]) -> Counts:
     """Counts of 0, for `shape` = (actors, episodes)."""
     n = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    commands = () if environment.robot.n_commands == 1 else (environment.robot.n_commands,)
     return Counts(
         np.zeros(shape),
         np.zeros(shape, np.int64),
         np.zeros(shape, bool),
         np.zeros((shape[0], n), np.int64),
-        np.zeros((shape[0], n, *commands)),
+        np.zeros((shape[0], n, *environment.robot.command_shape)),
     )
 
 

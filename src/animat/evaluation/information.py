@@ -53,7 +53,6 @@ def goal_information(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
     actors: Actor,
-    n_actors: int,
     *,
     draws: int = DRAWS,
     seed: int = 1,
@@ -78,15 +77,15 @@ def goal_information(
     if environment.n_actions is None:
         raise InvalidArgument("environment: expected discrete actions for goal information, got continuous ones")
     rng = np.random.default_rng([seed, 41])
-    traced = trace(environment, simulator, actors, n_actors, episodes=EPISODES, seed=seed)
+    traced = trace(environment, simulator, actors, episodes=EPISODES, seed=seed)
     when = (rng.random(traced.lengths.shape) * traced.lengths).astype(np.int64)
     rows, columns = np.indices(when.shape)
     states = jax.tree.map(lambda x: x[rows, columns, when], traced.states)
     key = jax.random.key(int(rng.integers(2**31)))
-    actions = np.asarray(_at_each_goal(environment, draws, states, actors, jax.random.split(key, n_actors)))
+    actions = np.asarray(_at_each_goal(environment, draws, states, actors, jax.random.split(key, actors.n_actors)))
     bits = conditional_information(actions.reshape(-1, *actions.shape[2:]), environment.n_actions)
     # The samples are the actors, or the states of a single actor.
-    samples = bits.reshape(when.shape).mean(axis=1) if n_actors > 1 else bits
+    samples = bits.reshape(when.shape).mean(axis=1) if len(when) > 1 else bits
     pairs = actions[..., :2].reshape(len(bits), -1, 2)
     null = [
         _plug_in(rng.permuted(pairs.reshape(len(bits), -1), axis=1).reshape(pairs.shape), environment.n_actions).mean()

@@ -13,7 +13,7 @@ from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.evaluation.controls import Control, interventions_of
 from animat.evaluation.information import DRAWS, GoalInformation, goal_information, interval_of_mean
-from animat.evaluation.rollouts import Networks, roll_out
+from animat.evaluation.rollouts import Networks
 from animat.evaluation.statistics import Interval
 from animat.evaluation.traces import Traces, trace
 from animat.neurons.simulator import NeuronSimulator
@@ -118,7 +118,6 @@ def run_interventions(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
     policies: Networks,
-    n_policies: int,
     *,
     episodes: int,
     seed: int,
@@ -135,27 +134,27 @@ def run_interventions(
     if simulator is None or not isinstance(unwrapped(environment), Animat):
         raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")
     progress, draws = progress or Silent(), 2 if policies.greedy else DRAWS
-    plain = Control(AS_THEY_ARE, "through the culture's simulator", policies, n_policies)
-    usual = roll_out(environment, simulator, policies, n_policies, episodes=episodes, seed=seed)
+    plain = Control(AS_THEY_ARE, "through the culture's simulator", policies)
+    usual = plain.run(environment, simulator, episodes=episodes, seed=seed)
     has_goals = hasattr(environment.robot, "with_goal_of")
-    switch_at = max(1, int(np.median(usual.lengths)) // 2) if has_goals else None
-    acting = [plain, *interventions_of(environment, simulator, policies, n_policies, switch_at=switch_at)]
+    switch_at = usual.half_way if has_goals else None
+    acting = [plain, *interventions_of(environment, simulator, policies, switch_at=switch_at)]
     rows = []
     for number, control in enumerate(acting):
         progress.update(number, len(acting), control.name)
-        within = control.within(environment, simulator)
-        ran = usual if control is plain else roll_out(*within, policies, n_policies, episodes=episodes, seed=seed)
+        ran = usual if control is plain else control.run(environment, simulator, episodes=episodes, seed=seed)
         lost = usual.returns - ran.returns
         information = None
         if has_goals and control.name in WITH_INFORMATION:
-            information = goal_information(*within, policies, n_policies, draws=draws, seed=seed)
-        samples = lost.mean(axis=1) if n_policies > 1 else lost[0]
+            within = control.within(environment, simulator)
+            information = goal_information(*within, policies, draws=draws, seed=seed)
+        samples = lost.mean(axis=1) if len(lost) > 1 else lost[0]
         rows.append(InterventionRow(control.name, control.meaning, ran.returns, interval_of_mean(samples), information))
     turning = None
     if switch_at is not None:
         # The same episodes, with the same random numbers, with and without a switch.
         usual_trace, switched = (
-            trace(*each.within(environment, simulator), policies, n_policies, episodes=TRACED_EPISODES, seed=seed)
+            trace(*each.within(environment, simulator), policies, episodes=TRACED_EPISODES, seed=seed)
             for each in (plain, acting[-1])
         )
         turning = _switch_effect(usual_trace, switched, switch_at)

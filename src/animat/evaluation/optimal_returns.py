@@ -89,9 +89,9 @@ def optimal_returns(
         best[i] = of_case.with_interval(best[i], resamples=resamples, progress=Part(resampling, i, 1, n), **options)
     optima: list[OptimalReturn] = []
     for mapping, case, optimum in zip(mappings, cases, best, strict=True):
-        random = roll_out(*case, Uniform(), 1, episodes=episodes, seed=seed).returns[0]
+        random = roll_out(*case, Uniform(), episodes=episodes, seed=seed).returns[0]
         coupling = best_coupling(*case, seed=seed, progress=Part(searching, len(optima), 1, n))
-        of_coupling = roll_out(*case, coupling, 1, episodes=episodes, seed=seed).returns[0]
+        of_coupling = roll_out(*case, coupling, episodes=episodes, seed=seed).returns[0]
         gap = context_gap(of_coupling, random, optimum)
         optima.append(
             OptimalReturn(robot.name, mapping.name, float(random.mean()), standard_error(random), optimum, gap)

@@ -37,6 +37,12 @@ class Actor(abc.ABC):
     def act(self, environment: Environment[Any], observation: Seen, uniforms: Uniforms) -> Array:
         """An action for each observation (scaled), from uniforms in [0, 1), as `draw_action` does."""
 
+    @property
+    def n_actors(self) -> int:
+        """How many run side by side: the length of the first axis of all its arrays; 1 without arrays."""
+        arrays = jax.tree.leaves(self)
+        return len(arrays[0]) if arrays else 1
+
 
 @final
 @partial(jax.tree_util.register_dataclass, data_fields=["network", "scales"], meta_fields=["greedy"])
@@ -119,6 +125,11 @@ class Episodes:
     commanded: Float64[np.ndarray, "actors conditions *commands"]
     outcome: Outcome | None = None
 
+    @property
+    def half_way(self) -> int:
+        """Half of the median episode, in iterations; at least one."""
+        return max(1, int(np.median(self.lengths)) // 2)
+
 
 def check_seed(seed: int) -> None:
     """Refuse a seed of more than 32 bits (InvalidArgument): JAX uses no more, so two could give the same draws."""
@@ -157,7 +168,6 @@ def roll_out(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
     actors: Actor,
-    n_actors: int,
     *,
     episodes: int,
     seed: int,
@@ -175,6 +185,7 @@ def roll_out(
     Raises:
         InvalidArgument: for fewer than one episode or more than fit, or a seed of more than 32 bits.
     """
+    n_actors = actors.n_actors
     check_at_once("episodes", episodes, n_actors)
     check_seed(seed)
     keys = jax.random.split(jax.random.key(seed), 1 if alike else n_actors)
@@ -196,7 +207,6 @@ def _roll_out(
     keys: Key[Array, " actors"],
 ) -> tuple[Any, ...]:
     n_conditions = 0 if simulator is None or environment.n_actions is None else environment.n_actions
-    commands = () if environment.robot.n_commands == 1 else (environment.robot.n_commands,)
     n_drawn = environment.n_drawn
 
     def begin(key: PRNGKeyArray) -> tuple[tuple[Any, ...], Key[Array, " iterations"]]:
@@ -207,7 +217,7 @@ def _roll_out(
             jnp.zeros(episodes),
             jnp.zeros(episodes, jnp.int32),
             jnp.zeros(n_conditions, jnp.int32),
-            jnp.zeros((n_conditions, *commands)),
+            jnp.zeros((n_conditions, *environment.robot.command_shape)),
             jnp.zeros(episodes, bool),
         )
         return carry, jax.random.split(key, environment.robot.episode_limit)

@@ -18,7 +18,7 @@ from animat.evaluation.coupling import ContextGap, context_gap, least_context_ga
 from animat.evaluation.interventions import InterventionTable, run_interventions
 from animat.evaluation.optimum import Optimum, best_return
 from animat.evaluation.resampling import WellSampled
-from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.rollouts import networks_of
 from animat.evaluation.row import Row
 from animat.evaluation.statistics import Interval, normalised_score
 from animat.evaluation.verdict import Verdict
@@ -237,15 +237,15 @@ def evaluate(
     body, progress = robot or first.robot, progress or Silent()
     world = _World.of(first, body, timeline, at_min)
     within = world.environment, world.simulator
-    networks, n = networks_of(list(policies.values()), greedy=greedy), len(policies)
+    networks = networks_of(list(policies.values()), greedy=greedy)
     # Those trained as a control run as one here too: their choices have no effect.
     is_control = first.mapping is not None and first.delivery == "shuffled"
     meaning = "as trained: the delivered condition is drawn at random" if is_control else "as trained"
-    trained = Control("policies", meaning, networks, n, delivery="shuffled" if is_control else "chosen")
+    trained = Control("policies", meaning, networks, delivery="shuffled" if is_control else "chosen")
     labels = [condition.label for condition in first.conditions]
     if first.mapping is None:
         labels = [f"{command:+g}" for command in first.commands or ()]
-    all_controls = controls_of(*within, labels, networks, n)
+    all_controls = controls_of(*within, labels, networks)
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)
@@ -273,7 +273,7 @@ def evaluate(
     work = None
     if interventions:
         phase = in_phase(progress, "whose work it is")
-        work = run_interventions(*trained.within(*within), networks, n, episodes=episodes, seed=seed, progress=phase)
+        work = run_interventions(*trained.within(*within), networks, episodes=episodes, seed=seed, progress=phase)
     for best in (optimum, net_optimum):
         findings += () if best is None else tuple(best.findings())
     return Evaluation(
@@ -321,12 +321,10 @@ class _World:
         return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings)
 
     def row_of(self, control: Control, *, episodes: int, seed: int) -> Row:
-        environment, simulator = control.within(self.environment, self.simulator)
-        ran = roll_out(environment, simulator, control.actor, control.n_actors, episodes=episodes, seed=seed)
-        changed = environment is not self.environment or simulator is not self.simulator
+        ran = control.run(self.environment, self.simulator, episodes=episodes, seed=seed)
         of_trials = self._electrode_pulses()
         pulses = None if of_trials is None else ran.presented @ of_trials * (control.delivery != "silent") / episodes
-        return Row(control.name, control.meaning, ran, changed, pulses, self.first.pulse_cost)
+        return Row(control.name, control.meaning, ran, control.delivery != "chosen", pulses, self.first.pulse_cost)
 
     def optimum(self, resolution: float, seed: int, progress: Progress) -> Optimum:
         """The optimal return; if responses are known, with its interval and without conditions with few responses."""

@@ -37,12 +37,12 @@ def trace(
     environment: Environment[Any],
     simulator: NeuronSimulator | None,
     actors: Actor,
-    n_actors: int,
     *,
     episodes: int,
     seed: int,
 ) -> Traces:
     """Run episodes of each actor on a robot in JAX; arguments as in `animat.evaluation.rollouts.roll_out`."""
+    n_actors = actors.n_actors
     keys = jax.random.split(jax.random.key(seed), n_actors * episodes).reshape(n_actors, episodes)
     traced: Traces = jax.device_get(_trace(environment, simulator, actors, keys))
     return traced

@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from animat.columns import align_columns
-from animat.environment import Environment
 from animat.evaluation.controls import Control
-from animat.evaluation.rollouts import roll_out
 from animat.evaluation.statistics import CONFIDENCE, Interval
-from animat.neurons.simulator import NeuronSimulator
 from animat.reality_gap.row import Row, resampled_means
 from animat.records import as_json
 
@@ -42,25 +39,10 @@ class Intervention:
         return vars(self) | {"lost": as_json(self.lost.to_dict())}
 
 
-def half_an_episode(policies: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int) -> int:
-    """Half of the policies' median episode on the simulator, in iterations; at least one."""
-    ran = roll_out(environment, simulator, policies.actor, policies.n_actors, episodes=EPISODES, seed=seed)
-    return max(1, int(np.median(ran.lengths)) // 2)
-
-
-def run_ideal_actuator(
-    ideal: Control, environment: Environment[Any], simulator: NeuronSimulator, seed: int
-) -> tuple[str, Float64[np.ndarray, " episodes"]]:
-    """The meaning of an ideal actuator, and returns of policies with one in place of the culture."""
-    within = ideal.within(environment, simulator)
-    ran = roll_out(*within, ideal.actor, ideal.n_actors, episodes=EPISODES, seed=seed)
-    return ideal.meaning, np.asarray(ran.returns, np.float64).ravel()
-
-
 def intervention_table(
-    rows: Sequence[Row], meaning_of_ideal: str, with_ideal: Float64[np.ndarray, " episodes"]
+    rows: Sequence[Row], ideal: Control, with_ideal: Float64[np.ndarray, " episodes"]
 ) -> tuple[Intervention, ...]:
-    """The table: the simulator, an ideal actuator (`run_ideal_actuator`), then the measured interventions.
+    """The table: the simulator, an ideal actuator with its returns on it, then the measured interventions.
 
     The session's rows have the policies first; without a complete episode of theirs it is empty.
     """
@@ -71,7 +53,7 @@ def intervention_table(
     lost = _lost(usual_returns, with_ideal)
     table = [
         Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
-        Intervention("ideal actuator", meaning_of_ideal, False, float(with_ideal.mean()), lost),
+        Intervention(ideal.name, ideal.meaning, False, float(with_ideal.mean()), lost),
     ]
     for row in (measured[name] for name in MEASURED if name in measured):
         lost = _lost(usual_returns, row.measured)

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from animat.environment import Environment
 from animat.evaluation.controls import Control, Delivered
-from animat.evaluation.rollouts import Episodes, Uniform, roll_out
+from animat.evaluation.rollouts import Episodes, Uniform
 from animat.progress import Progress, Silent
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.session_responses import CommandSums
@@ -89,9 +89,8 @@ def predict(
     acting = [policies, *map(_with_random_actor, controls)]
 
     def run(number: int, on: int) -> Episodes:
-        control, drawn = acting[number], roll_out_seed(seed, number, on)
-        within = control.within(environment, simulators[on])
-        return roll_out(*within, control.actor, control.n_actors, episodes=episodes_each, seed=drawn)
+        drawn = roll_out_seed(seed, number, on)
+        return acting[number].run(environment, simulators[on], episodes=episodes_each, seed=drawn)
 
     predictions: dict[str, Prediction] = {}
     # A hanging body on the host is only noticed in the main thread (`animat.robots.host.time_limit`).
@@ -108,7 +107,9 @@ def predict(
             returns = np.array([each.returns for each in episodes])
             presented = np.array([each.presented for each in episodes])
             total = np.array([each.commanded for each in episodes]).reshape(*presented.shape, -1)
-            rows = {control.name: [*range(control.n_actors)]} if number else {name: [i] for i, name in enumerate(names)}
+            rows = {name: [i] for i, name in enumerate(names)}
+            if number:
+                rows = {control.name: [*range(control.actor.n_actors)]}
             for name, of in rows.items():
                 each = CommandSums(presented[:, of], total[:, of]).summed(1)
                 predictions[name] = Prediction(
@@ -135,7 +136,7 @@ def _with_random_actor(control: Control) -> Control:
     if control.delivery not in ("silent", "shuffled"):
         return control
     delivery: Delivered = "silent" if control.delivery == "silent" else "chosen"
-    return replace(control, actor=Uniform(), n_actors=1, delivery=delivery)
+    return replace(control, actor=Uniform(), delivery=delivery)
 
 
 def _program_of(control: Control) -> tuple[Hashable, ...]:

@@ -36,7 +36,7 @@ from animat.evaluation.verdict import compare_episodes
 from animat.goals.tally import Outcome
 from animat.progress import Progress, in_phase
 from animat.reality_gap.calibration import Calibration
-from animat.reality_gap.interventions import half_an_episode, intervention_table, run_ideal_actuator
+from animat.reality_gap.interventions import EPISODES, intervention_table
 from animat.reality_gap.optimum import begin_optimum, wait_for_optimum
 from animat.reality_gap.outlook import outlook
 from animat.reality_gap.predicting import BOOTSTRAPS_ON_HOST, ROLL_OUTS, Prediction, episodes_on_host, pool, predict
@@ -118,14 +118,14 @@ def run_policies(
     animat = Animat(loop.robot, loop.mapping, len(loop.conditions))
     environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
     simulator = calibration.simulator
-    networks, n_policies = networks_of(list(policies.values()), greedy=greedy), len(policies)
-    trained, controls = Control("policies", "as trained", networks, n_policies), [RANDOM]
+    networks = networks_of(list(policies.values()), greedy=greedy)
+    trained, controls = Control("policies", "as trained", networks), [RANDOM]
     lacks = lacking(loop.robot)
     if with_controls:
         if "heuristic" in lacks:
             findings += (Finding("no-heuristic", "note", lacks["heuristic"]),)
         labels = [condition.label for condition in loop.conditions]
-        controls = controls_of(environment, simulator, labels, networks, n_policies)
+        controls = controls_of(environment, simulator, labels, networks)
         # The heuristic stays last: random numbers depend on the place.
         controls.sort(key=lambda control: control.name == "heuristic")
     if with_coupling:
@@ -137,16 +137,17 @@ def run_policies(
             raise InvalidArgument(
                 f"--interventions: expected a robot in JAX, got {loop.robot.name}, which is stepped on the host"
             )
-        half = half_an_episode(trained, environment, simulator, seed)
-        of_ideal, *changed = interventions_of(environment, simulator, networks, n_policies, switch_at=half)
-        ideal = run_ideal_actuator(of_ideal, environment, simulator, seed)
+        simulated = {"episodes": EPISODES, "seed": seed}
+        half_way = trained.run(environment, simulator, **simulated).half_way
+        actuator, *changed = interventions_of(environment, simulator, networks, switch_at=half_way)
+        ideal = actuator, actuator.run(environment, simulator, **simulated).returns.ravel()
         controls += [each for each in changed if each.name not in ("silent", "shuffled")]
     acting = {name: Greedy(policy) if greedy else policy for name, policy in policies.items()}
     pooled = np.concatenate(calibration.responses_hz)
     agents = [Agent(name, trained.meaning, controller) for name, controller in acting.items()]
     agents += [agent_of(control, animat, acting, pooled) for control in controls]
 
-    of_each = planned_episodes(n_policies, len(controls), episodes)
+    of_each = planned_episodes(len(policies), len(controls), episodes)
     check_session(culture, loop, agents, of_each, seed)
 
     why_no_optimum = _why_no_optimum(loop, calibration)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,36 +15,29 @@ _MOST = len(PALETTE)
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """The returns of one arm: the mean return of each policy at each recording, with the recordings' minutes."""
-
-    name: str
-    minutes: Float64[np.ndarray, " recordings"]
-    returns: Float64[np.ndarray, "policies recordings"]
-
-    @property
-    def quartiles(self) -> Float64[np.ndarray, "3 recordings"]:
-        """Lower quartile, median and upper quartile over policies at each recording."""
-        return np.asarray(np.quantile(self.returns, [0.25, 0.5, 0.75], axis=0), np.float64)
-
-
-@dataclass(frozen=True, eq=False)
 class Courses:
-    """The arms of one mapping, with their common return of random actions and optimal return.
+    """The arms of one mapping over time, with their common return of random actions and optimal return.
 
     Attributes:
         title: the mapping.
-        courses: of the arms, with the same minutes.
-        random: return of random actions at these minutes.
-        optimum: optimal return on a coarse grid at these minutes; None if not known.
-        fine_optimum: pairs of a minute and the optimal return on a fine grid, for some minutes.
+        minutes: of the recordings.
+        returns: mean return of each policy at each recording, by the arm's name.
+        random: return of random actions at each recording.
+        optimum: optimal return on a coarse grid at each recording; None if not known.
+        fine_optimum: optimal return on a fine grid at some of the minutes.
     """
 
     title: str
-    courses: tuple[Course, ...]
+    minutes: Float64[np.ndarray, " recordings"]
+    returns: Mapping[str, Float64[np.ndarray, "policies recordings"]]
     random: Float64[np.ndarray, " recordings"]
     optimum: Float64[np.ndarray, " recordings"] | None = None
-    fine_optimum: tuple[tuple[float, float], ...] = ()
+    fine_optimum: Mapping[float, float] = field(default_factory=dict)
+
+
+def quartiles(returns: Float64[np.ndarray, "policies recordings"]) -> Float64[np.ndarray, "3 recordings"]:
+    """Lower quartile, median and upper quartile over policies at each recording."""
+    return np.asarray(np.quantile(returns, [0.25, 0.5, 0.75], axis=0), np.float64)
 
 
 def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_min: float) -> Figure:
@@ -53,23 +46,23 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
     The end of training on the culture's clock is marked.
     """
     figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 3.4, title, share_x=True)
-    names = list(dict.fromkeys(course.name for of in panels_of for course in of.courses[:_MOST]))
+    names = list(dict.fromkeys(name for of in panels_of for name in list(of.returns)[:_MOST]))
     for axes, of in zip(panels, panels_of, strict=True):
-        for course in of.courses[:_MOST]:
-            colour = PALETTE[names.index(course.name) % _MOST]
-            low, middle, high = course.quartiles
-            axes.fill_between(course.minutes, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.plot(course.minutes, middle, color=colour, marker="o", markersize=3, label=course.name)
-        minutes = of.courses[0].minutes
+        minutes = of.minutes
+        for name, returns in list(of.returns.items())[:_MOST]:
+            colour = PALETTE[names.index(name) % _MOST]
+            low, middle, high = quartiles(returns)
+            axes.fill_between(minutes, low, high, color=colour, alpha=0.2, linewidth=0)
+            axes.plot(minutes, middle, color=colour, marker="o", markersize=3, label=name)
         if of.optimum is not None:
-            name = "optimal return, coarse grid"
-            axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=name)
+            label = "optimal return, coarse grid"
+            axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=label)
         if of.fine_optimum:
-            points = zip(*of.fine_optimum, strict=True)
+            points = list(of.fine_optimum), list(of.fine_optimum.values())
             axes.plot(*points, "D", color=OPTIMUM, markersize=4, label="optimal return, fine grid")
         axes.plot(minutes, of.random, color=GREY, linestyle=":", linewidth=1.3, label="random actions")
         axes.axvline(trained_until_min, color=GREY, linewidth=1.0, label="end of training")
-        left_out = len(of.courses) - _MOST
+        left_out = len(of.returns) - _MOST
         more = f" ({left_out} more arms in the tables)" if left_out > 0 else ""
         style_axes(axes, f"{of.title}{more}", "recording (min)", "return")
     add_common_legend(figure, panels, columns=3)

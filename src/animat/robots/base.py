@@ -120,6 +120,12 @@ class Robot(abc.ABC, Generic[State]):
     episode_limit: int
     """Iterations after which an episode is cut off."""
 
+    @final
+    @property
+    def command_shape(self) -> tuple[int, ...]:
+        """The shape of a motor command: (), or (n_commands,) for several."""
+        return () if self.n_commands == 1 else (self.n_commands,)
+
     @property
     @abc.abstractmethod
     def observation_spec(self) -> tuple[Quantity, ...]:
@@ -141,7 +147,7 @@ class Robot(abc.ABC, Generic[State]):
         Args:
             uniforms: random numbers in [0, 1), shape (noise_size,).
             state: before the iteration.
-            u: the motor command in [-1, 1]; several have shape (n_commands,).
+            u: the motor command in [-1, 1], of `command_shape`.
 
         Returns:
             the state after the iteration, the reward in the task's own units, and whether the task ended.

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections import Counter
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,6 @@ def check_robot(robot: Robot[Any]) -> None:
 def _check_compiled(robot: Robot[Any]) -> None:
     """Cached per robot: compiling its episode takes some tenths of a second."""
     name, observations, noise = type(robot).__name__, len(robot.observation_spec), robot.noise_size
-    one_command = () if robot.n_commands == 1 else (robot.n_commands,)
     heuristic = getattr(robot, "heuristic", None)
 
     def outputs_of(state: Any, reward: Any) -> tuple[Any, ...]:
@@ -53,13 +52,13 @@ def _check_compiled(robot: Robot[Any]) -> None:
         return state, observation, jnp.asarray(reward, jnp.float32), values.get("potential", 0.0)
 
     def episode(key: Any) -> Any:
-        state = _call(f"{name}.reset", robot.reset, key)
-        outputs, ends, commands = [outputs_of(state, 0.0)], [], []
+        first = state = _call(f"{name}.reset", robot.reset, key)
+        outputs, commands = [outputs_of(state, 0.0)], []
         # Commands at both ends and in the middle.
-        for u in np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32):
-            uniforms = jnp.full(noise, 0.5, jnp.float32)
+        for number, u in enumerate(np.linspace(-1.0, 1.0, _STEPS, dtype=np.float32), 1):
+            uniforms, given = jnp.full(noise, 0.5, jnp.float32), jnp.full(robot.command_shape, u)
             expected = f"it to run under jax.jit with {noise} uniforms (noise_size)"
-            step = _call(f"{name}.advance", robot.advance, uniforms, state, jnp.full(one_command, u), expected=expected)
+            step = _call(f"{name}.advance", robot.advance, uniforms, state, given, expected=expected)
             if not isinstance(step, tuple) or len(step) != 3:
                 raise InvalidArgument(f"{name}.advance: expected (state, reward, whether it ended), got {shown(step)}")
             after, reward, ended = step
@@ -67,12 +66,14 @@ def _check_compiled(robot: Robot[Any]) -> None:
             _expect_shape(f"{name}.advance: reward", reward, (), "a number")
             _expect_shape(f"{name}.advance: whether it ended", ended, (), "true or false", bool)
             outputs.append(outputs_of(after, reward))
-            ends.append(ended)
             if heuristic is not None:
                 command = _call(f"{name}.heuristic", heuristic, outputs[-1][1])
-                _expect_shape(f"{name}.heuristic", command, one_command, "a command")
+                _expect_shape(f"{name}.heuristic", command, robot.command_shape, "a command")
                 commands.append(jnp.asarray(command, jnp.float32))
-        return outputs, ends, commands
+            # After its end an episode starts again.
+            is_over = jnp.logical_or(ended, number % robot.episode_limit == 0)
+            state = jax.tree.map(partial(jnp.where, is_over), first, after)
+        return outputs, commands
 
     def run(key: Any) -> Any:
         # Traced twice, by functions that JAX takes to be different: a value kept from the first trace fails in the
@@ -81,7 +82,7 @@ def _check_compiled(robot: Robot[Any]) -> None:
         return jax.device_get(jax.jit(episode)(key))
 
     try:
-        outputs, ends, commands = _call(name, run, jax.random.key(0))
+        outputs, commands = _call(name, run, jax.random.key(0))
     except InvalidArgument as error:
         # Without the note that JAX adds.
         raise InvalidArgument(str(error)) from error.__cause__
@@ -92,8 +93,7 @@ def _check_compiled(robot: Robot[Any]) -> None:
         for what, value in zip(("a state", "an observation", "a reward", "a potential"), values, strict=True):
             if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(value)):
                 raise InvalidArgument(f"{name}: expected finite numbers, got NaN or infinite ones in {what}")
-    last = [*ends, True].index(True)
-    for _, observation, *_ in outputs[: last + 2]:
+    for _, observation, *_ in outputs:
         for number, quantity in zip(observation, robot.observation_spec, strict=True):
             within = np.clip(number, quantity.low, quantity.high)
             # Up to rounding in float32.

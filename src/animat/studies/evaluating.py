@@ -41,19 +41,19 @@ class Evaluate(StudyTask):
         study, timeline, first, last = as_recorded(self.study, folder)
         setting = setting_of(study, self.spec, self.arm, timeline)
         networks = _networks(study, folder, self.spec, self.arm)
-        robot, slug, n = self.spec.name, self.arm.slug, study.policies
+        robot, slug = self.spec.name, self.arm.slug
         parts = []
         for at_min, episodes in study.minutes_of(self.arm, first, last).items():
-            ran = setting.run(networks, n, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
+            ran = setting.run(networks, at_min, episodes, draw_seed(study.seed, robot, slug, at_min))
             parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min))
         if self.arm.through_neurons and timeline is not None:
             for i, at_min in enumerate(timeline.start_min.tolist()):
                 progress.update(i, len(timeline), "over time")
                 seed = draw_seed(study.seed, robot, slug, at_min, "over time")
-                ran = setting.run(networks, n, at_min, study.episodes_over_time, seed)
+                ran = setting.run(networks, at_min, study.episodes_over_time, seed)
                 parts.append(episode_rows(ran, robot=robot, arm=self.arm.name, at_min=at_min, over_time=True))
         seed = draw_seed(study.seed, robot, slug, last, "paths")
-        paths = record_paths(setting.environment, setting.simulator(last), networks, n, seed)
+        paths = record_paths(setting.environment, setting.simulator(last), networks, seed)
         return [
             write_episodes(episodes_file(folder, self.spec, self.arm), parts),
             write_arrays(paths_file(folder, self.spec, self.arm), vars(paths)),
@@ -88,21 +88,20 @@ class Control(StudyTask):
         for i, at_min in enumerate(minutes):
             progress.update(i, len(minutes), f"at {at_min:g} min")
             simulator = setting.simulator(at_min)
-            for each in controls_of(setting.environment, simulator, setting.action_labels, networks, study.policies):
+            for each in controls_of(setting.environment, simulator, setting.action_labels, networks):
                 seed = draw_seed(study.seed, robot, name, at_min, _SEED_NAMES.get(each.name, each.name))
-                within = each.within(setting.environment, simulator)
-                ran = roll_out(*within, each.actor, each.n_actors, episodes=study.episodes, seed=seed)
+                ran = each.run(setting.environment, simulator, episodes=study.episodes, seed=seed)
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=each.name))
         if timeline is not None and arm.through_neurons:
             if networks is not None and not isinstance(setting.environment.robot, HostRobot):
                 progress.update(len(minutes), len(minutes) + 1, "best coupling")
                 seeds = [draw_seed(study.seed, robot, name, last, COUPLING, part) for part in ("search", "episodes")]
                 coupling = best_coupling(setting.environment, setting.simulator(last), seed=seeds[0])
-                ran = setting.run(coupling, 1, last, study.episodes, seeds[1])
+                ran = setting.run(coupling, last, study.episodes, seeds[1])
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=last, agent=COUPLING))
             for at_min in timeline.start_min.tolist():
                 seed = draw_seed(study.seed, robot, name, at_min, "over time")
-                ran = setting.run(Uniform(), 1, at_min, study.episodes, seed)
+                ran = setting.run(Uniform(), at_min, study.episodes, seed)
                 parts.append(episode_rows(ran, robot=robot, arm=through, at_min=at_min, agent=RANDOM, over_time=True))
         return [write_episodes(controls_file(folder, self.spec, arm), parts)]
 
@@ -118,9 +117,9 @@ class Setting(NamedTuple):
         """The simulator at a minute."""
         return None if self.timeline is None else self.timeline.at(at_min)
 
-    def run(self, actor: Actor, n: int, at_min: float, episodes: int, seed: int) -> Episodes:
+    def run(self, actor: Actor, at_min: float, episodes: int, seed: int) -> Episodes:
         """Run episodes at a minute."""
-        return roll_out(self.environment, self.simulator(at_min), actor, n, episodes=episodes, seed=seed)
+        return roll_out(self.environment, self.simulator(at_min), actor, episodes=episodes, seed=seed)
 
 
 def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimeline | None) -> Setting:

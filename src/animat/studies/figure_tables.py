@@ -13,7 +13,7 @@ from animat.recordings.recording import Recording
 from animat.report.array import rates_of_sites
 from animat.report.drift import PERCENTILES, Drift
 from animat.report.learning_curves import LearningCurve, mean_with_interval
-from animat.report.over_time import Courses
+from animat.report.over_time import Courses, quartiles
 from animat.responses.psth import PostStimulusHistogram
 from animat.responses.responses import Responses
 from animat.studies.paths import Paths
@@ -102,12 +102,11 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
     head = ("mapping", "arm", "at_min", "policies", "lower_quartile", "median", "upper_quartile", "random")
     rows = []
     for panel in panels:
-        fine = dict(panel.fine_optimum)
-        for course in panel.courses:
-            for i, at_min in enumerate(course.minutes.tolist()):
+        for arm, returns in panel.returns.items():
+            for i, at_min in enumerate(panel.minutes.tolist()):
                 levels = (None if each is None else float(each[i]) for each in (panel.random, panel.optimum))
-                known = panel.title, course.name, at_min, len(course.returns), *course.quartiles[:, i].tolist()
-                rows.append((*known, *levels, fine.get(at_min)))
+                known = panel.title, arm, at_min, len(returns), *quartiles(returns)[:, i].tolist()
+                rows.append((*known, *levels, panel.fine_optimum.get(at_min)))
     return _write(folder, f"{robot}-over-time", (*head, "optimum_rough_grid", "optimum_fine_grid"), rows)
 
 

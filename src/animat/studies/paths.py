@@ -39,13 +39,11 @@ class Paths:
         ]
 
 
-def record_paths(
-    environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, n_actors: int, seed: int
-) -> Paths:
+def record_paths(environment: Environment[Any], simulator: NeuronSimulator | None, actors: Actor, seed: int) -> Paths:
     """Run one episode of each actor; arguments as for `animat.evaluation.rollouts.roll_out`."""
     if isinstance(environment.robot, HostRobot):
-        keys = jax.random.split(jax.random.key(seed), n_actors)
+        keys = jax.random.split(jax.random.key(seed), actors.n_actors)
         return Paths(*paths_on_host(environment, simulator, actors, keys, seed))
-    traced = trace(environment, simulator, actors, n_actors, episodes=1, seed=seed)
+    traced = trace(environment, simulator, actors, episodes=1, seed=seed)
     observations, commands, lengths = (each[:, 0] for each in (traced.observations, traced.commands, traced.lengths))
     return Paths(observations, commands, lengths.astype(np.int64))

@@ -21,7 +21,7 @@ from animat.report.controls import draw_controls
 from animat.report.drift import draw_drift, drift_of
 from animat.report.episodes import draw_frames, draw_paths
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
-from animat.report.over_time import Course, Courses, draw_over_time
+from animat.report.over_time import Courses, draw_over_time
 from animat.report.psth import draw_psth
 from animat.report.raster import draw_raster
 from animat.report.response_histograms import draw_response_histograms
@@ -181,22 +181,15 @@ def _courses(known: References, rough: References, timeline: SimulatorTimeline) 
     over_time = rows_where(known.table, agent=POLICY, over_time=True)
     panels = []
     for kind in (kind for kind in kinds_of(known.study) if kind.through_neurons):
-        courses = []
+        returns = {}
         for arm in known.study.arms_of(kind):
             of_minute = rows_where(over_time, arm=arm.name).groupby("at_min")
-            returns = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
-            courses.append(Course(arm.name, np.array(every_min), returns))
+            returns[arm.name] = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
+        random = np.array([rough.random(kind, at_min) for at_min in every_min])
         optimum = [rough.best_return(kind, at_min) for at_min in every_min]
-        fine = ((at_min, known.best_return(kind, at_min)) for at_min in every_min)
-        panels.append(
-            Courses(
-                mapping_label(*kind.kind),
-                tuple(courses),
-                np.array([rough.random(kind, at_min) for at_min in every_min]),
-                None if optimum[0] is None else np.array(optimum, np.float64),
-                tuple((at_min, best) for at_min, best in fine if best is not None),
-            )
-        )
+        fine = {at_min: best for at_min in every_min if (best := known.best_return(kind, at_min)) is not None}
+        coarse = None if optimum[0] is None else np.array(optimum, np.float64)
+        panels.append(Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, coarse, fine))
     return panels
 
 

@@ -139,8 +139,7 @@ def expect_varied(robot: Robot[Any], varying: Varying) -> None:
     def once(value: Any, name: str) -> Any:
         varied = with_parameters(robot, {name: value})
         state = varied.reset(jax.random.key(0))
-        command = jnp.zeros(() if robot.n_commands == 1 else robot.n_commands)
-        after, reward, _ = varied.advance(jnp.zeros(robot.noise_size), state, command)
+        after, reward, _ = varied.advance(jnp.zeros(robot.noise_size), state, jnp.zeros(robot.command_shape))
         return varied.observe(after), reward
 
     for name in varying.parameters:

@@ -115,14 +115,14 @@ class TrainTrials(StudyTask):
                 together.save_checkpoint(checkpoint)
                 written = time.monotonic()
 
-        environment, n = training.environment_on(timeline), len(self.members)
+        environment = training.environment_on(timeline)
         simulator = _at(judging, training.minute(CHUNKS - 1))
         files = []
         for i, trial in enumerate(self.trials):
             networks = together.networks(i, greedy=self.study.actions == "most probable")
             returns: list[float] | None = None
             if networks is not None:
-                ran = roll_out(environment, simulator, networks, n, episodes=self.episodes, seed=self.seeds[1])
+                ran = roll_out(environment, simulator, networks, episodes=self.episodes, seed=self.seeds[1])
                 means = ran.returns.mean(axis=1)
                 returns = means.tolist() if np.isfinite(means).all() else None
             file = returns_file(place, trial, last, self.members[0])

@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from animat.closed_loop.runner import HostRunner, RobotRunner, Runner
+from animat.closed_loop.runner import runner_of
 from animat.environment import Animat, Environment, WithoutNeurons
 from animat.errors import InvalidArgument
 from animat.evaluation.rollouts import check_seed
 from animat.neurons.timeline import SimulatorTimeline
 from animat.report.film.scene import Moment, Scene
 from animat.report.film.session import USUAL_S
-from animat.robots.host import HostRobot
 from animat.training.policy import Policy, first_of_alike
 from animat.wrappers import ShuffledDelivery
 
@@ -64,8 +63,7 @@ def scene_of_policies(
     respond = jax.jit(environment.respond)
     state = environment.reset(jax.random.key(seed))
     rng, runner_seed = np.random.default_rng([seed, 1]), (seed, 22)
-    runner_type = HostRunner if isinstance(robot, HostRobot) else RobotRunner
-    runner: Runner = runner_type(robot, np.random.default_rng(runner_seed))
+    runner = runner_of(robot, np.random.default_rng(runner_seed))
     time_s, moments = 0.0, list[Moment]()
     for episode, (name, policy) in enumerate(policies.items()):
         if time_s >= to_s:
