@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, did_you_mean, some_of
+from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_text_table
@@ -159,8 +159,14 @@ def _electrodes(table: TextTable, place: int) -> Column:
     lists = []
     for row, cell in enumerate(table.text(place)):
         try:
-            lists.append([int(electrode) for electrode in cell.split()])
+            electrodes = [int(word) for word in cell.split()]
+            # Refuses what 64 bits cannot hold.
+            lists.append(np.array(electrodes, dtype=np.int64).tolist())
         except (ValueError, OverflowError) as error:
             expected = "whole numbers separated by spaces"
             raise table.wrong(row, f"stimulus_electrodes: expected {expected}, got {cell[:40]!r}") from error
-    return padded(lists)
+    try:
+        return padded(lists)
+    except UnusableData as error:
+        # The file of the stimuli, not that of the spikes.
+        raise InvalidFile(f"{table.path}: {error}") from error
