@@ -107,7 +107,7 @@ class PlainColumns:
                 lengths[name] = len(column)
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
-            only = f"only the {len(fired):,} channels that fired count"
+            only = f"only the channels that fired ({len(fired):,}) count"
             message = f"no channel table: {only}, so rates per channel may be too high"
             noted.append(Finding("silent-channels-unknown", "warning", message, float(len(fired))))
             return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
