@@ -166,7 +166,7 @@ class Hdf5File:
         lengths = np.diff(ends, prepend=0)
         if np.any(lengths < 0) or lengths.sum() != n_values:
             raise InvalidFile(
-                f"{self.path}: /{where}_index does not divide the {n_values:,} values of {where}: damaged"
+                f"{self.path}: /{where}_index does not divide the {n_values:,} values of /{where}: damaged"
             )
         return lengths
 
