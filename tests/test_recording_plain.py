@@ -261,6 +261,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
         {"stimulus_electrodes": np.array([[3, -1], [-7, -1]])},
         "stimulus_electrodes: expected electrode numbers, .* got -7",
     ),
+    "a pulse without order": ({"presentation_pulses": 1}, "presentation_order: expected 'blocked' or 'mixed'"),
     "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: required to know which 5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected text, got 1"),
@@ -447,7 +448,7 @@ BAD_CSV = {
     "blanks between columns": ("time channel\n1 2\n", None, "separate the columns by commas, semicolons or tabs"),
     "a spreadsheet's first line": ("sep=;\ntime;channel\n1;2\n", None, "remove this first line"),
     "a quote that is not closed": (
-        'time_s,channel\n0.1,a\n0.2,"b\n0.3,c\n',
+        'time_s,channel\n0.1,a\n0.2,"b\n0.3,c\n\n\n',
         None,
         "line 3: expected a quote to be closed",
     ),
@@ -462,6 +463,16 @@ BAD_CSV = {
         "time,channel\n1,2\n",
         "time,electrodes\n1,left\n",
         "stimulus_electrodes: expected whole numbers separated by spaces",
+    ),
+    "an electrode beyond 64 bits": (
+        "time,channel\n1,2\n",
+        "time,electrodes\n1,5\n2,99999999999999999999\n",
+        "a_stimuli.csv, line 3: stimulus_electrodes: expected whole numbers",
+    ),
+    "one long list of electrodes among many": (
+        "time,channel\n1,2\n",
+        f"time,electrodes\n1,{'7 ' * 3000}\n" + "2,7\n" * 20_000,
+        "a_stimuli.csv: stimulus_electrodes: expected a few electrodes per stimulus, got 3000",
     ),
     "negative frequency": (
         "time,channel\n1,2\n",

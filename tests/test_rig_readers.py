@@ -13,10 +13,12 @@ import pytest
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
+from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Presentation
+from animat.tables import UNKNOWN
 from rig_files import (
     BITS,
     FIRST_FRAME,
@@ -358,6 +360,40 @@ def test_absurd_sizes_are_refused_before_memory_is_allocated(tmp_path: Path, sha
         file.create_dataset("units/spike_times", shape, "f8", chunks=(1024,) + (1,) * (len(shape) - 1))
     with pytest.raises(InvalidFile, match=r"claims [\d,]+ values, more than a file of"):
         read_recording(path)
+
+
+def test_a_chunk_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["uV_per_sample_unit"] = 0.2
+        chunks = (16_000_000, 64)
+        file.create_dataset("samples", (50, 64), "<i2", maxshape=(None, 64), chunks=chunks, compression="gzip")
+    with pytest.raises(InvalidFile, match="samples is stored in chunks of an absurd size"):
+        open_traces(tmp_path / "a.h5")
+
+
+def test_a_column_that_is_empty_by_type_is_named(tmp_path: Path) -> None:
+    path = other_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "r+") as file:
+        del file["units/spike_times"]
+        file["units/spike_times"] = h5py.Empty("f8")
+    with pytest.raises(InvalidFile, match="expected values at units/spike_times, got an empty dataspace"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("ends", "electrodes"),
+    [((2, 3), [[5, 6], [7, UNKNOWN]]), ((2,), None), ((2, 1), None), ((2, 9), None), ((-1, 2), None)],
+)
+def test_stimuli_whose_electrodes_have_no_sound_index_are_read_without(
+    tmp_path: Path, ends: tuple[int, ...], electrodes: list[list[int]] | None
+) -> None:
+    path = other_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "r+") as file:
+        at = "stimulus/presentation/pulses/electrodes"
+        file[at], file[f"{at}_index"] = np.array([5, 6, 7]), np.array(ends)
+    stimuli = read_recording(path).stimuli
+    assert stimuli.time_s.tolist() == [0.25, 0.75]
+    assert stimuli.electrodes.tolist() == (electrodes or [[UNKNOWN], [UNKNOWN]])
 
 
 def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> None:

@@ -54,6 +54,9 @@ class VirtualCulture(ComputedCulture):
             stay silent, and unseen.
         limits: tighter limits than `SIMULATED_LIMITS`.
         progress: updated during the scan.
+
+    Raises:
+        InvalidArgument: for an invalid setting.
     """
 
     name: ClassVar[str] = "virtual"
@@ -270,7 +273,8 @@ class VirtualCulture(ComputedCulture):
         known = int(time_ns_of.searchsorted(end_ns))
         self._held_ns, self._held_neuron = time_ns_of[known:], neuron[known:]
         self._now_ns = end_ns
-        self.fired = time_s, neuron = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
+        time_s, neuron = (time_ns_of[:known] - start_ns) / NS, neuron[:known]
+        self.fired = time_s, neuron
         return Observed(
             start_s=(start_ns - self._zero_ns) / NS,
             duration_s=(end_ns - start_ns) / NS,

@@ -74,9 +74,11 @@ class PlainColumns:
         start_s = float(event_s.min(initial=0.0) if self.start_s is None else self.start_s)
         stop_s = float(event_s.max(initial=start_s))
         presentation = None
-        if self.presentation_order is not None or self.presentation_pulses is not None:
+        if self.presentation_order is not None:
             pulses = 1 if self.presentation_pulses is None else self.presentation_pulses
             presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
+        elif self.presentation_pulses is not None:
+            raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
         return Recording(
             spike_times_s=spike_time_s,
             spike_channels=rows[in_time],
@@ -105,7 +107,8 @@ class PlainColumns:
                 lengths[name] = len(column)
         if not lengths:
             fired, rows = np.unique(values, return_inverse=True)
-            message = f"no channel table: the {len(fired):,} that fired count as all; rates per channel may be too high"
+            only = f"only the channels that fired ({len(fired):,}) count"
+            message = f"no channel table: {only}, so rates per channel may be too high"
             noted.append(Finding("silent-channels-unknown", "warning", message, float(len(fired))))
             return _channel_table(fired.astype(np.str_), None, None), rows.reshape(-1).astype(np.int64)
         if len(set(lengths.values())) > 1:
@@ -158,7 +161,8 @@ class PlainColumns:
         given = np.full(n, UNKNOWN) if self.stimulus_electrodes is None else np.asarray(self.stimulus_electrodes)
         electrodes = given[:, None] if given.ndim == 1 else given
         if electrodes.ndim != 2 or len(electrodes) != n:
-            raise UnusableData(f"stimulus_electrodes: expected ({n}, electrodes), padded, got {electrodes.shape}")
+            expected = f"shape ({n}, electrodes), padded with {UNKNOWN}"
+            raise UnusableData(f"stimulus_electrodes: expected {expected}, got {electrodes.shape}")
         whole = _whole("stimulus_electrodes", electrodes)
         if whole.min(initial=UNKNOWN) < NOTHING:
             expected = f"electrode numbers, with {UNKNOWN} for unknown and {NOTHING} for nothing delivered"

@@ -96,7 +96,10 @@ def read_source(
     stimuli: str | None = None,
     part: str | None = None,
 ) -> Recording | ResponseTable:
-    """Read any source of responses: a recording, or a response table without spikes; see `read_recording`."""
+    """Read any source of responses: a recording, or a response table without spikes.
+
+    Arguments and errors are those of `read_recording`.
+    """
     path = Path(path)
     begin = first_bytes(path)
     if begin.startswith((HDF5, ZIP)) and stimuli_path is not None:

@@ -201,8 +201,8 @@ class CL1Culture(Culture):
             outcome = "what had not begun was interrupted"
             try:
                 # The one that is open now: this session may have ended while the delivery hung.
-                if self._session is not None:
-                    self._session.interrupt()
+                if (now_open := self._session) is not None:
+                    now_open.interrupt()
             except Exception as failed:
                 outcome = (
                     f"and it could not be interrupted ({describe_error(failed)}): make sure it gives no more pulses"

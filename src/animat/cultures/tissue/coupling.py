@@ -112,7 +112,8 @@ class Coupling:
         )
 
     def _join_reaches(self, places: tuple[tuple[int, int], ...]) -> Reach:
-        return Reach(*map(np.concatenate, zip(*map(self._reach_of_one, places), strict=True)))
+        reaches = [self._reach_of_one(place) for place in places]
+        return Reach(*(np.concatenate(columns) for columns in zip(*reaches, strict=True)))
 
     def _find_reach(self, place: tuple[int, int]) -> Reach:
         parameters, network = self._parameters, self._network

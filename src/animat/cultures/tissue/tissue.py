@@ -46,6 +46,9 @@ class Tissue:
         x_um, y_um: position of each neuron along the array's long and short side, shape (neurons,).
         is_excitatory: type of each neuron, shape (neurons,).
         step_ns: the time step.
+
+    Raises:
+        InvalidArgument: for a negative seed.
     """
 
     def __init__(self, seed: int, parameters: TissueParameters | None = None) -> None:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -14,7 +15,7 @@ from animat.errors import InvalidArgument
 from animat.progress import Progress, Silent
 from animat.recordings.detection.band import MARGIN_S, band_pass
 from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
-from animat.recordings.detection.pieces import read_piece
+from animat.recordings.detection.pieces import Piece, read_piece
 from animat.recordings.detection.settings import Detection
 from animat.recordings.findings import Finding
 from animat.recordings.raw import RawTraces
@@ -81,38 +82,24 @@ def detect_spikes(
     stimulus = np.unique(np.rint((times_s - traces.start_s) * rate_hz)).astype(np.int64)
     workers = workers or len(os.sched_getaffinity(0))
     noise_uv, level_uv = _noise_and_level_uv(traces, stimulus, settings, workers)
-    margin, length = round(MARGIN_S * rate_hz), max(round(settings.chunk_s * rate_hz), 1)
-    apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
-    depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
+    length = max(round(settings.chunk_s * rate_hz), 1)
 
-    def of_piece(start: int) -> tuple[np.ndarray, np.ndarray, int, np.ndarray, np.ndarray]:
-        piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), margin)
-        samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
-        for columns in blocks(len(noise_uv)):
-            cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
-            filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
-            if cleaned.is_blank.any():
-                filtered[cleaned.is_blank] = 0.0
-            end = margin + piece.stop - piece.start
-            row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, margin, end)
-            samples.append(sample - margin + piece.start)
-            channels.append(row + columns.start)
-            # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
-            saturation[:, 0] += cleaned.saturated * piece.owned
-            saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
-        return np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost
+    def search(start: int) -> _Found:
+        piece = read_piece(traces, stimulus, start, min(start + length, traces.samples), round(MARGIN_S * rate_hz))
+        return _search(piece, noise_uv, level_uv, rate_hz, settings)
 
     samples, channels = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     saturations, lost = np.zeros((len(stimulus), 2)), np.zeros(len(noise_uv), np.int64)
     starts = range(0, traces.samples, length)
     with ThreadPoolExecutor(workers) as pool:
-        for done, (sample, channel, first, saturation, lost_in_it) in enumerate(pool.map(of_piece, starts), start=1):
-            samples.append(sample)
-            channels.append(channel)
-            its = saturations[first : first + len(saturation)]
-            its[:, 0] += saturation[:, 0]
-            its[:, 1] = np.maximum(its[:, 1], saturation[:, 1])
-            lost += lost_in_it
+        # If one fails, or on Ctrl-C, the pieces that wait are given up.
+        for done, found in enumerate(pool.map(search, starts), start=1):
+            samples.append(found.sample)
+            channels.append(found.channel)
+            its = saturations[found.first_stimulus : found.first_stimulus + len(found.saturation)]
+            its[:, 0] += found.saturation[:, 0]
+            its[:, 1] = np.maximum(its[:, 1], found.saturation[:, 1])
+            lost += found.lost
             progress.update(done, len(starts), f"{sum(map(len, samples)):,} spikes")
     sample, channel = np.concatenate(samples), np.concatenate(channels)
     order = np.lexsort((channel, sample))
@@ -161,6 +148,41 @@ def _noise_and_level_uv(
     with ThreadPoolExecutor(workers) as pool:
         pieces = list(pool.map(of_piece, starts.tolist()))
     return np.asarray(np.median(pieces, axis=0), dtype=np.float32)
+
+
+class _Found(NamedTuple):
+    """The spikes of a piece; how many channels each of its stimuli saturates, and for how many ms; lost samples."""
+
+    sample: Int64[np.ndarray, " spikes"]
+    channel: Int64[np.ndarray, " spikes"]
+    first_stimulus: int
+    saturation: Float64[np.ndarray, "stimuli 2"]
+    lost: Int64[np.ndarray, " channels"]
+
+
+def _search(
+    piece: Piece,
+    noise_uv: Float32[np.ndarray, " channels"],
+    level_uv: Float32[np.ndarray, " channels"],
+    rate_hz: float,
+    settings: Detection,
+) -> _Found:
+    depth_uv = np.where(is_dead(noise_uv), np.inf, settings.threshold * noise_uv).astype(np.float32)
+    apart = max(round(settings.dead_time_ms * 1e-3 * rate_hz), 1)
+    first, last = piece.margin, piece.margin + piece.stop - piece.start
+    samples, channels, saturation = [], [], np.zeros((len(piece.stimulus), 2))
+    for columns in blocks(len(noise_uv)):
+        cleaned = piece.cleaned(columns, noise_uv[columns], level_uv[columns], rate_hz, settings)
+        filtered = _filtered(cleaned.voltage_uv, settings, rate_hz)
+        if cleaned.is_blank.any():
+            filtered[cleaned.is_blank] = 0.0
+        row, sample = find_negative_peaks(filtered, depth_uv[columns], apart, first, last)
+        samples.append(sample - first + piece.start)
+        channels.append(row + columns.start)
+        # Channels are counted only in the piece that a pulse starts in; the duration is seen in any of them.
+        saturation[:, 0] += cleaned.saturated * piece.owned
+        saturation[:, 1] = np.maximum(saturation[:, 1], cleaned.longest_ms)
+    return _Found(np.concatenate(samples), np.concatenate(channels), piece.first_stimulus, saturation, piece.lost)
 
 
 def _filtered(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from animat.errors import InvalidFile, did_you_mean, some_of
+from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
 from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_text_table
@@ -156,11 +156,18 @@ def plain_column(table: TextTable, place: int, name: str) -> Column:
 
 
 def _electrodes(table: TextTable, place: int) -> Column:
-    lists = []
-    for row, cell in enumerate(table.text(place)):
+    lists, cells = [], table.text(place)
+    expected = "stimulus_electrodes: expected whole numbers separated by spaces"
+    for row, cell in enumerate(cells):
         try:
             lists.append([int(electrode) for electrode in cell.split()])
-        except (ValueError, OverflowError) as error:
-            expected = "whole numbers separated by spaces"
-            raise table.wrong(row, f"stimulus_electrodes: expected {expected}, got {cell[:40]!r}") from error
-    return padded(lists)
+        except ValueError as error:
+            raise table.wrong(row, f"{expected}, got {cell[:40]!r}") from error
+    try:
+        return padded(lists)
+    except OverflowError as error:
+        row = next(row for row, electrodes in enumerate(lists) if max(map(abs, electrodes), default=0) >= 2**63)
+        raise table.wrong(row, f"{expected}, of at most 64 bits, got {cells[row][:40]!r}") from error
+    except UnusableData as error:
+        # The file of the stimuli, not that of the spikes.
+        raise InvalidFile(f"{table.path}: {error}") from error

@@ -22,6 +22,7 @@ SPARE_VALUES = 1_000_000
 """Values that any file may hold, however small it is; each one beyond them must take at least a byte."""
 LARGEST_VALUES = 200_000_000
 LARGEST_ITEM_BYTES = 2**16
+LARGEST_CHUNK_BYTES = 2**28
 DAMAGE = (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError, AttributeError)
 """Errors that h5py and numpy raise on damaged files."""
 
@@ -81,7 +82,7 @@ class Hdf5File:
         return tuple(node.dtype.names or ()) if isinstance(node, h5py.Dataset) else ()
 
     def dataset(self, where: str) -> h5py.Dataset:
-        """A dataset; refused if there is none, or its values are in other files."""
+        """A dataset; refused if there is none, it holds no values, or they are in other files or in absurd chunks."""
         node = self.node(where)
         if not isinstance(node, h5py.Dataset):
             raise InvalidFile(f"{self.path}: expected a dataset at {where}, found {'a group' if node else 'nothing'}")
@@ -91,6 +92,11 @@ class Hdf5File:
                 f"{self.path}: expected the values of {where} in the file itself, but they are in other files, which "
                 "are never opened; copy all data into one file"
             )
+        if node.shape is None:
+            raise InvalidFile(f"{self.path}: expected values at {where}, got an empty dataspace")
+        # HDF5 reads whole chunks, and raw traces are read in the program's own process.
+        if math.prod(node.chunks or ()) * node.dtype.itemsize > LARGEST_CHUNK_BYTES:
+            raise InvalidFile(f"{self.path}: {where} is stored in chunks of an absurd size: the file is damaged")
         return node
 
     def read(self, where: str, field: str | None = None) -> Column:
@@ -159,7 +165,9 @@ class Hdf5File:
         ends = self.read(f"{where}_index").astype(np.int64).reshape(-1)
         lengths = np.diff(ends, prepend=0)
         if np.any(lengths < 0) or lengths.sum() != n_values:
-            raise InvalidFile(f"{self.path}: /{where}_index does not divide the {n_values:,} values of it: damaged")
+            raise InvalidFile(
+                f"{self.path}: /{where}_index does not divide the {n_values:,} values of /{where}: damaged"
+            )
         return lengths
 
 

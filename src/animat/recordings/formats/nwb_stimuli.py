@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from typing import Any
 
 import h5py
@@ -106,9 +107,12 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
         return None
     values = file.read(at).astype(np.int64)
     if file.has(f"{at}_index"):
-        lengths = file.row_lengths(at, values.size)
-        rows = [row.tolist() for row in np.split(values.reshape(-1), np.cumsum(lengths))[:-1]]
-        return padded(rows) if len(rows) == n else None
+        ends = [0, *file.read(f"{at}_index").astype(np.int64).reshape(-1).tolist()]
+        # Stimuli are not refused for an index that does not fit: their electrodes are then unknown.
+        if len(ends) != n + 1 or sorted(ends) != ends or ends[-1] > len(values) or values.size != len(values):
+            return None
+        flat = values.reshape(-1).tolist()
+        return padded([flat[start:end] for start, end in pairwise(ends)])
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
 
 

@@ -120,7 +120,8 @@ def read_text_table(path: Path, bare: str | None = None) -> TextTable:
         raise InvalidFile(f"{path}: expected a header line and one line per event, got an empty file")
     # To the reader, a quote that is not closed goes on to the end.
     if (spanned := rows[-1][-1].rstrip().count("\n")) and not text.rstrip().endswith('"'):
-        raise InvalidFile(f"{path}, line {lines[-1] - spanned}: expected a quote to be closed, got none")
+        line = text.rstrip().count("\n") + 1 - spanned
+        raise InvalidFile(f"{path}, line {line}: expected a quote to be closed, got none")
     header = [name.strip() for name in rows[0]]
     if bare is not None and len(header) == 1 and is_number(header[0]):
         header = [bare]
