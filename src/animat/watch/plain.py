@@ -41,6 +41,11 @@ def settings(values: dict[str, Any]) -> str:
     return ", ".join(f"{text(name, 40)} {short(value)}" for name, value in values.items())
 
 
+def listed(value: Any) -> list[Any]:
+    """A list; empty for anything else."""
+    return value if isinstance(value, list) else []
+
+
 def mapped(value: Any) -> dict[str, Any]:
     """A dictionary; empty for anything else."""
     return value if isinstance(value, dict) else {}
