@@ -28,6 +28,9 @@ class Slider(gymnasium.Env[Any, Any]):
             self.action_space = Dict(a=SEEN) if fault == "dict" else MultiBinary(3)
         elif fault == "unbounded":
             self.action_space = Box(-np.inf, np.inf, (1,), np.float32)
+        elif fault in ("many levels", "no dimension", "many dimensions"):
+            size = {"no dimension": 0, "many dimensions": 65}.get(fault)
+            self.action_space = Discrete(2000) if size is None else Box(-1.0, 1.0, (size,), np.float32)
         elif fault == "dict seen":
             self.observation_space = Dict(a=SEEN)
         elif fault == "unknown scale":
@@ -72,6 +75,9 @@ for name, fault in (
     ("Dict", "dict"),
     ("MultiBinary", "multi-binary"),
     ("Unbounded", "unbounded"),
+    ("ManyLevels", "many levels"),
+    ("NoDimension", "no dimension"),
+    ("ManyDimensions", "many dimensions"),
     ("DictSeen", "dict seen"),
     ("UnknownScale", "unknown scale"),
     ("Remembers", "remembers"),

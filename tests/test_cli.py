@@ -451,7 +451,7 @@ BAD = {
     "a misspelt setting": (
         nothing,
         [*TRAIN, "{folder}/none", "--sac", "tau=0.01", "discuont=0.98"],
-        ["--sac: discuont: no such setting", "did you mean discount?"],
+        ["--sac: discuont: no such setting; expected", "did you mean discount?"],
     ),
     "a setting of no name": (
         nothing,

@@ -77,6 +77,17 @@ def episodes_of(environment: Any, simulator: Any = SIMULATOR, actor: Actor = BES
     return roll_out(environment, simulator, actor, episodes=2000, seed=5).returns[0]
 
 
+@dataclass(frozen=True)
+class Delayed(Animat[Any]):
+    delay: int = 2
+
+
+def test_an_environment_of_ones_own_may_have_more_attributes() -> None:
+    own = Delayed(ENVIRONMENT.robot, ENVIRONMENT.mapping, ENVIRONMENT.n_conditions)
+    for each in interventions_of(own, SIMULATOR, BEST, 1, switch_at=4):  # type: ignore[arg-type]
+        assert each.within(own, SIMULATOR)[0].n_actions == own.n_actions
+
+
 @pytest.mark.oracle
 def test_each_intervention_does_what_it_says() -> None:
     usual = episodes_of(ENVIRONMENT)

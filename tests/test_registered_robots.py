@@ -215,6 +215,20 @@ def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> No
         train(Training(Here(), None, algorithm=SMALL), None, package / "out")
 
 
+def test_ours_are_listed_first(package: Path) -> None:
+    robot_named(ROVER)
+    assert registry.REGISTRY.names() == (
+        "arm",
+        "cartpole",
+        "detour",
+        "navigation",
+        "shuttle",
+        "swing-up",
+        "wheels",
+        "rover",
+    )
+
+
 def test_an_installed_package_announces_its_robots(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = [EntryPoint("rover", ROVER, "animat.robots"), EntryPoint("tank", ROVER, "animat.robots")]
 

@@ -11,6 +11,7 @@ import pytest
 from animat.cli import main
 from animat.errors import InvalidFile
 from animat.training.specification import CHUNKS
+from animat.tuning.journal import JOURNAL, read_journal
 from animat.tuning.space import Range, own_settings, with_settings
 from animat.tuning.specification import Tune, read_tuning
 
@@ -134,3 +135,11 @@ def test_without_optuna_the_extra_is_named(
 def test_an_invalid_setting_of_a_study_is_reported_as_without_tune(tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match="polcies: no such setting at the top"):
         read_tuning(written(tmp_path, f"polcies = 3\n{PLAIN}"))
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "true", '"1"'])
+def test_a_journal_with_a_return_that_is_no_finite_number_is_refused(tmp_path: Path, number: str) -> None:
+    line = f'{{"trial": 0, "settings": {{}}, "state": "complete", "chunks": [60], "returns": [[{number}]]}}'
+    (tmp_path / JOURNAL).write_text(line + "\n")
+    with pytest.raises(InvalidFile, match=r"journal\.jsonl: .*returns: expected a (finite )?number.*remove it to run"):
+        read_journal(tmp_path)

@@ -16,12 +16,14 @@ import pytest
 from animat.errors import InvalidFile
 from animat.execution.jobs import PLANNED, Job
 from animat.execution.receipts import Receipt
+from animat.execution.task import NOTICES, UNFINISHED
 from animat.recordings.reading import read_recording
 from animat.responses.inspection import inspect_recording
 from animat.studies.context import plan_context_study
 from animat.studies.context_tasks import ContextStudy
 from animat.studies.plan import plan_study
 from animat.studies.toml import read_study
+from animat.training.policy import CURVE
 from animat.watch.cultures import CulturesView
 from animat.watch.recording import RecordingView
 from animat.watch.state import is_locked
@@ -298,3 +300,31 @@ def test_a_folder_is_locked_during_a_run(tmp_path: Path) -> None:
     with exclusive_lock(tmp_path):
         assert is_locked(tmp_path)
     assert not is_locked(tmp_path)
+
+
+def test_a_strange_file_beside_a_run_is_left_out_and_the_rest_is_shown(tmp_path: Path) -> None:
+    training = {"robot": {"name": "cartpole"}, "policies": 2, "iterations": 6000}
+    folder = tmp_path / "training"
+    (folder / UNFINISHED / NOTICES).mkdir(parents=True)
+    (folder / "training.json").write_text(json.dumps({"training": training, "random_return": 9.0}))
+    (folder / "evaluation.json").write_text('{"rows": [{"of": "mine"}, 3], "optimum": 7}')
+    (folder / UNFINISHED / NOTICES / "p0.json").write_text('{"mine": 1}')
+    np.savez(folder / UNFINISHED / "from-p0.npz", curve=np.zeros((3, 1, len(CURVE))), members=np.arange(5))
+    titles = [block["title"] for block in TrainingView(folder).view(None, 8.0)["blocks"]]
+    assert titles[:2] == ["So far", "Learning curves"] and "Policies" in titles
+
+    tuning = tmp_path / "tuning"
+    tuning.mkdir()
+    (tuning / "tune.json").write_text('{"study": {"robots": [{"name": "cartpole"}]}, "tune": {"trials": 3}}')
+    whole = {"trial": 0, "settings": {"tau": 0.1}, "state": "complete", "chunks": [60], "returns": [[1.0, 2.0]]}
+    (tuning / "journal.jsonl").write_text(json.dumps(whole) + '\n\n{"trial": 1, "sett')
+    *_, journal = TuningView(tuning).view(None, 8.0)["blocks"]
+    assert journal["rows"] == [[0, "complete", 1.5, "tau 0.1"]]
+
+    study = tmp_path / "study"
+    (study / "jobs").mkdir(parents=True)
+    (study / "study.json").write_text('{"study": {"robots": [{"name": "cartpole"}]}}')
+    (study / "jobs" / "mine.json").write_text('{"of": "mine"}')
+    (study / "jobs" / "fit.json").write_text('{"job": "fit", "outputs": {"a": "1"}}')
+    *_, done = StudyView(study).view(None, 8.0)["blocks"]
+    assert done["rows"] == [["fit", 1]]

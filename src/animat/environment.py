@@ -147,7 +147,7 @@ class Environment(abc.ABC, Generic[RobotState]):
 
 @dataclass(frozen=True)
 class Animat(Environment[RobotState]):
-    """A robot moved by the responses of neurons to the conditions that the agent picks from.
+    """A robot moved by the responses of neurons to the conditions that the agent picks.
 
     Attributes:
         mapping: from the response of a readout to a motor command.

@@ -119,9 +119,10 @@ class Registry(Generic[Thing]):
             raise InvalidArgument(f"{name}: expected it to be created {with_what}, got {first_line(error)}") from error
 
     def names(self) -> tuple[str, ...]:
-        """All known names: ours, the registered ones, then those announced by packages."""
-        announced = importlib.metadata.entry_points(group=self.entry_points)
-        return tuple(dict.fromkeys([*self._ours, *sorted(self._registered), *(point.name for point in announced)]))
+        """All known names: ours, then the user's in the order of registration, then those announced by packages."""
+        of_animat = sorted(name for name, kind in self._registered.items() if kind.__module__.startswith("animat."))
+        announced = (point.name for point in importlib.metadata.entry_points(group=self.entry_points))
+        return tuple(dict.fromkeys([*self._ours, *of_animat, *self._registered, *announced]))
 
     def name_of(self, name: str) -> str:
         """The registered name for any form of `name` that `named` accepts; raises as `named` does."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -38,8 +39,7 @@ class Inspect(ResponseOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.reading import list_recordings, read_source
-        from animat.recordings.recording import Recording
-        from animat.report.inspection import draw_inspection, draw_series, expect_unique_stems, inspection_text
+        from animat.report.inspection import draw_inspection, expect_unique_stems, inspection_text
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.inspection import inspect_recording
@@ -91,26 +91,35 @@ class Inspect(ResponseOptions):
                     figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
                     print(f"figures: {', '.join(figures)}\n")
                     inspected[-1]["figures"] = figures
-                    series.append((source.start_min, file, inspection.responses))
+                    series.append((file, inspection.responses))
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")
-                first = read_source(min(series, key=lambda one: one[0])[1], stimuli=self.stimuli, part=self.part)
-                recording = first if isinstance(first, Recording) else None
-                try:
-                    drawn = draw_series(recording, [one[2] for one in series], self.out, self.format)
-                except Mismatch as unlike:
-                    print(f"no figures of the series: {unlike}")
-                else:
-                    if drawn:
-                        print(f"figures of the series: {', '.join(map(str, drawn))}")
-                    results["figures"] = [str(figure) for figure in drawn]
+                results |= self._draw_series(series, self.out)
         if unreadable:
             others = "; the rest were inspected" if inspected else ""
             count = f"{len(unreadable)} of {len(files)} files could not be inspected"
             print(f"animat: {count}{others}", file=sys.stderr)
         return results
+
+    def _draw_series(self, series: Sequence[tuple[Path, Responses]], out: Path) -> dict[str, Any]:
+        """Draw the files' responses together, with the array of the first recording; returns the figures, if any."""
+        from animat.recordings.reading import read_source
+        from animat.recordings.recording import Recording
+        from animat.report.inspection import draw_series
+
+        file, _ = min(series, key=lambda one: one[1].start_min)
+        first = read_source(file, stimuli=self.stimuli, part=self.part)
+        recording = first if isinstance(first, Recording) else None
+        try:
+            drawn = draw_series(recording, [responses for _, responses in series], out, self.format)
+        except Mismatch as unlike:
+            print(f"no figures of the series: {unlike}")
+            return {}
+        if drawn:
+            print(f"figures of the series: {', '.join(map(str, drawn))}")
+        return {"figures": [str(figure) for figure in drawn]}
 
 
 def _optima(robot: str, responses: Responses, progress: Progress) -> list[dict[str, Any]] | None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
-from animat.errors import InvalidArgument, within
+from animat.errors import InvalidArgument, did_you_mean, within
 
 if TYPE_CHECKING:
     from animat.training.settings import SAC
@@ -29,6 +30,10 @@ def read_sac(pairs: Sequence[str]) -> SAC:
     """The algorithm's settings, with `pairs` in place of its defaults; InvalidArgument for an impossible one."""
     from animat.training.settings import SAC
 
-    numbers = read_numbers("--sac", pairs)
+    numbers, known = read_numbers("--sac", pairs), [field.name for field in fields(SAC)]
+    for name in numbers:
+        if name not in known:
+            near = did_you_mean(name, known)
+            raise InvalidArgument(f"--sac: {name}: no such setting; expected some of {', '.join(known)}{near}")
     with within("--sac"):
         return SAC(**numbers)  # type: ignore[arg-type]

@@ -36,9 +36,11 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
     """
     with ExitStack() as stack:
         try:
-            if device.is_symlink():
-                # In a world-writable folder another user could point it at one of ours.
-                raise DeviceFailed(f"{device.name}: expected a folder as its lock, got the link {device}: remove it")
+            # In a world-writable folder another user could point a link at one of ours.
+            if device.is_symlink() or device.is_file():
+                raise DeviceFailed(
+                    f"{device.name}: expected a folder as its lock, got {device}, a file or a link: remove it"
+                )
             stack.enter_context(exclusive_lock(device))
             if device.stat().st_uid == os.geteuid():
                 # Other users of the machine may hold it later; they cannot remove our files.

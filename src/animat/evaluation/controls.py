@@ -60,8 +60,11 @@ class Control:
     ) -> tuple[Environment[Any], NeuronSimulator | None]:
         """The policies' environment and simulator, changed for this control; the same objects if nothing changes."""
         if self.is_turned_round or self.commands is not None:
-            of: Any = vars(unwrapped(environment))
-            changed = ReversedMapping(**of) if self.commands is None else IdealActuator(**of, commands=self.commands)
+            animat = unwrapped(environment)
+            assert isinstance(animat, Animat)
+            # A subclass of the user's may have more attributes.
+            of = animat.robot, animat.mapping, animat.n_conditions
+            changed = ReversedMapping(*of) if self.commands is None else IdealActuator(*of, self.commands)
             environment = replace_innermost(environment, lambda _: changed)
         if self.delivery == "shuffled":
             environment = ShuffledDelivery(environment)

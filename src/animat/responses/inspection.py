@@ -31,7 +31,7 @@ class ConditionSummary(NamedTuple):
 
     Attributes:
         n_responses: all responses, including bursts.
-        n_non_burst: responses that are not bursts, to which the other numbers belong; NaN without any.
+        n_non_burst: responses that are not bursts, to which the other numbers belong, which are NaN without any.
         share_above_median: P(x >= P50), P50 the median of all conditions together.
     """
 

@@ -27,6 +27,7 @@ FAMILY = "gymnasium"
 _ID = re.compile(r"(?:[A-Za-z_][\w.]{0,200}:)?[\w./:-]{1,200}")
 MOST_OBSERVED = 4_096
 """Most numbers in an observation: a policy is a small network."""
+MOST_LEVELS = 1_024
 LARGEST_BOUND = 1e6
 """Of an observation: a larger bound says nothing about its usual size."""
 
@@ -60,7 +61,7 @@ class GymnasiumRobot(HostRobot):
     episode_limit: Iterations
     low: Annotated[tuple[Number, ...], Field(max_length=64)]
     high: Annotated[tuple[Number, ...], Field(max_length=64)]
-    levels: Annotated[Whole, Field(ge=0, le=1_024)]
+    levels: Annotated[Whole, Field(ge=0, le=MOST_LEVELS)]
     scales: Annotated[tuple[Scale, ...], Field(min_length=1, max_length=MOST_OBSERVED)]
     keeps_state: Flag
 
@@ -253,12 +254,16 @@ def _commands(name: str, space: Any) -> tuple[tuple[float, ...], tuple[float, ..
     from gymnasium.spaces import Box, Discrete
 
     if isinstance(space, Discrete):
+        if space.n > MOST_LEVELS:
+            raise InvalidArgument(f"{name}: expected at most {MOST_LEVELS:,} actions, got {space.n:,}")
         return (), (), int(space.n)
     if not isinstance(space, Box):
         raise InvalidArgument(f"{name}: expected an action space of kind Box or Discrete, got {type(space).__name__}")
     if not np.issubdtype(space.dtype, np.floating):
         raise InvalidArgument(f"{name}: expected actions that are floating-point numbers, got {space.dtype}")
     low, high = space.low.ravel().astype(float), space.high.ravel().astype(float)
+    if not 1 <= len(low) <= 64:
+        raise InvalidArgument(f"{name}: expected actions of 1 to 64 dimensions, got {len(low)}")
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise InvalidArgument(f"{name}: expected actions with finite bounds, low below high, got {shown(space)}")
     return tuple(low.tolist()), tuple(high.tolist()), 0

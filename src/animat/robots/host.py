@@ -38,7 +38,8 @@ class Body(abc.ABC):
         """One iteration by one of the robot's `actions`.
 
         Returns:
-            the observation, the reward in the task's own units, whether the task itself ended, and if it was cut off.
+            the observation, the reward in the task's own units, whether the task itself ended, and whether it was cut
+            off.
         """
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
@@ -71,7 +72,7 @@ class HostRobot(Robot[Any]):
 
     @abc.abstractmethod
     def body(self, *, with_pictures: bool = False) -> Body:
-        """A new body, with a `picture` if requested; InvalidArgument if it cannot be made, or differs."""
+        """A new body, with a `picture` if requested; InvalidArgument if that fails or does not match the parameters."""
 
     @abc.abstractmethod
     def actions(self, commands: Float[np.ndarray, "bodies commands"]) -> Sequence[Any]:

@@ -21,7 +21,7 @@ from animat.robots.registry import register_robot
 
 
 class NavigationState(NamedTuple):
-    """Position (x to the right, y down from the top-left corner) and heading (clockwise from the right, (-pi, pi])."""
+    """Position from the top-left corner (x right, y down) and heading (clockwise from the right, in (-pi, pi])."""
 
     x_m: Float[Array, ""]
     y_m: Float[Array, ""]

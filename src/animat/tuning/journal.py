@@ -10,7 +10,7 @@ from statistics import fmean
 from typing import Literal
 
 from animat.errors import InvalidFile
-from animat.records import read_record
+from animat.records import Number, read_record
 from animat.tuning.space import Settings
 from animat.writing import write_whole
 
@@ -34,7 +34,7 @@ class TrialResult:
     settings: Settings
     state: Literal["complete", "stopped", "diverged"]
     chunks: tuple[int, ...]
-    returns: tuple[tuple[float, ...], ...]
+    returns: tuple[tuple[Number, ...], ...]
 
     @property
     def means(self) -> list[float]:

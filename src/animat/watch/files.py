@@ -13,7 +13,7 @@ from animat.errors import InvalidFile
 from animat.execution.task import NOTICES, UNFINISHED
 from animat.plain_file import read_plain_text
 from animat.training.policy import CURVE, whole_curve
-from animat.watch.plain import mapped, text
+from animat.watch.plain import listed, mapped, number, text
 
 _MOST_BYTES = 2**24
 _MOST_CURVE_BYTES = 2**22
@@ -39,18 +39,17 @@ def job_progress(folder: Path) -> JobProgress:
     """The last progress reported by the jobs of an unfinished run."""
     progress = {}
     for path in sorted((folder / UNFINISHED / NOTICES).glob("*.json"))[:1000]:
-        report = _json_of(path)
-        if report is not None:
-            share, message = report
+        report = listed(_json_of(path))
+        if len(report) == 2 and number(report[0]) is not None:
             # Of policies that are trained together, only one reports a message.
-            progress[path.stem.replace("+", "/")] = float(share), text(message or "")
+            progress[path.stem.replace("+", "/")] = float(report[0]), text(report[1] or "")
     return progress
 
 
 def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks columns"]]:
     """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
     arrays = _arrays_in(path, ("curve", "members"), _MOST_CURVE_BYTES)
-    if arrays is None or (curve := _complete(arrays[0], 3)) is None:
+    if arrays is None or (curve := _complete(arrays[0], 3)) is None or arrays[1].shape != curve.shape[1:2]:
         return {}
     return {int(member): curve[:, row] for row, member in enumerate(arrays[1].tolist())}
 

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from animat.training.policy import CURVE
 from animat.watch.blocks import chart, curve
+from animat.watch.plain import listed, mapped, number, text
 
 Curves: TypeAlias = dict[int, Float64[np.ndarray, "chunks columns"]]
 """Learning curves by policy number, with the columns of `CURVE`."""
@@ -30,16 +31,18 @@ def levels_of(random_return: float | None, evaluation: Mapping[str, Any]) -> tup
         random_return: of random actions on the first simulator; None if not known.
         evaluation: of the training's policies; empty if there is none.
     """
-    rows = {row["name"]: row["mean_return"] for row in evaluation.get("rows", ())}
+    # It is a file of the user's, which may hold anything.
+    listed_rows = map(mapped, listed(evaluation.get("rows")))
+    rows = {text(row.get("name")): number(row.get("mean_return")) for row in listed_rows}
     returns = {
         "random actions": rows.get("random", random_return),
         "best coupling": rows.get("coupling"),
-        "optimal return": (evaluation.get("optimum") or {}).get("value"),
+        "optimal return": number(mapped(evaluation.get("optimum")).get("value")),
     }
     known = {name: value for name, value in returns.items() if value is not None}
     note = f"Lines: {', '.join(f'{name} {value:.4g}' for name, value in known.items())}." if known else ""
-    if rows and evaluation.get("recorded_at_min") is not None:
-        note += f" They are on the simulator of minute {evaluation['recorded_at_min']:g}, from evaluation.json."
+    if rows and (minute := number(evaluation.get("recorded_at_min"))) is not None:
+        note += f" They are on the simulator of minute {minute:g}, from evaluation.json."
     elif known and not rows:
         note = note[:-1] + ", on the first simulator."
     if missing := [name for name in returns if name not in known]:

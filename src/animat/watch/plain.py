@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from typing import Any
 
 
 def number(value: Any) -> float | None:
     """A finite number; None for anything else."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return value if is_number and math.isfinite(value) else None
+    # A whole number in a file can be larger than any float.
+    return value if is_number and abs(value) <= sys.float_info.max else None
 
 
 def numbers(values: Any) -> list[float | None]:
@@ -39,6 +40,11 @@ def short(value: Any) -> str:
 def settings(values: dict[str, Any]) -> str:
     """Settings by name, in a few characters each."""
     return ", ".join(f"{text(name, 40)} {short(value)}" for name, value in values.items())
+
+
+def listed(value: Any) -> list[Any]:
+    """A list; empty for anything else."""
+    return value if isinstance(value, list) else []
 
 
 def mapped(value: Any) -> dict[str, Any]:

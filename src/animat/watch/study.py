@@ -8,7 +8,7 @@ from typing import Any
 from animat.execution.task import PLANNED, UNFINISHED
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes
-from animat.watch.plain import text
+from animat.watch.plain import mapped, text
 from animat.watch.state import changed_s, state_of
 from animat.watch.view import View, in_blocks
 
@@ -77,7 +77,7 @@ def done_jobs(folder: Path) -> dict[str, int]:
     """The number of output files of each job with a receipt, in the order of the receipts."""
     receipts = sorted((changed_s(path) or 0.0, path) for path in (folder / "jobs").glob("[!.]*.json"))
     contents = (json_of(path) for _, path in receipts[:_MOST_RECEIPTS])
-    return {text(receipt["job"]): len(receipt["outputs"]) for receipt in contents if receipt}
+    return {text(receipt["job"]): len(mapped(receipt.get("outputs"))) for receipt in contents if "job" in receipt}
 
 
 def running_jobs(folder: Path, done: dict[str, int]) -> JobProgress:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
+from statistics import fmean
 from typing import Any
 
 from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import chart, curve, facts, table, time_left
 from animat.watch.files import json_of
-from animat.watch.plain import settings, short, text
+from animat.watch.plain import mapped, number, settings, short, text
 from animat.watch.state import state_of
 from animat.watch.study import running_jobs, running_table
 from animat.watch.view import View, in_blocks
@@ -54,16 +55,22 @@ class TuningView(View):
         return in_blocks(state, [facts("Trials", rows), trials_chart, jobs, _table(trials)])
 
     def _trials(self) -> list[dict[str, Any]]:
-        """The trials in the journal, each with its last mean return."""
+        """The readable trials in the journal, each with its last mean return."""
         try:
             lines = read_plain_text(self.folder / "journal.jsonl", 2**26).splitlines()
         except InvalidFile:
             return []
-        trials = []
-        for trial in map(json.loads, lines):
-            means = [sum(returns) / len(returns) for returns in trial["returns"]]
-            trials.append(trial | {"last": means[-1] if means else None})
-        return trials
+        return [trial for line in lines if (trial := _trial(line)) is not None]
+
+
+def _trial(line: str) -> dict[str, Any] | None:
+    try:
+        trial = json.loads(line)
+        means = [fmean(returns) for returns in trial["returns"]]
+        known = {"trial": int(trial["trial"]), "state": text(trial["state"]), "settings": mapped(trial["settings"])}
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return known | {"last": number(means[-1]) if means else None}
 
 
 def _finals(results: dict[str, Any]) -> dict[str, Any]:
