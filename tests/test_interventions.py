@@ -84,7 +84,7 @@ class Delayed(Animat[Any]):
 
 def test_an_environment_of_ones_own_may_have_more_attributes() -> None:
     own = Delayed(ENVIRONMENT.robot, ENVIRONMENT.mapping, ENVIRONMENT.n_conditions)
-    for each in interventions_of(own, SIMULATOR, BEST, 1, switch_at=4):  # type: ignore[arg-type]
+    for each in interventions_of(own, SIMULATOR, BEST, switch_at=4):  # type: ignore[arg-type]
         assert each.within(own, SIMULATOR)[0].n_actions == own.n_actions
 
 
