@@ -67,11 +67,9 @@ def _maxone_over(virtual: VirtualCulture) -> Iterator[Culture]:
                 new = np.column_stack([frames, amplifier[seen.spikes.channel]])
                 self.spikes, self.stepped = np.concatenate([self.spikes, new]), frame
 
-        def forget(self, before: int) -> None:
-            self.spikes = self.spikes[self.spikes[:, 0] >= before]
-
         def take(self, start: int, stop: int) -> Any:
             of = self.spikes[(self.spikes[:, 0] >= start) & (self.spikes[:, 0] < stop)]
+            self.spikes = self.spikes[self.spikes[:, 0] >= stop]
             return of[:, 0], of[:, 1]
 
     # Not known before it is open; spikes until then are discarded.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -317,7 +318,9 @@ def test_a_strange_file_beside_a_run_is_left_out_and_the_rest_is_shown(tmp_path:
     tuning.mkdir()
     (tuning / "tune.json").write_text('{"study": {"robots": [{"name": "cartpole"}]}, "tune": {"trials": 3}}')
     whole = {"trial": 0, "settings": {"tau": 0.1}, "state": "complete", "chunks": [60], "returns": [[1.0, 2.0]]}
-    (tuning / "journal.jsonl").write_text(json.dumps(whole) + '\n\n{"trial": 1, "sett')
+    strange = [whole | {"trial": 10**400}, whole | {"trial": math.inf}, whole | {"returns": [[10**400]]}]
+    lines = "\n".join(map(json.dumps, [whole, *strange]))
+    (tuning / "journal.jsonl").write_text(lines + '\n\n{"trial": 1, "sett')
     *_, journal = TuningView(tuning).view(None, 8.0)["blocks"]
     assert journal["rows"] == [[0, "complete", 1.5, "tau 0.1"]]
 

@@ -90,7 +90,7 @@ def in_file(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def as_invalid_file(path: str | os.PathLike[str], failure: str = "cannot be read", ending: str = "") -> Iterator[None]:
-    """Turn an OSError raised in this context into an InvalidFile: the path, the failure, and the system's reason."""
+    """Turn an OSError raised in this context into an InvalidFile: path, failure, the system's reason, `ending`."""
     try:
         yield
     except OSError as error:

@@ -54,6 +54,7 @@ class SimulatorOptions(ResponseOptions):
         """Read the recordings and fit a simulator to each, by the options and otherwise as in a policy's training."""
         from animat.neurons.timeline import fit_timeline
         from animat.recordings.reading import read_sources
+        from animat.responses.conditions import conditions_named
         from animat.responses.readouts import ALL
         from animat.responses.series import extract_series
 
@@ -61,9 +62,12 @@ class SimulatorOptions(ResponseOptions):
         fit = simulator_settings(fitted, self.simulator, self.bins, self.range_hz)
         if not recordings:
             raise InvalidArgument("--recordings: expected files or folders of recordings, got none")
+        by = self.conditions or fitted.get("by")
+        # Before recordings are read, which can take a while.
+        conditions = None if by is None else conditions_named(by)
         series = extract_series(
             read_sources(recordings),
-            self.conditions or fitted.get("by"),
+            conditions,
             self.window_ms or (None if trained is None else trained.window_ms),
             burst_threshold=fitted.get("burst_threshold") if self.burst_threshold is None else self.burst_threshold,
             allow=self.allow,

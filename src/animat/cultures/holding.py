@@ -37,7 +37,7 @@ def hold(device: Path, holder: str) -> Iterator[bool]:
     with ExitStack() as stack:
         try:
             # In a world-writable folder another user could point a link at one of ours.
-            if device.is_symlink() or device.is_file():
+            if device.is_symlink() or (device.exists() and not device.is_dir()):
                 raise DeviceFailed(
                     f"{device.name}: expected a folder as its lock, got {device}, a file or a link: remove it"
                 )

@@ -23,6 +23,7 @@ from animat.neurons.timeline import fit_timeline
 from animat.recordings.findings import warnings_once
 from animat.recordings.reading import read_sources
 from animat.registry import is_ours
+from animat.responses.conditions import conditions_named
 from animat.responses.readouts import DEFAULT_READOUTS, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
@@ -113,8 +114,10 @@ def set_up(
         if value is not None and recordings is None:
             raise InvalidArgument(f"{name}: expected only with recordings, as it sets how they are read")
     if recordings is not None:
+        # Before recordings are read, which can take a while.
+        by = None if conditions is None else conditions_named(conditions)
         read = readouts or DEFAULT_READOUTS.get(body.n_commands, "all")
-        series = extract_series(read_sources(recordings), conditions, window_ms, readouts=read)
+        series = extract_series(read_sources(recordings), by, window_ms, readouts=read)
         timeline = fit_timeline(series, kind=kind)
         for message in warnings_once(timeline.findings):
             warnings.warn(message, stacklevel=2)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int64
 
-from animat.errors import InvalidArgument, within
+from animat.errors import InvalidArgument, expect_kind, within
 from animat.responses.condition import RESTING, Condition, abbreviated, listed
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -213,6 +213,7 @@ def conditions_named(text: str) -> Conditions:
     Raises:
         InvalidArgument: for anything else.
     """
+    expect_kind("conditions", text, str, "text such as 'frequency:5,10'")
     with within("conditions"):
         parts = [_parse(part) for part in text.split(" x ")]
         if len(parts) == 1:

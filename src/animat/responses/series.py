@@ -62,7 +62,7 @@ def extract_series(
     kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings returns"
     recordings = expect_several("recordings", recordings, kinds, words)
     check_allowed(allow)
-    by = conditions_named(by) if isinstance(by, str) else by
+    by = by if by is None or isinstance(by, Conditions) else conditions_named(by)
     window_ms = DEFAULT_WINDOW_MS if window_ms is None else window_ms
     cultures = [each.culture for each in recordings if isinstance(each, Recording)]
     seeds = {str(culture.seed) for culture in cultures if culture and culture.kind in ("virtual", "synthetic")}

@@ -67,10 +67,10 @@ def _trial(line: str) -> dict[str, Any] | None:
     try:
         trial = json.loads(line)
         means = [fmean(returns) for returns in trial["returns"]]
-        known = {"trial": int(trial["trial"]), "state": text(trial["state"]), "settings": mapped(trial["settings"])}
-    except (ValueError, TypeError, KeyError, RecursionError):
+        known = {"trial": number(trial["trial"]), "state": text(trial["state"]), "settings": mapped(trial["settings"])}
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return None
-    return known | {"last": number(means[-1]) if means else None}
+    return None if known["trial"] is None else known | {"last": number(means[-1]) if means else None}
 
 
 def _finals(results: dict[str, Any]) -> dict[str, Any]:
