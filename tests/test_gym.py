@@ -229,7 +229,7 @@ def test_recordings_on_disk_are_the_neurons(tmp_path) -> None:
             {"recordings": "r", "window_ms": -4},
             "window_ms: expected two numbers of milliseconds, start and end, got -4",
         ),
-        ({"recordings": "missing", "conditions": "frequncy"}, "conditions: expected one of .*, got 'frequncy'"),
+        ({"recordings": "missing", "conditions": "frequncy"}, "conditions: expected one of .*; got 'frequncy'"),
         ({"recordings": "r", "window_ms": (2, 4, 8)}, r"window_ms: expected two numbers .*, got \(2, 4, 8\)"),
         ({"neural_observation": 1}, "neural_observation: expected True or False, got 1"),
     ],
