@@ -243,8 +243,9 @@ def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
 ) -> None:
     monkeypatch.setattr("animat.execution.task.SILENT_S", 1.0 if freezes else 60.0)
     (notice := tmp_path / "notices" / "a.json").parent.mkdir()
-    log = tmp_path / "log"
-    elsewhere = ours.submit(carry_out_alone, Join("a", log=log, takes_s=3.0 if freezes else 0.5), tmp_path, notice)
+    log, thawed = tmp_path / "log", tmp_path / "thawed"
+    task = Join("a", log=log, until=thawed) if freezes else Join("a", log=log, takes_s=0.5)
+    elsewhere = ours.submit(carry_out_alone, task, tmp_path, notice)
     while not log.exists():
         time.sleep(0.01)
     (at_work,) = [pid for pid in children() if str(notice.with_suffix(".lock")) in open_files(pid)]
@@ -253,6 +254,7 @@ def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
     try:
         carry_out_alone(Join("a", log=log), tmp_path, notice)
     finally:
+        thawed.touch()
         os.kill(at_work, signal.SIGCONT)
     elsewhere.result()
     order = ["begins", "begins", "ends", "ends"] if freezes else ["begins", "ends", "begins", "ends"]

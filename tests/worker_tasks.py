@@ -54,18 +54,22 @@ class Join(Sized):
 
     Attributes:
         log: file that logs when it began, and when it ended.
+        until: file for which it waits before it ends.
     """
 
     name: str
     of: tuple[str, ...] = ()
     log: Path | None = None
     takes_s: float = 0.0
+    until: Path | None = None
 
     def run(self, folder: Path, progress: Progress) -> list[Path]:
         held = "".join((folder / other).read_text() for other in self.of)
         progress.update(1, 2, "half")
         self._say("begins")
         time.sleep(self.takes_s)
+        while self.until is not None and not self.until.exists():
+            time.sleep(0.01)
         path = folder / self.name
         path.write_text(f"({self.name}{held})")
         self._say("ends")
