@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    if arguments == ["--version"]:
+    if arguments[:1] == ["--version"]:
         print(f"animat {importlib.metadata.version('animat')}")
         return 0
     try:
@@ -191,19 +191,23 @@ def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
     return watching(command.out)
 
 
+_SEE = "; see animat --help"
+
+
 def _parse(arguments: list[str]) -> Command:
     """Read the command line; raises usage errors in one line, not in a box."""
     name = arguments[0] if arguments else ""
     if name not in COMMANDS and name != "-h" and not name.startswith("--"):
-        got = f"got {name!r}{did_you_mean(name, COMMANDS)}" if arguments else "see animat --help"
-        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; {got}")
+        got = f"{name!r}{did_you_mean(name, COMMANDS) or _SEE}" if arguments else f"none{_SEE}"
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {got}")
     if "" in arguments:
         # From a shell variable that is not set; as a path it would be the working folder.
         before = arguments[arguments.index("") - 1]
         raise InvalidArgument(f"{before}: expected a value after it, got an empty text")
     fields = dataclasses.fields(COMMANDS[name]) if name in COMMANDS else ()
     options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
-    see = f"; see animat {name} --help" if name in COMMANDS else "; see animat --help"
+    options |= {} if fields else {"--version": False}
+    see = f"; see animat {name} --help" if name in COMMANDS else _SEE
     output = io.StringIO()
     command: Command
     try:
@@ -211,7 +215,8 @@ def _parse(arguments: list[str]) -> Command:
             command, unknown = tyro.cli(
                 _SUBCOMMANDS,
                 prog="animat",
-                description="Drive a robot with a living neuronal culture.",
+                description="Drive a robot with a living neuronal culture.\n\n"
+                "animat COMMAND --help describes a command; animat --version prints the version.",
                 args=arguments,
                 config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
                 registry=_options(),
@@ -295,9 +300,11 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
             raise ValueError(f"expected {expected}, got {' '.join(map(repr, words))}")
 
         if expected is not None:
-            kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None)]
-    # A flag that turns something off would say that its default is True.
-    if option.default is None or option.default == () or option.default is True:
+            # Two numbers that may be left out would be in braces, as choices are.
+            metavar = spec.metavar if spec.choices else spec.metavar.strip("{}")
+            kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None, metavar=metavar)]
+    # Flags are off unless given.
+    if option.default is None or option.default == () or isinstance(option.default, bool):
         kind = Annotated[kind, arg(help_behavior_hint="")]
     text = option.helptext() if callable(option.helptext) else option.helptext
     # Help would start a new paragraph at an indented line of a docstring.
