@@ -235,8 +235,10 @@ def _parse(arguments: list[str]) -> Command:
         parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
         message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
         message = message.removeprefix("Error parsing ")
-        if message.startswith("{"):
-            # The choices of a positional argument, in place of its name.
+        if message.startswith("Missing from "):
+            message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
+        if message.startswith("{") or message.partition(":")[0].isupper():
+            # The choices or the kind of a positional argument, in place of its name.
             named = next(field.name for field in fields if "Positional" in str(field.type))
             message = f"{named}: {message.partition(': ')[2]}"
         raise InvalidArgument(f"{message}{see}") from None
