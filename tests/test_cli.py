@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
 import json
 import os
 import shutil
@@ -932,6 +934,16 @@ def test_what_help_says_of_an_option_is_one_paragraph(
     for option in fields(COMMANDS[command]):
         said = " ".join((said_of[option.name] or "").split())
         assert said and any(said in line for line in lines), option.name
+
+
+def test_a_terminal_without_utf_8_gets_question_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Train, "run", lambda command: print("97.1 ± 0.5 of Müller's") or {})
+    for arguments, line in ((["train"], "97.1 ? 0.5 of M?ller's\n"), (["--help"], "? record ")):
+        written = io.BytesIO()
+        monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, encoding="ascii"))
+        with contextlib.suppress(SystemExit):
+            assert main(arguments) == 0
+        assert line in written.getvalue().decode("ascii")
 
 
 @pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])

@@ -84,6 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Closed streams are None, which the parser and others do not expect: discard what is written to them.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A character that the encoding lacks, such as ± in ASCII, is printed as a question mark.
+        sys.stdout.reconfigure(errors="replace")
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else list(arguments))
