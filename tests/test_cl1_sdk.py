@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip(
-    "cl.sim", reason="the CL1's SDK (cl-sdk, Python 3.12 or later) is not installed: pip install '.[cl1]'"
+    "cl.sim", reason="the CL1's SDK (cl-sdk, Python 3.12 or later) is not installed: pip install 'animat[cl1]'"
 )
 
 SETTINGS = {"CL_SDK_ACCELERATED_TIME": "1", "CL_SDK_VISUALISATION": "0"}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
 import json
 import os
 import shutil
@@ -783,12 +785,18 @@ def test_an_error_of_an_argument_begins_with_its_option(
         (["record", "--zzz"], 2, ["animat: unknown option --zzz; see animat record --help"]),
         (["convert", "a.csv", "--uot", "b.nwb"], 2, ["animat: unknown option --uot; did you mean --out?"]),
         (["--hepl"], 2, ["animat: unknown option --hepl; did you mean --help?"]),
+        (["--versoin"], 2, ["animat: unknown option --versoin; did you mean --version?"]),
         (["train", "cartpole", "pole"], 2, ["animat: unexpected argument 'pole'; see animat train --help"]),
         (["train", "--robot", "pole"], 2, ["animat: robot: expected only its value, got --robot before it; see"]),
         (["train", "--seed=3", "--policies"], 2, ["animat: --policies: expected a value after it, got none; see"]),
+        (["convert", "a.csv"], 2, ["animat: --out: expected a value, got none; see animat convert --help"]),
+        (["convert"], 2, ["animat: recording: expected a value, got none; see animat convert --help"]),
+        (["cluster"], 2, ["animat: where: expected a value, got none; see animat cluster --help"]),
+        (["cluster", "all"], 2, ["animat: where: expected local, got 'all'; see animat cluster --help"]),
         (["train", "--window-ms", "2"], 2, ["animat: --window-ms: expected two numbers, got '2'; see animat train"]),
         (["trian"], 2, ["train, evaluate", "got 'trian'; did you mean train?"]),
-        ([], 2, ["record, inspect"]),
+        (["help"], 2, ["got 'help'; see animat --help"]),
+        ([], 2, ["record, inspect", "got none; see animat --help"]),
     ],
 )
 def test_usage_errors_come_in_one_line(
@@ -895,17 +903,22 @@ def test_the_worst_of_several_warnings_is_printed(
 def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"animat {version('animat')}\n"
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert "animat --version" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_no_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_no_none_and_no_false(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
     assert stop.value.code == 0
     said = capsys.readouterr().out
     assert "options" in said
     assert "None" not in said
+    assert "False" not in said
     assert "(default: )" not in said
+    assert "{FLOAT" not in said
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -921,6 +934,16 @@ def test_what_help_says_of_an_option_is_one_paragraph(
     for option in fields(COMMANDS[command]):
         said = " ".join((said_of[option.name] or "").split())
         assert said and any(said in line for line in lines), option.name
+
+
+def test_a_terminal_without_utf_8_gets_question_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Train, "run", lambda command: print("97.1 ± 0.5 of Müller's") or {})
+    for arguments, line in ((["train"], "97.1 ? 0.5 of M?ller's\n"), (["--help"], "? record ")):
+        written = io.BytesIO()
+        monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, encoding="ascii"))
+        with contextlib.suppress(SystemExit):
+            assert main(arguments) == 0
+        assert line in written.getvalue().decode("ascii")
 
 
 @pytest.mark.parametrize("arguments", [["live", "--help"], pytest.param(["--version"], marks=pytest.mark.oracle)])

@@ -39,7 +39,8 @@ def test_without_dask_or_a_scheduler_it_is_a_line(
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert main(command) == 1
     assert capsys.readouterr().err == (
-        "animat: --cluster: expected the package Dask, which is not installed: pip install 'animat[cluster]'\n"
+        "animat: --cluster: expected the package Dask, which is not installed: "
+        f"{shlex.quote(sys.executable)} -m pip install 'animat[cluster]'\n"
     )
     assert not (tmp_path / "out").exists()
 

@@ -201,7 +201,7 @@ def test_spikeinterface_is_asked_for_by_the_formats_name(tmp_path: Path) -> None
         import spikeinterface  # noqa: F401
     except ImportError:
         installed = False
-    message = "reader: expected one of" if installed else r"reader: .* not installed: pip install 'animat\[raw\]'"
+    message = "reader: expected one of" if installed else r"reader: .* not installed: .* -m pip install 'animat\[raw\]'"
     with pytest.raises(InvalidArgument, match=message):
         convert_recording(path, tmp_path / "out.nwb", reader="nosuchformat")
     with pytest.raises(InvalidFile, match="no such file"):

@@ -64,6 +64,8 @@ def test_what_is_printed_under_a_bar_goes_where_it_should() -> None:
     printed, drawn = drawn_by(SCRIPT)
     assert printed == "the result\n"
     assert "counting" in drawn
+    # Although the last report is of four fifths.
+    assert "100 %" in drawn
     assert "the result" not in drawn
 
 
@@ -102,10 +104,30 @@ def test_a_line_comes_every_ten_seconds_where_there_is_no_terminal(
     assert capsys.readouterr() == ("", "\n".join(lines) + "\n")
 
 
+def test_a_line_that_says_nothing_new_comes_every_minute(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s, lines = 0.0, []
+    monkeypatch.setattr("animat.progress.time.monotonic", lambda: now_s)
+    with Bar("recording") as progress:
+        for now_s in map(float, range(161)):
+            # One step at 5 s and another at 115 s. In between the note changes once, and otherwise only the time left.
+            progress.update((now_s >= 5) + (now_s >= 115), 4, "first" if now_s < 95 else "second")
+            if line := capsys.readouterr().err:
+                lines.append((now_s, line))
+    assert lines == [
+        (10.0, "recording: 25 %, first\n"),
+        (70.0, "recording: 25 %, first\n"),
+        (95.0, "recording: 25 %, second\n"),
+        (115.0, "recording: 50 %, 2 min left, second\n"),
+    ]
+
+
 def test_work_that_reports_nothing_for_long_gets_lines_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("animat.progress.LINE_EVERY_S", 0.02)
+    monkeypatch.setattr("animat.progress.SAME_EVERY_S", 0.02)
     monkeypatch.setattr("animat.progress._CHECK_EVERY_S", 0.01)
     lines = ""
     with Bar("solving") as progress:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -524,6 +525,13 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         assert Path(each["figure"]).read_bytes().startswith(b"\x89PNG")
     assert main(given) == 0
     assert capsys.readouterr().out == printed
+
+
+def test_the_verdict_has_the_numbers_of_the_table(known: Validation) -> None:
+    verdict, *table = validation_text("known.npz", known).splitlines()
+    off, bits = re.findall(r"off by (0\.\d+) at most, .* worth (\S+ ± \S+) bits", verdict)[0]
+    assert any(line.split()[0] == "memory" and line.split()[3] == off for line in table if line.strip())
+    assert any(f"conditions bring {bits} bits" in line for line in table)
 
 
 def test_the_figure_names_its_axes(known: Validation) -> None:

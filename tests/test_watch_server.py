@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import re
+import shlex
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -220,7 +222,8 @@ def test_the_command_says_what_is_wrong(
     assert "--port: expected a free port from 1 to 65,535" in capsys.readouterr().err
     monkeypatch.setattr("animat.watch.serving.find_spec", lambda name: None)
     assert main(["watch", str(tmp_path)]) == 1
-    expected = "expected starlette and uvicorn to be installed, got none: pip install 'animat[watch]'\n"
+    command = f"{shlex.quote(sys.executable)} -m pip install 'animat[watch]'"
+    expected = f"expected starlette and uvicorn to be installed, got none: {command}\n"
     assert capsys.readouterr().err == f"animat: watch: {expected}"
     assert main(["record", "--out", str(tmp_path), "--watch"]) == 1
     assert capsys.readouterr().err == f"animat: --watch: {expected}"

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S = 10.0
 """Between lines, if there is no terminal."""
+SAME_EVERY_S = 60.0
+"""Between lines that differ in nothing but speed and time left."""
 _CHECK_EVERY_S = 1.0
 _BAR_WIDTH = 24
 _RECENT = 2 / 3
@@ -180,6 +182,8 @@ class Bar:
 
         training: 34 %, 81,600 of 240,000 iterations, 1,940 a second, 82 s left, return 101.2
 
+    While nothing moves, the line comes every minute.
+
     It is a context manager. Each phase of the work (`in_phase`) has its own bar.
     """
 
@@ -187,7 +191,7 @@ class Bar:
         self._phases = [Phase(title)]
         self._live: Live | None = None
         self._is_over = threading.Event()
-        self._printed_s = time.monotonic()
+        self._printed_s, self._printed = time.monotonic(), [""]
         self._printing = threading.Lock()
 
     def __enter__(self) -> Self:
@@ -227,9 +231,12 @@ class Bar:
             now_s, phase = time.monotonic(), self._phases[-1]
             if now_s - self._printed_s < LINE_EVERY_S:
                 return
-            self._printed_s = now_s
-            parts = [f"{100 * phase.share:.0f} %", *phase.counted(), phase.left(), phase.note]
-            print(f"{phase.title}: {', '.join(filter(None, parts))}", file=sys.stderr, flush=True)
+            done, counted = f"{phase.title}: {100 * phase.share:.0f} %", phase.counted()
+            news = [done, *counted[:1], phase.note]
+            if news == self._printed and now_s - self._printed_s < SAME_EVERY_S:
+                return
+            self._printed_s, self._printed = now_s, news
+            print(", ".join(filter(None, [done, *counted, phase.left(), phase.note])), file=sys.stderr, flush=True)
 
     def _drawn(self) -> RenderableType:
         """The phases one below the other, then further details of the last, cut to the terminal's width."""
@@ -252,8 +259,11 @@ class Bar:
         details = ", ".join(filter(None, [*phases[-1].counted(), phases[-1].note]))
         return Group(table, Text(details, no_wrap=True, overflow="ellipsis")) if details else table
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         self._is_over.set()
+        if kind is None:
+            # Not all work reports its end.
+            self._phases[-1].end()
         if self._live is not None:
             self._live.stop()
             self._live = None

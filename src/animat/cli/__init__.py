@@ -84,6 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Closed streams are None, which the parser and others do not expect: discard what is written to them.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A character that the encoding lacks, such as ± in ASCII, is printed as a question mark.
+        sys.stdout.reconfigure(errors="replace")
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else list(arguments))
@@ -104,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    if arguments == ["--version"]:
+    if arguments[:1] == ["--version"]:
         print(f"animat {importlib.metadata.version('animat')}")
         return 0
     try:
@@ -191,19 +194,23 @@ def _live_page(command: Command) -> contextlib.AbstractContextManager[None]:
     return watching(command.out)
 
 
+_SEE = "; see animat --help"
+
+
 def _parse(arguments: list[str]) -> Command:
     """Read the command line; raises usage errors in one line, not in a box."""
     name = arguments[0] if arguments else ""
     if name not in COMMANDS and name != "-h" and not name.startswith("--"):
-        got = f"got {name!r}{did_you_mean(name, COMMANDS)}" if arguments else "see animat --help"
-        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; {got}")
+        got = f"{name!r}{did_you_mean(name, COMMANDS) or _SEE}" if arguments else f"none{_SEE}"
+        raise InvalidArgument(f"expected a command, one of {', '.join(COMMANDS)}; got {got}")
     if "" in arguments:
         # From a shell variable that is not set; as a path it would be the working folder.
         before = arguments[arguments.index("") - 1]
         raise InvalidArgument(f"{before}: expected a value after it, got an empty text")
     fields = dataclasses.fields(COMMANDS[name]) if name in COMMANDS else ()
     options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
-    see = f"; see animat {name} --help" if name in COMMANDS else "; see animat --help"
+    options |= {} if fields else {"--version": False}
+    see = f"; see animat {name} --help" if name in COMMANDS else _SEE
     output = io.StringIO()
     command: Command
     try:
@@ -211,7 +218,8 @@ def _parse(arguments: list[str]) -> Command:
             command, unknown = tyro.cli(
                 _SUBCOMMANDS,
                 prog="animat",
-                description="Drive a robot with a living neuronal culture.",
+                description="Drive a robot with a living neuronal culture.\n\n"
+                "animat COMMAND --help describes a command; animat --version prints the version.",
                 args=arguments,
                 config=(FlagCreatePairsOff, OmitArgPrefixes, DisallowNone),
                 registry=_options(),
@@ -230,8 +238,10 @@ def _parse(arguments: list[str]) -> Command:
         parts = itertools.groupby(lines, lambda line: bool(line) and not line.strip("─-"))
         message = next(" ".join(line for line in part if line) for is_rule, part in parts if not is_rule)
         message = message.removeprefix("Error parsing ")
-        if message.startswith("{"):
-            # The choices of a positional argument, in place of its name.
+        if message.startswith("Missing from "):
+            message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
+        if message.startswith("{") or message.partition(":")[0].isupper():
+            # The choices or the kind of a positional argument, in place of its name.
             named = next(field.name for field in fields if "Positional" in str(field.type))
             message = f"{named}: {message.partition(': ')[2]}"
         raise InvalidArgument(f"{message}{see}") from None
@@ -295,9 +305,11 @@ def _option(option: constructors.StructFieldSpec) -> constructors.StructFieldSpe
             raise ValueError(f"expected {expected}, got {' '.join(map(repr, words))}")
 
         if expected is not None:
-            kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None)]
-    # A flag that turns something off would say that its default is True.
-    if option.default is None or option.default == () or option.default is True:
+            # Two numbers that may be left out would be in braces, as choices are.
+            metavar = spec.metavar if spec.choices else spec.metavar.strip("{}")
+            kind = Annotated[kind, dataclasses.replace(spec, instance_from_str=read, choices=None, metavar=metavar)]
+    # Flags are off unless given.
+    if option.default is None or option.default == () or isinstance(option.default, bool):
         kind = Annotated[kind, arg(help_behavior_hint="")]
     text = option.helptext() if callable(option.helptext) else option.helptext
     # Help would start a new paragraph at an indented line of a docstring.

@@ -58,7 +58,7 @@ class Convert(Command):
     raw: bool = False
     """Find the spikes in the raw traces, instead of using those that the rig found"""
     reader: str | None = None
-    """Find the spikes in traces of another format, by its name in SpikeInterface (to be installed), such as intan"""
+    """Find the spikes in traces of another format, by its name in SpikeInterface, such as intan; needs animat[raw]"""
     band_hz: tuple[float, float] = (100.0, 3000.0)
     """Pass band of the filter for finding spikes; 0 0: the traces are already filtered"""
     threshold: float = 5.0

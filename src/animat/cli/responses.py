@@ -24,13 +24,14 @@ class ResponseOptions(Command):
 
     conditions: str | None = None
     """What the agent chooses from: frequency, interval:5,10+-25%, electrode, pattern, "frequency x electrode", all;
-    default: by frequency, and by place where places were recorded; with policies: as in their training"""
-    window_ms: tuple[float, float] | None = None
-    """Start and end of the response window after a stimulus, in ms; default: 2 10; with policies: as in their
+    default: by frequency, and by place where places were recorded; in evaluate and replay: as in the policies'
     training"""
+    window_ms: tuple[float, float] | None = None
+    """Start and end of the response window after a stimulus, in ms; default: 2 10; in evaluate and replay: as in the
+    policies' training"""
     burst_threshold: float | None = None
     """Share of active channels above which a response is a burst; 1 keeps all; default: where two groups separate;
-    with policies: as in their training"""
+    in evaluate and replay: as in the policies' training"""
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,13 @@ class SimulatorOptions(ResponseOptions):
 
     simulator: Literal["histogram", "empirical", "memory"] | None = None
     """memory: draw a response that was measured after a similar history, the default except for recordings in blocks;
-    histogram: the paper's; empirical: draw any measured value; default with policies: as in their training"""
+    histogram: the paper's; empirical: draw any measured value; default in evaluate and replay: as in the policies'
+    training"""
     bins: int | None = None
-    """Bins of a histogram; default: 20; with policies: as in their training"""
+    """Bins of a histogram; default: 20; in evaluate and replay: as in the policies' training"""
     range_hz: float | None = None
     """Equally wide bins from 0 to this rate, in Hz (the paper: 120); default: edges at percentiles of each recording;
-    with policies: as in their training"""
+    in evaluate and replay: as in the policies' training"""
     allow: tuple[str, ...] = ()
     """Findings to allow, by name, such as dead-window"""
 

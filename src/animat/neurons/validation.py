@@ -172,7 +172,7 @@ class Validation:
         conditions = self.gain("empirical", MARGINAL)
         distance, lag = scores.distance, self.autocorrelation[0] - scores.autocorrelation.mean[0]
         better = [s.kind for s in self.scores[1:] if self.gain(s.kind, self.kind, "crps_hz").is_certain]
-        off = f"the held-out distribution is off by up to {distance:.2f}"
+        off = f"the held-out distribution is off by up to {distance:.3f}"
         drifted = f", as responses {'fell' if self.drift < 0 else 'rose'} by {100 * abs(self.drift):.0f} % meanwhile"
         off += drifted if abs(self.drift) > SMALL_DISTANCE / 2 else ""
         if self.is_blocked:
@@ -201,8 +201,8 @@ class Validation:
         if better:
             return f"With care: the {better[-1]} simulator predicts better; train with --simulator {better[-1]}"
         return (
-            f"Can be trusted: the held-out distribution is off by {distance:.2f} at most, and the condition is worth "
-            f"{conditions.value:.2f} ± {conditions.error:.2f} bits per trial"
+            f"Can be trusted: the held-out distribution is off by {distance:.3f} at most, and the condition is worth "
+            f"{conditions.value:.3f} ± {conditions.error:.3f} bits per trial"
         )
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from pydantic import Field
 
 from animat.errors import InvalidArgument, first_line, shown
-from animat.extras import install_command
+from animat.extras import install_command, pip_install
 from animat.records import Flag, Number, Whole, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Iterations, Quantity
 from animat.robots.host import LONGEST_KEPT, Body, HostRobot, time_limit
@@ -245,7 +245,7 @@ def _expect_sound_mujoco(name: str, env: Any) -> None:
     if is_of_mujoco and getattr(sys.modules["mujoco"], "__version__", "") == "4.0.0":
         raise InvalidArgument(
             f"{name}: expected a MuJoCo that computes accelerations correctly, got 4.0.0, which does not: "
-            'pip install "mujoco<4"'
+            f"{pip_install('mujoco<4')}"
         )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Int64
 
 from animat.cultures.failures import describe_error, vendor_module
 from animat.errors import DeviceFailed
+from animat.extras import pip_install
 
 ADDRESS = "tcp://localhost:7205"
 """The filtered stream, in which the server detects spikes: one message per frame."""
@@ -64,8 +65,8 @@ class ZmqSpikes:
         self.lost_frames = 0
 
     def start(self) -> None:
-        missing = "culture: expected the package pyzmq to read a maxone, which is not installed: pip install pyzmq"
-        zmq = vendor_module("zmq", missing)
+        missing = "culture: expected the package pyzmq to read a maxone, which is not installed"
+        zmq = vendor_module("zmq", f"{missing}: {pip_install('pyzmq')}")
         self._frame, self._failed, self.lost_frames = -1, None, 0
         self._spikes.clear()
         self._going.set()
