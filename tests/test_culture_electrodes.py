@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
+import weakref
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -305,6 +307,19 @@ def test_a_culture_that_another_s_state_was_given_to_is_what_it_was(tmp_path: Pa
         restored.restore_state(tmp_path / "other.state")
     with restored:
         assert restored.record(SHORT).equals(recording)
+
+
+def test_a_dropped_culture_is_freed_without_garbage_collection() -> None:
+    gc.disable()
+    try:
+        with small_culture() as culture:
+            culture.deliver([stimulus(culture, 0.0)], 0.1)
+        tissue = culture.tissue
+        freed = [weakref.ref(each) for each in (culture, tissue, tissue._coupling, tissue._network)]
+        del culture, tissue
+        assert [each() for each in freed] == [None] * 4
+    finally:
+        gc.enable()
 
 
 def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:
