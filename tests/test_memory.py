@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.numpy import save
 
 import animat.gym  # noqa: F401
 from animat.cli.train import _memories
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return, best_returns
@@ -444,6 +445,25 @@ def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> N
     for read, written in zip(jax.tree.leaves(loaded.simulators), jax.tree.leaves(timeline.simulators), strict=True):
         np.testing.assert_array_equal(read, written)
     assert Simulators(kind=kind).kind == loaded.fitted["kind"] == kind
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "No such file"),
+        (b"{}", "header"),
+        (save({"a": np.zeros(3)}), "no entry 'animat'"),
+        (save({"a": np.zeros(3)}, {"animat": '{"format": "a policy"}'}), "no entry 'conditions'"),
+    ],
+)
+def test_a_file_of_another_kind_is_no_simulators(content: bytes | None, reason: str, tmp_path: Path) -> None:
+    path = tmp_path / "timeline.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InvalidFile) as error:
+        load_timeline(path)
+    assert str(error.value).startswith(f"{path}: expected simulators as animat study and animat tune write them, got ")
+    assert reason in str(error.value) and str(error.value).endswith("; run the command again to replace it")
 
 
 @pytest.mark.parametrize("kind", get_args(Kind))

@@ -550,7 +550,7 @@ def test_simulators_are_kept_whole(finished: Path) -> None:
     assert [c.label for c in timeline.conditions] == ["5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz"]
     assert float(timeline.at(0.0).percentiles[5]) > 0
     (finished.parent / "cut").write_bytes((finished / "simulators/timeline.safetensors").read_bytes()[:50])
-    with pytest.raises(InvalidFile, match="cut: expected a study's simulators"):
+    with pytest.raises(InvalidFile, match="cut: expected simulators as animat study and animat tune write them"):
         load_timeline(finished.parent / "cut")
 
 
