@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Pair, draw_comparisons
@@ -422,6 +422,20 @@ def test_on_a_phone_the_headline_fits_the_screen(tmp_path: Path) -> None:
     assert page.count("<picture>") == page.count("</picture>") == 1
     alone = write_page(tmp_path / "one.html", "t", "l", [Section("s", pictures=(Picture(wide, "a", "b"),))], [])
     assert "<picture>" not in alone.read_text()
+
+
+@pytest.mark.parametrize("part", ["file", "narrow"])
+def test_a_figure_that_is_gone_is_named_by_the_error(part: str, tmp_path: Path) -> None:
+    there = save_figure(
+        draw_headline([(score("arm", "1-threshold", 5.0, 4.0, 6.0, 0.0, 10.0), np.ones(2))]), tmp_path / "a.png"
+    )
+    gone = tmp_path / "gone.png"
+    picture = replace(Picture(there, "a", "b", narrow=there), **{part: gone})
+    with pytest.raises(InvalidFile, match=f"^{gone}: cannot be read: No such file or directory; run the command again"):
+        write_page(tmp_path / "page.html", "t", "l", [Section("s", pictures=(picture,))], [])
+    assert not (tmp_path / "page.html").exists()
+    with pytest.raises(InvalidFile, match=f"^{gone}: cannot be read: "):
+        _ = Picture(gone, "a", "b").width_px
 
 
 def test_there_is_one_kind_of_minus() -> None:
