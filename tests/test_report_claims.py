@@ -27,7 +27,7 @@ from animat.studies.captions import CULTURE
 from animat.studies.cultures import CulturesRun
 from animat.studies.cultures_page import _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
-from animat.studies.optima import kinds_of, rough_kinds
+from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
@@ -333,7 +333,7 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
 def test_every_mapping_has_its_own_optima_over_time() -> None:
     study = paper_study()
     assert [kind.mapping for kind in kinds_of(study)] == ["1-threshold", "9-thresholds", "linear", "none"]
-    assert [kind.mapping for kind in rough_kinds(study)] == ["1-threshold", "9-thresholds"]
+    assert [kind.mapping for kind in kinds_over_time(study)] == ["1-threshold", "9-thresholds"]
 
 
 def test_every_line_of_a_figure_is_in_its_legend() -> None:
@@ -456,7 +456,7 @@ def test_files_that_a_page_names_are_links() -> None:
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
 
 
-def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> None:
+def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> None:
     minutes = np.array([0.0, 10.0])
     returns = {f"c{i}": np.zeros((2, 2)) for i in range(8)}
     panels = [
