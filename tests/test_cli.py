@@ -126,7 +126,7 @@ def test_the_live_page_has_what_returns_are_compared_with(
         (["inspect", "no-such-file.nwb"], 1),
     ],
 )
-def test_the_exit_status_tells_a_command_line_that_cannot_be_read_from_other_errors(
+def test_a_command_line_that_cannot_be_read_has_another_exit_status_than_other_errors(
     command: list[str], status: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(command) == status
@@ -270,7 +270,7 @@ def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys
 
 
 @pytest.mark.oracle
-def test_evaluate_tells_the_optimum_of_the_recording_it_evaluates_on(
+def test_evaluate_reports_the_optimum_of_the_recording_it_evaluates_on(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = with_a_coarse_optimum(monkeypatch)

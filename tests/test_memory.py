@@ -221,7 +221,7 @@ def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> Non
         memory = fit_memory(replace(responses, presented=every, place=np.arange(600))).memory
         assert memory != NO_MEMORY
         none += not memory.load_s
-    # One in a hundred by chance, and a little more: the trace tells not all of a step.
+    # One in a hundred by chance, and a few more, as the trace does not contain everything about a step.
     assert none >= 36
 
 
@@ -583,7 +583,7 @@ def network(seed: int, spikes: float, n: int = 3000) -> Responses:
 def test_the_fewer_the_spikes_the_more_the_stimulus_weighs_in_the_trace(seed: int) -> None:
     many = fit_memory(network(seed, spikes=300)).memory
     few = fit_memory(network(seed, spikes=3)).memory
-    # The network's own: what it remembers is its activity, which so many spikes tell as it is.
+    # The network's own: it remembers its activity, which so many spikes measure well.
     assert (many.decay, many.weight) == (pytest.approx(0.3), 0.0)
     assert few.weight >= 2
 
@@ -594,7 +594,7 @@ def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator()
     for seed in range(60):
         simulator = fit_memory(independent(seed))
         none += simulator.memory == NO_MEMORY
-    # The best of many memories tells by chance a little more than none: two standard errors keep that part small.
+    # By chance the best of many memories predicts a little better than none: two standard errors keep that part small.
     assert none >= 54
     assert not any(
         np.all(each.nearest == each.followers)

@@ -135,7 +135,7 @@ def test_the_response_is_read_after_the_last_pulse_of_a_trial() -> None:
     assert table.is_last_of_presentation.tolist() == [False, False, True, False, True]
 
 
-def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
+def test_provenance_protocol_and_findings_survive_a_file() -> None:
     noted = (Finding("a-thing", "warning", "something: odd", 0.1), Finding("another", "note", "less odd"))
     words = {"source": "virtual culture: of a test", "seed": "7", "of a rig": "its: words"}
     made = recording(provenance=words, protocol=PAPER, culture=RecordedCulture("virtual", 7), findings=noted)

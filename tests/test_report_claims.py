@@ -248,7 +248,7 @@ def test_decisions_follow_a_changed_study() -> None:
 # --- robots of one kind -----------------------------------------------------------------------------------------------
 
 
-def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
+def test_two_robots_of_a_kind_are_distinguished(tmp_path: Path) -> None:
     """The pole mass as printed beside the simulator's, in one study."""
     printed = RobotSpec("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
     study = Study(robots=(RobotSpec("cartpole"), printed))
