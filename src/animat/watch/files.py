@@ -77,7 +77,7 @@ def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ col
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
     """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes.
 
-    Raises some error for a file that holds something else.
+    A file that holds something else may raise any error.
     """
     arrays = _arrays_in(path, ("return", "actor", "over_time", "agent", "at_min"), _MOST_EPISODES_BYTES)
     if arrays is None:
