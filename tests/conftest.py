@@ -85,7 +85,7 @@ def import_from_the_last_to_the_first(config: pytest.Config) -> None:
     if int(worker[2:]) % 2 == 0 or [Path(each).resolve() for each in config.args] != [Path(__file__).parent]:
         return
     for file in sorted(Path(__file__).parent.glob("test_*.py"), reverse=True):
-        # What is wrong is told where it is collected.
+        # Errors are reported where the file is collected.
         with suppress(Exception, pytest.skip.Exception):
             importlib.import_module(file.stem)
 

@@ -265,9 +265,9 @@ def test_what_cannot_be_a_body_is_refused_in_one_line_before_training(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = main(["train", f"{TOY}{name}-v0", "--mapping", "none", "--out", str(tmp_path / "out")])
-    told = capsys.readouterr().err
-    assert code != 0 and told.count("\n") == 1 and "Traceback" not in told
-    assert FAULTS[name] in told and f"{TOY}{name}-v0" in told, told
+    error = capsys.readouterr().err
+    assert code != 0 and error.count("\n") == 1 and "Traceback" not in error
+    assert FAULTS[name] in error and f"{TOY}{name}-v0" in error, error
     assert not (tmp_path / "out").exists()
 
 
@@ -302,8 +302,8 @@ def test_a_module_that_is_not_installed_is_named(capsys: pytest.CaptureFixture[s
         ("", "expected gymnasium: and an environment's id"),
     ):
         assert main(["train", f"gymnasium:{id}", "--mapping", "none", "--out", str(tmp_path / "out")]) != 0
-        told = capsys.readouterr().err
-        assert words in told and told.count("\n") == 1
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
 
 
 @pytest.mark.oracle

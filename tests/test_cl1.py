@@ -61,7 +61,7 @@ def test_a_channel_that_cannot_stimulate_is_refused_by_name(channel: int, what: 
     assert refused.value.limit == "sites"
 
 
-def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_restarted_clock_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with CL1Culture() as culture:
         culture.rest(60.0)
         recording = culture.record(Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1), seed=1)
@@ -75,30 +75,30 @@ def test_a_clock_that_began_anew_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "the CL1's clock is at 1.0 min, before the end of the recording at 1.0 min" in found.message
 
 
-def test_another_chip_rig_or_kind_of_culture_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_chip_rig_or_kind_of_culture_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with CL1Culture() as culture:
         recording = culture.record(Protocol(pulse=CL1_PULSE, trials=2, patterns=2, setup_s=0.1), seed=1)
     names = {"system_id": "stand-in", "chip_id": "none", "cell_batch_id": "7"}
 
-    def told(kind: RecordedCulture | None = recording.culture, **words: str) -> str | None:
+    def message(kind: RecordedCulture | None = recording.culture, **words: str) -> str | None:
         monkeypatch.setattr(sys.modules["cl"], "get_system_attributes", lambda: names)
         with CL1Culture() as culture:
             changed = replace(recording, provenance={**recording.provenance, **words}, culture=kind)
             found = other_culture(changed, culture)
         return None if found is None else found.message
 
-    assert told() is told(cell_batch_id="7") is None
-    assert told(chip_id="A3") == (
+    assert message() is message(cell_batch_id="7") is None
+    assert message(chip_id="A3") == (
         "the recordings are of chip_id A3, but this is chip_id none: percentiles differ between cultures"
     )
-    assert "system_id rig 2, but this is system_id stand-in" in str(told(system_id="rig 2"))
-    assert "cell_batch_id 6, but this is cell_batch_id 7" in str(told(cell_batch_id="6"))
-    assert "of a MaxOne, but this is a CL1" in str(told(RecordedCulture("maxone")))
-    assert "of a virtual culture, but this is a CL1" in str(told(VirtualCulture(1).recorded_as))
+    assert "system_id rig 2, but this is system_id stand-in" in str(message(system_id="rig 2"))
+    assert "cell_batch_id 6, but this is cell_batch_id 7" in str(message(cell_batch_id="6"))
+    assert "of a MaxOne, but this is a CL1" in str(message(RecordedCulture("maxone")))
+    assert "of a virtual culture, but this is a CL1" in str(message(VirtualCulture(1).recorded_as))
     is_simulated = recording.culture is not None and recording.culture.is_simulated
-    assert "of a CL1" in str(told(RecordedCulture("cl1", 1, not is_simulated)))
+    assert "of a CL1" in str(message(RecordedCulture("cl1", 1, not is_simulated)))
     # A converted file says nothing of where it comes from; and a replay answers from whatever was recorded.
-    assert told(None, source="rig.h5") is None
+    assert message(None, source="rig.h5") is None
     foreign = replace(recording, provenance={**recording.provenance, "chip_id": "A3"})
     with ReplayCulture([foreign]) as replayed:
         assert other_culture(recording, replayed) is None
@@ -199,7 +199,7 @@ def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) ->
 
 
 @pytest.mark.parametrize("is_simulator", [True, False])
-def test_a_simulator_that_did_not_keep_up_is_told_with_what_helps(
+def test_if_the_simulator_does_not_keep_up_the_error_says_what_helps(
     is_simulator: bool, neurons: Neurons, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def late(*_: object) -> None:
@@ -219,7 +219,7 @@ def test_a_simulator_that_did_not_keep_up_is_told_with_what_helps(
         assert (helps in str(failed.value)) == is_simulator
 
 
-def test_what_could_not_be_interrupted_is_told(neurons: Neurons, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_interruption_is_reported(neurons: Neurons, monkeypatch: pytest.MonkeyPatch) -> None:
     with CL1Culture() as culture:
         with monkeypatch.context() as patch:
             patch.setattr(neurons, "interrupt", lambda _: [][0])

@@ -29,12 +29,12 @@ from animat.cultures.devices.cl1_source import use_simulated_culture
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Phase, Pulse
 from animat.stimulation.stimulus import Stimulus
-def tell(**what): print("TOLD" + json.dumps(what))
+def report(**what): print("REPORT " + json.dumps(what))
 """
 
 
-def told(script: str, folder: Path) -> dict[str, Any]:
-    """What a script tells in its last line, run in a process of its own.
+def reported(script: str, folder: Path) -> dict[str, Any]:
+    """What a script reports in its last line, run in a process of its own.
 
     In accelerated time the SDK gives up on a tick after 100 ms, which a busy machine can take: then it is run again.
     """
@@ -52,8 +52,8 @@ def told(script: str, folder: Path) -> dict[str, Any]:
         if ran.returncode == 0 or "Timeout waiting for timestamp" not in ran.stderr:
             break
     assert ran.returncode == 0, ran.stderr[-3000:]
-    line = [line for line in ran.stdout.splitlines() if line.startswith("TOLD")][-1]
-    return dict(json.loads(line.removeprefix("TOLD")))
+    line = [line for line in ran.stdout.splitlines() if line.startswith("REPORT ")][-1]
+    return dict(json.loads(line.removeprefix("REPORT ")))
 
 
 def test_it_passes_the_contract_on_the_sdks_simulator(tmp_path: Path) -> None:
@@ -65,9 +65,9 @@ class TestOnSimulator(CultureContract):
     def make_culture(self): return CL1Culture()
 done = [name for name in dir(TestOnSimulator) if name.startswith("test_")]
 for name in done: getattr(TestOnSimulator(), name)()
-tell(done=len(done))
+report(done=len(done))
 """
-    assert told(script, tmp_path)["done"] >= 10
+    assert reported(script, tmp_path)["done"] >= 10
 
 
 def test_the_five_frequencies_come_as_asked_and_as_the_sdks_own_file_says(tmp_path: Path) -> None:
@@ -76,10 +76,10 @@ protocol = Protocol(pulse=CL1_PULSE, patterns=10, trials=10, setup_s=0.1, pause_
 with CL1Culture(record_to="rec") as culture:
     recording = culture.record(protocol, seed=1)
     asked = np.concatenate([b.stimuli.time_s for b in culture.schedule(protocol, 1).blocks])
-    tell(asked=asked.tolist(), got=recording.stimuli.time_s.tolist(), hz=recording.stimuli.frequency_hz.tolist(),
+    report(asked=asked.tolist(), got=recording.stimuli.time_s.tolist(), hz=recording.stimuli.frequency_hz.tolist(),
          electrodes=recording.stimuli.electrodes.tolist(), spikes=len(recording.spike_times_s), said=culture.provenance)
 """
-    found = told(script, tmp_path)
+    found = reported(script, tmp_path)
     asked, got = np.array(found["asked"]).reshape(5, 10), np.array(found["got"]).reshape(5, 10)
     np.testing.assert_array_equal(np.rint(np.diff(got) * 25_000), np.diff(np.rint(asked * 25_000)))
     assert "SDK's simulator" in found["said"]["source"]
@@ -120,9 +120,9 @@ for _ in range(20_000):
         cl.StimDesign(*numbers)
     except ValueError:
         wrongly += 1
-tell(taken=taken, refused=refused, wrongly=wrongly)
+report(taken=taken, refused=refused, wrongly=wrongly)
 """
-    found = told(script, tmp_path)
+    found = reported(script, tmp_path)
     assert found["wrongly"] == 0
     assert min(found["taken"], found["refused"]) > 500
 
@@ -142,9 +142,9 @@ with CL1Culture() as culture:
             culture.deliver([Stimulus(0.0, (channel,), CL1_PULSE)], 0.1)
         except UnsafeStimulus as error:
             words.append(f"got electrode {channel}" in str(error))
-tell(silent=silent, words=words)
+report(silent=silent, words=words)
 """
-    assert told(script, tmp_path) == {"silent": [], "words": [True] * 5}
+    assert reported(script, tmp_path) == {"silent": [], "words": [True] * 5}
 
 
 def test_a_simulated_culture_answers_through_the_sdk_and_ticks_do_not_change_it(tmp_path: Path) -> None:
@@ -162,9 +162,9 @@ with cl.open() as neurons:
         spikes += [(s.timestamp - start, s.channel) for s in tick.analysis.spikes]
         stims += [(s.timestamp - start, s.channel) for s in tick.analysis.stims]
         frames += int(np.abs(tick.frames.astype(int)).sum())
-tell(spikes=sorted(spikes), stims=sorted(stims), frames=frames)
+report(spikes=sorted(spikes), stims=sorted(stims), frames=frames)
 """
-    found = [told(script.replace("TICKS", str(ticks)), tmp_path) for ticks in (100, 1000)]
+    found = [reported(script.replace("TICKS", str(ticks)), tmp_path) for ticks in (100, 1000)]
     assert found[0] == found[1]
     spikes = np.array(found[0]["spikes"])
     times = sorted({time for time, _ in found[0]["stims"]})
@@ -187,9 +187,9 @@ with CL1Culture() as culture:
     window = [np.count_nonzero((recording.spike_times_s >= t + 0.002) & (recording.spike_times_s < t + 0.010))
               for t in recording.stimuli.time_s]
     rest = len(recording.spike_times_s) / recording.duration_s * 0.008
-tell(window=float(np.mean(window)), rest=rest, stimuli=len(window))
+report(window=float(np.mean(window)), rest=rest, stimuli=len(window))
 """
-    found = told(script, tmp_path)
+    found = reported(script, tmp_path)
     assert found["stimuli"] == 40
     assert found["window"] > 1.5 * found["rest"]
 
@@ -213,16 +213,16 @@ with CL1Culture(record_to="rig") as culture:
 if session.ending.by != "plan":
     sys.exit(session.ending.message)
 recording = session.recording()
-tell(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
+report(episodes=len(session.episodes), times=recording.stimuli.time_s.tolist(),
      hz=recording.stimuli.frequency_hz.tolist(), pattern=recording.stimuli.pattern.tolist())
 """
-    found = told(script, tmp_path)
+    found = reported(script, tmp_path)
     assert found["episodes"] == 2
     (file,) = (tmp_path / "rig").glob("*.h5")
     from animat.recordings.formats.hdf5_formats import read_hdf5
 
     own = read_hdf5(file).stimuli
-    # The SDK's index repeats itself after a hundred entries (1.0.0): the rest is not told, and nothing untrue.
+    # The SDK's index repeats itself after a hundred entries (1.0.0): the rest is unknown, and nothing is wrong.
     known = ~np.isnan(own.frequency_hz)
     assert len(known) == len(found["hz"]) and np.all(known[:100])
     assert own.frequency_hz[known].tolist() == np.array(found["hz"])[known].tolist()

@@ -26,7 +26,7 @@ STIMULI = [event(frame, channel) for frame in (701, 1503, 2250) for channel in (
 
 
 def read(pieces: list[int], stimuli: list[Any] = STIMULI) -> tuple[np.ndarray, list[tuple[int, int]], np.ndarray]:
-    """Frames, spikes and their waveforms; stimuli are told of as the SDK does, before the frames that they lie in."""
+    """Frames, spikes and their waveforms; stimuli are passed as by the SDK, before the frames that they lie in."""
     culture, at, waiting = SimulatedCL1(2, neurons=200), 0, sorted(stimuli, key=lambda e: e.timestamp)
     frames, spikes, shapes = [], [], []
     for piece in pieces:
@@ -141,7 +141,7 @@ def test_settings_that_cannot_be_are_refused(bad: dict[str, float]) -> None:
         SimulatedCL1(1, **bad)  # type: ignore[arg-type]
 
 
-def test_unless_told_otherwise_it_is_as_large_as_is_said_that_real_time_carries() -> None:
+def test_by_default_it_has_as_many_neurons_as_the_page_says() -> None:
     docs = (Path(__file__).parent.parent / "docs" / "hardware.md").read_text()
     assert f"It has {REAL_TIME_NEURONS} neurons by default" in docs
     assert len(SimulatedCL1(1)._sees) == REAL_TIME_NEURONS

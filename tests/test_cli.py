@@ -90,7 +90,7 @@ def test_the_live_page_has_what_returns_are_compared_with(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with_a_rough_optimum(monkeypatch)
+    with_a_coarse_optimum(monkeypatch)
     folder = tmp_path / "policies"
     shutil.copytree(policies, folder)
     manifest = json.loads((folder / "training.json").read_text())
@@ -128,18 +128,18 @@ def test_the_live_page_has_what_returns_are_compared_with(
         (["inspect", "no-such-file.nwb"], 1),
     ],
 )
-def test_the_exit_status_tells_a_command_line_that_cannot_be_read_from_other_errors(
+def test_a_command_line_that_cannot_be_read_has_another_exit_status_than_other_errors(
     command: list[str], status: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(command) == status
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def with_a_coarse_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The optimal return on a coarse grid, and a short search for the coupling; returns the resolutions asked for."""
     asked = []
 
-    def rough(*case: Any, resolution: float, **options: Any) -> Optimum:
+    def coarse(*case: Any, resolution: float, **options: Any) -> Optimum:
         asked.append(resolution)
         return best_return(*case, resolution=0.25, episodes=0, **options)
 
@@ -148,7 +148,7 @@ def with_a_rough_optimum(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     def narrow(*of: Any, resolution: float, **options: Any) -> Optimum:
         return with_interval(*of, resolution=0.25, resamples=3, **options)
 
-    monkeypatch.setattr("animat.evaluation.table.best_return", rough)
+    monkeypatch.setattr("animat.evaluation.table.best_return", coarse)
     monkeypatch.setattr(WellSampled, "with_interval", narrow)
     monkeypatch.setattr("animat.evaluation.coupling.GENERATIONS", 4)
     return asked
@@ -272,10 +272,10 @@ def test_evaluate_says_whose_work_it_is(recordings: Path, policies: Path, capsys
 
 
 @pytest.mark.oracle
-def test_evaluate_tells_the_optimum_of_the_recording_it_evaluates_on(
+def test_evaluate_reports_the_optimum_of_the_recording_it_evaluates_on(
     recordings: Path, policies: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = with_a_rough_optimum(monkeypatch)
+    asked = with_a_coarse_optimum(monkeypatch)
     command = ["evaluate", str(policies), "--recordings", str(recordings), "--at-min", "0"]
     assert main([*command, "--optimum", "--json"]) == 0
     said = capsys.readouterr().out

@@ -27,7 +27,7 @@ from animat.execution.jobs import PLANNED, Job, Jobs
 from animat.execution.local_cluster import local_cluster
 from animat.execution.task import Task, bring_back, carry_out_unshared, store
 from animat.progress import Progress, Silent
-from worker_tasks import Fail, Join, Sized, rest, tell_process
+from worker_tasks import Fail, Join, Sized, describe_process, rest
 
 TINY = Path(__file__).parent / "tiny_study.toml"
 
@@ -149,7 +149,7 @@ class Tried(Sized):
 @oracle
 def test_each_has_a_core_and_jobs_come_in_order(running: Running, tmp_path: Path) -> None:
     with Cluster(running.file) as cluster:
-        processes = [future.result() for future in [cluster.submit(tell_process) for _ in range(6)]]
+        processes = [future.result() for future in [cluster.submit(describe_process) for _ in range(6)]]
         assert all(len(cores) == 1 for _, cores in processes)
         assert len({process for process, _ in processes}) <= 2
         jobs = [Job(name, Join(name, tuple(of)), tuple(of)) for name, of in (("a", ""), ("b", "a"), ("c", "ab"))]
@@ -157,7 +157,7 @@ def test_each_has_a_core_and_jobs_come_in_order(running: Running, tmp_path: Path
         assert (tmp_path / "c").read_text() == "(c(a)(b(a)))"
     # Another client gets another process: what it has imported may have changed.
     with Cluster(running.file) as cluster:
-        assert cluster.submit(tell_process).result()[0] not in {process for process, _ in processes}
+        assert cluster.submit(describe_process).result()[0] not in {process for process, _ in processes}
 
 
 @oracle
@@ -299,7 +299,7 @@ def test_a_worker_of_another_version_is_named_and_gets_nothing(
             client.wait_for_workers(3, timeout=300)
         with Cluster(running.file) as cluster:
             warned = capsys.readouterr().err
-            processes = [future.result() for future in [cluster.submit(tell_process) for _ in range(12)]]
+            processes = [future.result() for future in [cluster.submit(describe_process) for _ in range(12)]]
         process.terminate()
     assert len({pid for pid, _ in processes}) <= 2
     assert re.fullmatch(r"warning: worker tcp://\S+: expected animat 0\.1\S+, jax .*, got animat 0\.0\..*\n", warned)

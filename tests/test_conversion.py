@@ -285,7 +285,7 @@ def test_an_experimenter_is_last_first(who: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("date", "is_told"),
+    ("date", "is_noted"),
     [
         ("2024-05-31T14:00:00", True),
         ("2024-05-31", True),
@@ -293,11 +293,11 @@ def test_an_experimenter_is_last_first(who: str) -> None:
         ("2024-05-31T14:00Z", False),
     ],
 )
-def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_told: bool, tmp_path: Path) -> None:
+def test_a_date_without_a_zone_is_taken_as_utc_with_a_note(date: str, is_noted: bool, tmp_path: Path) -> None:
     written = convert_recording(rig_file("npz", tmp_path), tmp_path / "out.nwb", Origin(recorded_at=date))
-    told = {finding.name: finding for finding in written.findings}
-    assert ("zone-unknown" in told) == is_told
+    findings = {finding.name: finding for finding in written.findings}
+    assert ("zone-unknown" in findings) == is_noted
     with h5py.File(tmp_path / "out.nwb") as file:
-        assert ("+00:00" in file["session_start_time"][()].decode()) == (is_told or date.endswith("Z"))
+        assert ("+00:00" in file["session_start_time"][()].decode()) == (is_noted or date.endswith("Z"))
     again = convert_recording(tmp_path / "out.nwb", tmp_path / "again.nwb")
     assert [finding.name for finding in again.findings] == [finding.name for finding in written.findings]

@@ -64,7 +64,7 @@ def test_a_device_that_fails_while_it_is_opened_is_let_go_of() -> None:
     assert culture.closed == 1
 
 
-def test_a_close_that_fails_is_told_and_takes_the_place_of_no_error() -> None:
+def test_a_close_that_fails_is_reported_and_replaces_no_other_error() -> None:
     class Stuck(ReplayCulture):
         def _close(self) -> None:
             raise OSError("no route to host")
@@ -99,7 +99,7 @@ def test_what_is_final_cannot_be_overridden(kind: type[Culture]) -> None:
 
 
 def test_the_contract_needs_no_pytest_and_no_compiled_tissue() -> None:
-    told = "import sys, animat.cultures.contract, animat.cultures.virtual, animat.cultures.series;"
-    told += "print([m for m in ('pytest', 'numba', 'jax', 'pynwb', 'matplotlib') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
+    script = "import sys, animat.cultures.contract, animat.cultures.virtual, animat.cultures.series;"
+    script += "print([m for m in ('pytest', 'numba', 'jax', 'pynwb', 'matplotlib') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
+import weakref
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -227,7 +229,7 @@ def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
         small_culture().restore_state(tmp_path / "none.state")
 
 
-def test_one_culture_is_told_in_one_text_however_its_numbers_are_written() -> None:
+def test_the_settings_of_a_culture_do_not_depend_on_how_numbers_are_written() -> None:
     facilitated = ShortTerm(1, 750, 0)
     whole = VirtualCulture(
         1, parameters=TissueParameters(ampa_ms=3, i_to_any=facilitated), rule=SelectionRule(spacing_um=18), scan_s=20
@@ -236,10 +238,10 @@ def test_one_culture_is_told_in_one_text_however_its_numbers_are_written() -> No
         1, parameters=TissueParameters(ampa_ms=3.0, i_to_any=ShortTerm(1.0, 750.0)), rule=SelectionRule(), scan_s=20.0
     )
     assert whole.settings == with_fractions.settings
-    # What recordings that are there say of the culture of every default.
-    told = VirtualCulture(1).settings
-    assert told["scan_s"] == "20.0"
-    rule, parameters = told["selection_rule"], told["tissue_parameters"]
+    # As existing recordings state them, with all defaults.
+    stated = VirtualCulture(1).settings
+    assert stated["scan_s"] == "20.0"
+    rule, parameters = stated["selection_rule"], stated["tissue_parameters"]
     assert rule == json.dumps(asdict(SelectionRule()))
     assert '"recording_sites": 1024, "signal_to_noise": 6.0, "spacing_um": 18.0, "stimulation_sites": 32' in rule
     assert parameters == json.dumps(asdict(TissueParameters()))
@@ -305,6 +307,19 @@ def test_a_culture_that_another_s_state_was_given_to_is_what_it_was(tmp_path: Pa
         restored.restore_state(tmp_path / "other.state")
     with restored:
         assert restored.record(SHORT).equals(recording)
+
+
+def test_a_dropped_culture_is_freed_without_garbage_collection() -> None:
+    gc.disable()
+    try:
+        with small_culture() as culture:
+            culture.deliver([stimulus(culture, 0.0)], 0.1)
+        tissue = culture.tissue
+        freed = [weakref.ref(each) for each in (culture, tissue, tissue._coupling, tissue._network)]
+        del culture, tissue
+        assert [each() for each in freed] == [None] * 4
+    finally:
+        gc.enable()
 
 
 def test_a_recording_comes_back_equal_from_its_file(tmp_path: Path) -> None:

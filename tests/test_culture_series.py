@@ -229,22 +229,22 @@ def test_a_recording_that_is_another_is_not_taken_for_it(undisturbed: list[Path]
         record(other)
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("is_stated", [True, False])
 def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
-    told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    is_stated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = VirtualCulture.settings
 
     def before(self: VirtualCulture) -> dict[str, str]:
-        # The first revision did not tell.
+        # The first revision did not state itself.
         named = settings.__get__(self)
-        return {key: words for key, words in named.items() if told or key != "tissue_revision"}
+        return {key: words for key, words in named.items() if is_stated or key != "tissue_revision"}
 
     with monkeypatch.context() as patched:
         patched.setattr("animat.cultures.tissue.parameters.REVISION", 1)
         patched.setattr(VirtualCulture, "settings", property(before))
         (file,) = record(tmp_path, sessions=1)
-    there = "1" if told else "nothing"
+    there = "1" if is_stated else "nothing"
     with pytest.raises(Mismatch, match=rf"_0000_min.nwb: expected .*\(tissue_revision: {there} there, 6 now\)"):
         record(tmp_path, sessions=2)
     with pytest.raises(Mismatch, match=r"culture.state: .* which differs in tissue_revision"):

@@ -164,7 +164,7 @@ def test_traces_are_the_same_in_any_layout(samples: int, n: int, kind: str, turn
 
 
 @pytest.mark.parametrize("samples", [2499, 2500, 7001])
-def test_the_noise_is_told_by_the_median(samples: int) -> None:
+def test_the_noise_is_estimated_from_the_median(samples: int) -> None:
     voltage = np.random.default_rng(2).normal(3, 5, (4, samples)).astype(np.float32)
     looked_at = voltage[:, :: max(samples // 2500, 1)]
     middle = np.median(looked_at, axis=1, keepdims=True)

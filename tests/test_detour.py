@@ -69,9 +69,9 @@ def test_goals_in_oblique_surroundings_are_where_a_body_touches_something_at_one
     ways = (start[axis] + along * (places[:, axis] - start[axis]) for axis in (0, 1))
     near = Surroundings(robot.walls, robot.obstacles).clearance_m(*ways).min(axis=0)
     drawn = set(map(tuple, robot._goals_m.tolist()))
-    told = np.abs(near - 0.035) > 1e-4
-    assert [tuple(place) in drawn for place in places[told].tolist()] == (near[told] < 0.035).tolist()
-    assert 0.2 * len(places) < len(drawn) < 0.8 * len(places) and told.mean() > 0.99
+    is_clear = np.abs(near - 0.035) > 1e-4
+    assert [tuple(place) in drawn for place in places[is_clear].tolist()] == (near[is_clear] < 0.035).tolist()
+    assert 0.2 * len(places) < len(drawn) < 0.8 * len(places) and is_clear.mean() > 0.99
 
 
 def test_its_body_is_that_of_wheels() -> None:

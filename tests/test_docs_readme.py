@@ -32,8 +32,8 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 
 def test_every_page_is_in_the_source_distribution() -> None:
-    told = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    included = told["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    included = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
     assert {page.relative_to(ROOT).parts[0] for page in PAGES} <= set(included)
 
 
@@ -75,9 +75,9 @@ def test_the_examples_in_python_run(
     wrapped, followed, loaded = re.findall(r"```python\n(.*?)```", training_page, flags=re.DOTALL)
     exec(compile(wrapped, "training.md", "exec"), {})
     assert capsys.readouterr().out == "1 1.0 False\n"
-    # With the README's training, which is done: its rows are told all the same.
+    # With the README's training, which is done: its rows are printed all the same.
     exec(compile(followed, "training.md", "exec"), names)
-    told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
-    assert {policy for policy, _ in told} == {"p0", "p1"} and {iterations for _, iterations in told} >= {"6400"}
+    rows = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    assert {policy for policy, _ in rows} == {"p0", "p1"} and {iterations for _, iterations in rows} >= {"6400"}
     exec(compile(loaded, "training.md", "exec"), {})
     assert capsys.readouterr().out.strip() in ("5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz")

@@ -95,7 +95,7 @@ def test_products_are_the_combinations_that_occur() -> None:
         ("5 Hz, pattern 1", (5.0,), ((3, 4, 5),), False),
         ("10 Hz, pattern 0", (10.0,), ((1, 2),), False),
     ]
-    # Pulses 0.1 s apart, at no stated frequency: their intervals tell it.
+    # Pulses 0.1 s apart, at no stated frequency: it follows from their intervals.
     (last,) = conditions_named("interval:10 x electrode:1+2").assign(stimuli).conditions
     assert description((last,)) == [("10 Hz, electrodes 1+2", (10.0,), ((1, 2),), False)]
     for text in ("frequency:5,80 x pattern:0,3", "interval:5,10+-25% x electrode:3,1+2"):

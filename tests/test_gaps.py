@@ -41,12 +41,12 @@ def test_a_clock_that_does_not_start_at_0_causes_a_warning_and_its_start_can_be_
     finding = next(f for f in recording_findings(source) if f.name == "start-unknown")
     assert finding.severity == "warning" and "animat convert --start-s" in finding.message
     assert f"the first event is at {source.spike_times_s[0]:.12g} s" in finding.message
-    told = read_recording(path, start_s=from_s)
-    assert not {"start-unknown", "silence", "times-not-in-seconds"} & set(said(told))
-    assert (told.start_s, told.stop_s) == (from_s, source.stop_s)
-    assert said(told)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, instead of 0 s"
+    with_start = read_recording(path, start_s=from_s)
+    assert not {"start-unknown", "silence", "times-not-in-seconds"} & set(said(with_start))
+    assert (with_start.start_s, with_start.stop_s) == (from_s, source.stop_s)
+    assert said(with_start)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, instead of 0 s"
     assert "start-given" not in said(read_recording(path, start_s=0.0))
-    inspection = inspect_recording(told)
+    inspection = inspect_recording(with_start)
     # 20,000 spikes on 30 channels in 600 s, independent of each other.
     assert inspection.spontaneous_rate_hz == pytest.approx(20_000 / 30 / 600, rel=1e-3)
     assert inspection.network_bursts is not None and len(inspection.network_bursts) == 0

@@ -18,34 +18,34 @@ from animat.evaluation.rollouts import Actor
 from animat.robots import Cartpole, Quantity, Robot
 
 
-class Told(NamedTuple):
+class Sensing(NamedTuple):
     sensed: jax.Array
     goal: jax.Array
 
 
 @dataclass(frozen=True)
-class Telling(Robot[Told]):
+class Sensor(Robot[Sensing]):
     """Senses 0 or 1, drawn in each iteration; its goal is one of four, drawn at the start."""
 
     episode_limit: int = 5
-    name = "telling"
+    name = "sensor"
     noise_size = 1
 
     @property
     def observation_spec(self) -> tuple[Quantity, ...]:
         return (Quantity("sensed", "1", 2.0), Quantity("goal", "1", 4.0, of_goal=True))
 
-    def reset(self, key: Any) -> Told:
+    def reset(self, key: Any) -> Sensing:
         one, other = jax.random.uniform(key, (2,))
-        return Told(jnp.floor(2 * one), jnp.floor(4 * other))
+        return Sensing(jnp.floor(2 * one), jnp.floor(4 * other))
 
-    def advance(self, uniforms: Any, state: Told, u: Any) -> tuple[Told, Any, Any]:
-        return Told(jnp.floor(2 * uniforms[0]), state.goal), jnp.float32(0.0), jnp.bool_(False)
+    def advance(self, uniforms: Any, state: Sensing, u: Any) -> tuple[Sensing, Any, Any]:
+        return Sensing(jnp.floor(2 * uniforms[0]), state.goal), jnp.float32(0.0), jnp.bool_(False)
 
-    def observe(self, state: Told) -> Any:
+    def observe(self, state: Sensing) -> Any:
         return jnp.stack(state)
 
-    def with_goal_of(self, state: Told, other: Told) -> Told:
+    def with_goal_of(self, state: Sensing, other: Sensing) -> Sensing:
         return state._replace(goal=other.goal)
 
 
@@ -62,7 +62,7 @@ class Choosing(Actor):
         return jnp.sum(uniforms >= below, axis=-1)
 
 
-ENVIRONMENT = WithoutNeurons(Telling(), (-1.0, 0.0, 1.0))
+ENVIRONMENT = WithoutNeurons(Sensor(), (-1.0, 0.0, 1.0))
 
 
 def closed_form(probabilities: np.ndarray) -> float:
@@ -135,4 +135,4 @@ def test_what_has_one_goal_or_continuous_actions_has_none() -> None:
     with pytest.raises(InvalidArgument, match="cartpole has no method `with_goal_of`"):
         goal_information(WithoutNeurons(Cartpole(), (-1.0, 1.0)), None, actors)
     with pytest.raises(InvalidArgument, match="expected discrete actions"):
-        goal_information(WithoutNeurons(Telling(), None), None, actors)
+        goal_information(WithoutNeurons(Sensor(), None), None, actors)

@@ -68,7 +68,7 @@ def along(goal: str, xs: list[float], limit: int = 4) -> tuple[list[float], list
         ends.append(bool(ended))
         if ended:
             break
-    # The log of a closed loop has the same to tell.
+    # The log of a closed loop gives the same outcome.
     by_log = robot.outcome_of(np.array([[robot.robot.start_m], *([x] for x in xs[: len(rewards)])], np.float32))
     for of_state, of_log in zip(robot.outcome(state), by_log, strict=True):
         np.testing.assert_array_equal(of_state, of_log)

@@ -59,8 +59,8 @@ def test_what_is_learned_from_is_shaped_and_what_is_reported_is_not() -> None:
 def test_trainings_are_described_with_their_goal() -> None:
     plain = Training(Cartpole(), None)
     assert "goal" not in plain.to_dict() and plain.to_dict()["robot"]["name"] == "cartpole"
-    told = Training(with_goal("cartpole", GOAL), None).to_dict()
-    assert {**told, "goal": None} == {**plain.to_dict(), "goal": None} and told["goal"] == GOAL
+    data = Training(with_goal("cartpole", GOAL), None).to_dict()
+    assert {**data, "goal": None} == {**plain.to_dict(), "goal": None} and data["goal"] == GOAL
     own = Study(robots=(RobotSpec("cartpole"),))
     assert "goal" not in study_to_toml(own)
 
@@ -77,9 +77,9 @@ def test_policies_carry_their_goal_and_are_evaluated_with_it(tmp_path: Path) -> 
     with pytest.raises(Mismatch, match="goal"):
         expect_folder_for(replace(training, robot=with_goal("cartpole", GOAL + " weight 2")), tmp_path)
     evaluation = evaluate(trained, None, episodes=3, controls=("heuristic",))
-    told = evaluation.to_dict()
-    assert told["objectives"] == GOAL.split("; ")
-    heuristic = next(row for row in told["rows"] if row["name"] == "heuristic")
+    data = evaluation.to_dict()
+    assert data["objectives"] == GOAL.split("; ")
+    heuristic = next(row for row in data["rows"] if row["name"] == "heuristic")
     assert heuristic["success_share"] == 1 and heuristic["satisfaction_percent"] == pytest.approx([100] * 3)
     text = evaluation.to_text()
     assert re.search(r"ended early\s+success\s+satisfied\s+margin", text)
@@ -105,8 +105,8 @@ def test_the_command_line_takes_a_goal(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["evaluate", out, "--episodes", "2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["objectives"] == GOAL.split("; ")
     assert main(["train", *given, "--goal", "drive cart_positon in -10..10 cm"]) == 1
-    told = capsys.readouterr().err
-    assert "did you mean cart_position?" in told and told.count("\n") == 1
+    error = capsys.readouterr().err
+    assert "did you mean cart_position?" in error and error.count("\n") == 1
 
 
 def test_a_study_has_a_goal_in_its_file(tmp_path: Path) -> None:
@@ -131,8 +131,8 @@ def test_a_study_tabulates_how_far_each_objective_was_met(tmp_path: Path) -> Non
         ran[spec.name] = roll_out(
             WithoutNeurons(spec.robot(), (-0.1, 0.1)), None, Constant(jnp.array([0, 1])), episodes=2, seed=1
         )
-        told = {"robot": spec.name, "arm": "a", "at_min": 0.0}
-        parts.append(write_episodes(tmp_path / f"{spec.name}.npz", [episode_rows(ran[spec.name], **told)]))
+        labels = {"robot": spec.name, "arm": "a", "at_min": 0.0}
+        parts.append(write_episodes(tmp_path / f"{spec.name}.npz", [episode_rows(ran[spec.name], **labels)]))
     table = read_episodes(parts)
     rows = list(goals_met(Study(robots=specs, arms=(Arm("a"),)), table))
     assert [(row.robot, row.objective) for row in rows] == [("cartpole", each) for each in goal.split("; ")]
@@ -158,9 +158,9 @@ def test_a_closed_loop_reports_outcomes_of_whole_episodes_by_observations() -> N
         SimpleNamespace(number=i, start=start, is_whole=i < 2) for i, start in enumerate(starts)
     ]  # the last one was broken off
     session: Any = SimpleNamespace(episodes=episodes, ticks=ticks)
-    told = outcomes(robot, session)
-    assert list(told) == [0, 1] and [bool(each.succeeded) for each in told.values()] == [True, False]
-    np.testing.assert_allclose([each.margin for each in told.values()], [0.1, -0.1], atol=1e-6)
+    found = outcomes(robot, session)
+    assert list(found) == [0, 1] and [bool(each.succeeded) for each in found.values()] == [True, False]
+    np.testing.assert_allclose([each.margin for each in found.values()], [0.1, -0.1], atol=1e-6)
     assert outcomes(Navigation(), session) == {}
 
 

@@ -209,7 +209,7 @@ def test_arms_of_a_study_share_programs_and_those_that_are_not_trained_have_none
 
 def test_a_device_s_memory_decides_on_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     groups = [group_of(SHORTEST, i) for i in range(3)]
-    assert parts_that_fit(groups) == [[0, 1, 2]]  # A processor tells no limit.
+    assert parts_that_fit(groups) == [[0, 1, 2]]  # A processor has no known limit.
     monkeypatch.setattr(training_task, "bytes_at_once", lambda groups: 9 * len(groups))
     for available, parts in (
         (30.0, [[0, 1, 2]]),

@@ -30,7 +30,7 @@ def quiet() -> TissueParameters:
     """50 neurons without noise, driven so that they spike, close enough for delays under a refractory period.
 
     A spike scales as much as in 1,200 neurons: where many spike in one step, Brian2 scales all before any is sent. The
-    drive is one at which no neuron comes so near to its threshold that single precision cannot tell: of 28,000 spikes
+    drive is one at which no neuron comes too near to its threshold for single precision: of 28,000 spikes
     one or a few do (at 24 mV one of seed 2, which is 1.2e-6 mV below in one step, and spikes in the next).
     """
     parameters = TissueParameters(neurons=50, width_um=400.0, height_um=400.0, in_degree_e=12, in_degree_i=5)
@@ -43,16 +43,16 @@ def pulse() -> Pulse:
     return Pulse(0.05, np.array([120.0, 300.0]), np.array([150.0, 280.0]))
 
 
-def steps_aside(seed: int, pulses: list[Pulse], told: TissueParameters | None = None) -> np.ndarray:
+def steps_aside(seed: int, pulses: list[Pulse], changed: TissueParameters | None = None) -> np.ndarray:
     """By how many steps each spike of the kernel is aside from Brian2's; every neuron must spike as often in both.
 
-    `told` are other parameters for Brian2.
+    `changed` are the parameters for Brian2, if they are others.
     """
     parameters = quiet()
     tissue = Tissue(seed, parameters)
     kicks = [tissue._coupling.kicks(pulse, round(pulse.time_s * 1000 / parameters.step_ms)) for pulse in pulses]
     reference = Brian2Tissue(
-        told or parameters,
+        changed or parameters,
         tissue._network,
         tissue._wiring.needed,
         tissue._state.v_mv.astype(float),
@@ -80,4 +80,4 @@ def test_the_same_spikes_at_the_same_steps(seed: int, pulses: list[Pulse]) -> No
 def test_what_is_a_little_different_is_noticed(change: dict[str, float]) -> None:
     with pytest.raises(AssertionError):
         for seed in range(1, 6):
-            assert np.max(steps_aside(seed, [pulse()], told=replace(quiet(), **change))) == 0
+            assert np.max(steps_aside(seed, [pulse()], changed=replace(quiet(), **change))) == 0

@@ -66,7 +66,7 @@ CULTURES = (1, 2, 3)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[int, SimulatorTimeline]:
-    """The simulator at 0 min of each culture; one with memory would tell the optimum what policies do not see."""
+    """The simulator at 0 min of each culture; with memory, the optimum would know what policies do not see."""
     timelines = {}
     for seed in CULTURES:
         folder = tmp_path_factory.mktemp(f"culture{seed}")

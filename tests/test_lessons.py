@@ -369,7 +369,7 @@ def test_assessments_alone_change_nothing_of_what_is_learned(tmp_path: Path) -> 
     assert not (tmp_path / "None" / "best").exists()
 
 
-def test_trainings_are_told_apart_by_lessons_and_assessments() -> None:
+def test_trainings_with_other_lessons_or_assessments_have_other_fingerprints() -> None:
     plain = describe(SHORT, timeline_of())
     others = [replace(SHORT, assess=4), TAUGHT, replace(SHORT, shadowing="drawn")]
     assert len({plain["fingerprint"], *(describe(other, timeline_of())["fingerprint"] for other in others)}) == 4

@@ -60,7 +60,7 @@ def test_a_replay_is_recorded_at_its_minutes(tmp_path: Path) -> None:
 
 
 @pytest.mark.oracle
-def test_what_is_due_next_is_recorded_and_what_was_missed_is_told(tmp_path: Path) -> None:
+def test_what_is_due_next_is_recorded_and_missed_recordings_are_listed(tmp_path: Path) -> None:
     with FakeCulture() as culture:
         first = record_series(lambda: culture, SHORT, tmp_path, sessions=2, interval_min=1.0)
         kept = [file.read_bytes() for file in first.files]
@@ -277,9 +277,9 @@ def test_the_command_records_a_replay(tmp_path: Path, capsys: pytest.CaptureFixt
         str(tmp_path / "out"),
     ]
     assert main([*command, "--recordings", str(tmp_path / "synthetic"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert [Path(file).name for file in told["recordings"]] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
-    assert read_recording(told["recordings"][1]).start_min == pytest.approx(10.0)
+    data = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert [Path(file).name for file in data["recordings"]] == ["recording_0000_min.nwb", "recording_0010_min.nwb"]
+    assert read_recording(data["recordings"][1]).start_min == pytest.approx(10.0)
     for wrong in (command, ["record", "--selection", "x.json"], ["record", "--culture", "maxone"]):
         assert main(wrong) != 0
         error = capsys.readouterr().err.strip()

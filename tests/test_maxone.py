@@ -190,7 +190,7 @@ def test_a_stop_takes_the_power_and_says_what_was_sent(rig: Rig) -> None:
     assert len(rig.delivered) == 5
 
 
-def test_power_that_stays_on_is_told(rig: Rig) -> None:
+def test_power_that_stays_on_is_reported(rig: Rig) -> None:
     def refuse(command: Any) -> str:
         return "Error" if command.kind == "core" else str(send(command))
 
@@ -287,8 +287,8 @@ def test_a_device_that_does_not_answer_is_one_line(rig: Rig, monkeypatch: pytest
     # What could not be done about it is in the notes: that the power is on, for one, which is not known.
     assert any("expected it to close, got ConnectionRefusedError" in note for note in failed.value.__notes__)
     rig.is_gone = False
-    for told in ("", None, "nan", "-1"):
-        rig.lsb_mv = told
+    for step in ("", None, "nan", "-1"):
+        rig.lsb_mv = step
         with pytest.raises(DeviceFailed, match="expected the converter's step"):
             culture_on(rig).open()
     monkeypatch.setattr(sys.modules["maxlab"], "initialize", lambda: [][0])

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.numpy import save
 
 import animat.gym  # noqa: F401
 from animat.cli.train import _memories
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.evaluation.commands import CLASSES, commands_after
 from animat.evaluation.heuristic import heuristic_policy
 from animat.evaluation.optimum import best_return, best_returns
@@ -220,7 +221,7 @@ def test_a_load_is_found_where_there_is_one_and_not_where_there_is_none() -> Non
         memory = fit_memory(replace(responses, presented=every, place=np.arange(600))).memory
         assert memory != NO_MEMORY
         none += not memory.load_s
-    # One in a hundred by chance, and a little more: the trace tells not all of a step.
+    # One in a hundred by chance, and a few more, as the trace does not contain everything about a step.
     assert none >= 36
 
 
@@ -446,6 +447,25 @@ def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> N
     assert Simulators(kind=kind).kind == loaded.fitted["kind"] == kind
 
 
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "No such file"),
+        (b"{}", "header"),
+        (save({"a": np.zeros(3)}), "no entry 'animat'"),
+        (save({"a": np.zeros(3)}, {"animat": '{"format": "a policy"}'}), "no entry 'conditions'"),
+    ],
+)
+def test_a_file_of_another_kind_is_no_simulators(content: bytes | None, reason: str, tmp_path: Path) -> None:
+    path = tmp_path / "timeline.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InvalidFile) as error:
+        load_timeline(path)
+    assert str(error.value).startswith(f"{path}: expected simulators as animat study and animat tune write them, got ")
+    assert reason in str(error.value) and str(error.value).endswith("; run the command again to replace it")
+
+
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_a_report_says_how_its_simulators_differ_from_the_papers(kind: Kind) -> None:
     said = dict(decisions(replace(paper_study(), simulators=Simulators(kind=kind))))
@@ -563,7 +583,7 @@ def network(seed: int, spikes: float, n: int = 3000) -> Responses:
 def test_the_fewer_the_spikes_the_more_the_stimulus_weighs_in_the_trace(seed: int) -> None:
     many = fit_memory(network(seed, spikes=300)).memory
     few = fit_memory(network(seed, spikes=3)).memory
-    # The network's own: what it remembers is its activity, which so many spikes tell as it is.
+    # The network's own: it remembers its activity, which so many spikes measure well.
     assert (many.decay, many.weight) == (pytest.approx(0.3), 0.0)
     assert few.weight >= 2
 
@@ -574,7 +594,7 @@ def test_without_memory_in_the_responses_there_is_mostly_none_in_the_simulator()
     for seed in range(60):
         simulator = fit_memory(independent(seed))
         none += simulator.memory == NO_MEMORY
-    # The best of many memories tells by chance a little more than none: two standard errors keep that part small.
+    # By chance the best of many memories predicts a little better than none: two standard errors keep that part small.
     assert none >= 54
     assert not any(
         np.all(each.nearest == each.followers)

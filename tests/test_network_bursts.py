@@ -53,9 +53,9 @@ def test_a_recording_without_stimuli_is_described(tmp_path: Path, capsys: pytest
     assert figure.axes[0].collections[0].get_offsets().shape[0] == len(source.spike_times_s)
     write_nwb(source, tmp_path / "a.nwb")
     assert main(["inspect", str(tmp_path / "a.nwb"), "--out", str(tmp_path / "figures"), "--json"]) == 1
-    told = capsys.readouterr().out
-    assert "figures of the series" not in told
-    assert '"network_bursts": {"bursts": 3' in told
+    printed = capsys.readouterr().out
+    assert "figures of the series" not in printed
+    assert '"network_bursts": {"bursts": 3' in printed
     assert [file.name for file in (tmp_path / "figures").iterdir()] == ["a-raster.png"]
 
 

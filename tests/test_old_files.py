@@ -39,16 +39,16 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(old: Path) -> dict[str, Any]:
-    said: dict[str, Any] = json.loads((old / "told.json").read_text())
-    return said
+def expected(old: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((old / "told.json").read_text())
+    return content
 
 
 def test_recordings_are_what_they_were(
-    old: Path, told: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    old: Path, expected: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recordings = read_recordings([old / "recordings"])
-    for recording, was in zip(recordings, told["recordings"], strict=True):
+    for recording, was in zip(recordings, expected["recordings"], strict=True):
         assert recording.start_min == was["start_min"]
         assert recording.channels.label.tolist() == was["channels"]
         assert (len(recording.spike_times_s), len(recording.stimuli)) == (was["spikes"], was["stimuli"])
@@ -56,18 +56,18 @@ def test_recordings_are_what_they_were(
         assert recording.stimuli.time_s.sum() == pytest.approx(was["stimulus_times_s"], rel=1e-12)
         assert sorted(set(recording.stimuli.frequency_hz.tolist())) == was["frequencies_hz"]
         assert str(recording.presentation) == was["presentation"].replace("a presentation", "per trial")
-    assert [each.rate_hz.tolist() for each in extract_series(recordings)] == told["rate_hz"]
+    assert [each.rate_hz.tolist() for each in extract_series(recordings)] == expected["rate_hz"]
     assert main(["inspect", str(old / "recordings")]) == 0
     assert capsys.readouterr().out.count("usable") == 2
 
 
 @pytest.mark.oracle
 def test_a_policy_acts_as_it_did_and_is_evaluated_and_run(
-    old: Path, told: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    old: Path, expected: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     policy = Policy.load(old / "policies" / "p0.safetensors")
-    assert [condition.label for condition in policy.conditions] == told["policy"]["conditions"]
-    for seen, was in zip(([0.5, 0.2, 1.0], [0.1, 0.9, -2.0]), told["policy"]["probabilities"], strict=True):
+    assert [condition.label for condition in policy.conditions] == expected["policy"]["conditions"]
+    for seen, was in zip(([0.5, 0.2, 1.0], [0.1, 0.9, -2.0]), expected["policy"]["probabilities"], strict=True):
         np.testing.assert_allclose(policy.probabilities(np.array(seen)), was, rtol=1e-5)
     given = [str(old / "policies"), "--recordings", str(old / "recordings"), "--json"]
     assert main(["evaluate", *given]) == 0
@@ -78,10 +78,10 @@ def test_a_policy_acts_as_it_did_and_is_evaluated_and_run(
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["session"]["ended_by"] == "plan"
 
 
-def test_a_session_is_read_and_its_recording_written_again(old: Path, told: dict[str, Any], tmp_path: Path) -> None:
+def test_a_session_is_read_and_its_recording_written_again(old: Path, expected: dict[str, Any], tmp_path: Path) -> None:
     shutil.copytree(old / "session", tmp_path / "session")
     session = read_session(tmp_path / "session")
-    was = told["session"]
+    was = expected["session"]
     assert session.ending.by == was["ended_by"]
     assert sum(episode.pulses for episode in session.episodes) == was["pulses"]
     assert "warm-up" in {tick.handled for tick in session.ticks}
@@ -150,9 +150,9 @@ def test_channels_are_read_and_a_culture_that_was_made_up_is_refused(old: Path, 
 
 
 def test_a_trainings_folder_is_left_to_the_version_that_began_it(old: Path) -> None:
-    told = json.loads((old / "policies" / "training.json").read_text())["training"]
-    training = Training(robot_of(told), told["mapping"], told["policies"], told["iterations"], told["seed"])
-    training = replace(training, duration_min=told["duration_min"])
+    begun = json.loads((old / "policies" / "training.json").read_text())["training"]
+    training = Training(robot_of(begun), begun["mapping"], begun["policies"], begun["iterations"], begun["seed"])
+    training = replace(training, duration_min=begun["duration_min"])
     with pytest.raises(Mismatch, match=r"^[^\n]* got one of another .*; give another folder"):
         expect_folder_for(training, old / "policies")
     with pytest.raises(Mismatch, match=r"^[^\n]* got one of another .*; give another folder"):

@@ -19,8 +19,8 @@ from animat.coding.mapping import Thresholds
 from animat.environment import Animat
 from animat.errors import UnusableData
 from animat.evaluation.optimal_returns import optimal_returns
-from animat.evaluation.optimum import Optimum, best_return, rough_values
-from animat.evaluation.resampling import WellSampled, _rough
+from animat.evaluation.optimum import Optimum, best_return, optimal_values
+from animat.evaluation.resampling import WellSampled, _coarse
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
 from animat.recordings.formats.nwb import write_nwb
@@ -57,8 +57,8 @@ def test_it_is_the_optimum_of_the_default_simulator_above_random_and_constant_st
 def test_inspect_reports_the_optimum(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rough = partial(optimal_returns, resolution=0.25, episodes=20, resamples=4)
-    monkeypatch.setattr("animat.evaluation.optimal_returns.optimal_returns", rough)
+    coarse = partial(optimal_returns, resolution=0.25, episodes=20, resamples=4)
+    monkeypatch.setattr("animat.evaluation.optimal_returns.optimal_returns", coarse)
     write_nwb(synthetic_recording(1, patterns=40, channels=64), tmp_path / "a.nwb")
     assert main(["inspect", str(tmp_path / "a.nwb"), "--optimum", "cartpole", "--json"]) == 0
     said = capsys.readouterr().out.splitlines()
@@ -174,8 +174,8 @@ def test_the_ends_of_the_interval_are_the_least_and_the_most_of_what_was_bootstr
     known = sampled.with_interval(best, resolution=0.25)
     rng = np.random.default_rng(1)
     simulators = [fit_histogram(each) for each in (responses, *(responses.bootstrapped(rng) for _ in range(39)))]
-    grid = _rough(grid_for(SHORT), 0.25)
-    values, _ = rough_values([(environment, each) for each in simulators], grid, 1)
+    grid = _coarse(grid_for(SHORT), 0.25)
+    values, _ = optimal_values([(environment, each) for each in simulators], grid, 1)
     moved = values[1:] - values[0]
     low, high = min(moved.min(), -moved.max()), moved.max()
     assert known.interval is not None

@@ -12,7 +12,7 @@ import pytest
 
 from animat.errors import UnsafeStimulus
 from animat.execution.pinned import PinnedProcesses
-from worker_tasks import die, refuse, rest, tell_process
+from worker_tasks import describe_process, die, refuse, rest
 
 CORE = min(os.sched_getaffinity(0))
 
@@ -47,18 +47,18 @@ def test_it_keeps_to_the_contract_of_an_executor(make: Callable[[], Executor]) -
 
 @pytest.mark.oracle
 def test_a_process_stays_until_it_has_grown_large(one: Executor) -> None:
-    first, second, third = (one.submit(tell_process, mib).result() for mib in (0, 900, 0))
+    first, second, third = (one.submit(describe_process, mib).result() for mib in (0, 900, 0))
     assert first == second
     assert first[0] != third[0]
     assert first[1] == third[1] == [CORE]
 
 
 def test_ctrl_c_of_the_terminal_does_not_reach_a_process(one: Executor) -> None:
-    process, _ = one.submit(tell_process).result()
+    process, _ = one.submit(describe_process).result()
     assert os.getpgid(process) != os.getpgid(0)
 
 
-def test_work_whose_process_dies_is_told_apart_and_the_next_finds_another(one: Executor) -> None:
+def test_work_whose_process_dies_fails_and_the_next_gets_another_process(one: Executor) -> None:
     with pytest.raises(BrokenExecutor, match="its process ended with status 7"):
         one.submit(die).result()
     assert one.submit(rest, 0.0).result() == 0.0
@@ -66,7 +66,7 @@ def test_work_whose_process_dies_is_told_apart_and_the_next_finds_another(one: E
 
 def test_left_by_an_error_it_ends_what_runs() -> None:
     with pytest.raises(ValueError, match="no"), PinnedProcesses([CORE, CORE]) as executor:
-        process, _ = executor.submit(tell_process).result()
+        process, _ = executor.submit(describe_process).result()
         running = [executor.submit(rest, 600.0) for _ in range(2)]
         waiting = executor.submit(rest, 600.0)
         while not all(future.running() for future in running):

@@ -212,7 +212,7 @@ def test_phases_of_a_part_never_go_back() -> None:
     whole = EqualPhases(Seen(), 4)
     for done in (0, 5, 10):
         whole.update(done, 10)
-    # Of a phase that tells nothing nothing is added.
+    # A phase that reports nothing adds nothing.
     for title in ("silent", "second", "third", "one more than planned"):
         phase = in_phase(whole, title)
         for done in () if title == "silent" else (0, 1):

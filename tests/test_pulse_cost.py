@@ -201,7 +201,7 @@ def test_a_policy_learns_the_action_that_is_best_with_the_cost(cost: float, best
     for policy in range(2):
         actor = jax.tree.map(lambda leaf, of=policy: leaf[of], learners.deployed)
         assert int(likeliest_action(environment, actor, jnp.ones((1, 1)))[0]) == best
-    # What is told is the return of the task, which costs take nothing from: from -5 to 5.
+    # Returns are reported without the costs: they are from -5 to 5.
     assert np.all(np.abs(finished.returns / finished.episodes) <= 5)
 
 
@@ -220,13 +220,13 @@ class PaidLess(Payer):
 def test_a_cost_is_learned_from_as_if_the_robot_were_paid_less() -> None:
     """Where all conditions cost the same the two are one task; in quarters nothing is rounded, and bits are equal."""
     costing = TrialCosts(Animat(Payer(episode_limit=4), Thresholds(1), 2), (0.25, 0.25))
-    (one, told), (other, told_less) = learned(costing, 40), learned(Animat(PaidLess(), Thresholds(1), 2), 40)
+    (one, finished), (other, finished_less) = learned(costing, 40), learned(Animat(PaidLess(), Thresholds(1), 2), 40)
     for a, b in zip(jax.tree.leaves(one.trained), jax.tree.leaves(other.trained), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(one.replay, other.replay)
     np.testing.assert_array_equal(one.exploration.returns, other.exploration.returns)
-    np.testing.assert_array_equal(told.episodes, told_less.episodes)
-    np.testing.assert_array_equal(told.returns, told_less.returns + told.episodes)
+    np.testing.assert_array_equal(finished.episodes, finished_less.episodes)
+    np.testing.assert_array_equal(finished.returns, finished_less.returns + finished.episodes)
 
 
 @pytest.mark.oracle
@@ -242,9 +242,9 @@ def test_a_body_that_is_stepped_on_the_host_pays_too() -> None:
         if environment is not plain:
             each = environment.costs[0] * np.asarray(more.episodes.iteration)
             np.testing.assert_allclose(np.asarray(more.episodes.info["cost"]), each)
-    (free, told), (as_free, told_too), (costing, _) = replays
+    (free, total), (as_free, same_total), (costing, _) = replays
     np.testing.assert_array_equal(free, as_free)
-    assert told == told_too
+    assert total == same_total
     # The first round is acted alike, whatever is learned after it.
     n = SMALL.environments
     np.testing.assert_allclose(free[:n, -2] - costing[:n, -2], SMALL.reward_scale * 0.25, atol=1e-6)
@@ -295,11 +295,11 @@ def test_a_cost_travels_with_policies(tmp_path: Path, responses: Responses) -> N
     with pytest.raises(Mismatch, match="the same pulse_cost as"):
         evaluate({"p": costly["p0"], "q": policies["p0"]}, timeline, episodes=3)
     whole = (tmp_path / "costly" / "p0.safetensors").read_bytes()
-    told = b'\\"pulse_cost\\": 0.5'
-    # Told by its provenance too.
-    assert whole.count(told) == 2
+    entry = b'\\"pulse_cost\\": 0.5'
+    # Its provenance has it too.
+    assert whole.count(entry) == 2
     for other in (b"-9 ", b"NaN", b"[1]"):
-        (tmp_path / "other.safetensors").write_bytes(whole.replace(told, told.replace(b"0.5", other)))
+        (tmp_path / "other.safetensors").write_bytes(whole.replace(entry, entry.replace(b"0.5", other)))
         with pytest.raises(InvalidFile, match="got a faulty one: pulse_cost: expected"):
             Policy.load(tmp_path / "other.safetensors")
 
@@ -336,10 +336,10 @@ def test_an_evaluation_counts_what_each_agent_gives(responses: Responses) -> Non
     assert rows["silent"].to_dict()["electrode_pulses"] == 0.0
     assert rows["random"].electrode_pulses == pytest.approx(np.mean(COUNTS) * lengths["random"], rel=0.2)
     for row in rows.values():
-        told = row.to_dict()
+        data = row.to_dict()
         presented = row.episodes.presented @ np.array(COUNTS)
-        assert told["electrode_pulses"] * 40 * len(presented) == pytest.approx(presented.sum()) or row.name == "silent"
-        assert told["net_return"] == told["mean_return"] - 0.3 * told["electrode_pulses"]
+        assert data["electrode_pulses"] * 40 * len(presented) == pytest.approx(presented.sum()) or row.name == "silent"
+        assert data["net_return"] == data["mean_return"] - 0.3 * data["electrode_pulses"]
     assert table.net_optimum is not None and table.optimum is not None
     assert table.net_optimum.value <= table.optimum.value + 1e-6
     assert max(row.to_dict()["net_return"] or 0 for row in rows.values()) <= table.net_optimum.value + 0.5
@@ -376,13 +376,13 @@ def test_in_a_loop_nothing_is_lost(pulses: int, tmp_path: Path, monkeypatch: pyt
     episodes = sums.agg(total=("reward", "sum"), given=("electrode_pulses", "sum")).reset_index()
     for row in gap.rows:
         of = episodes[episodes["agent"].isin(policies if row.name == "policies" else [row.name])]
-        told = row.to_dict()
-        assert told["electrode_pulses"] == of["given"].sum() / len(of)
-        assert sorted(told["measured_returns"]) == pytest.approx(sorted(of["total"]), rel=1e-15, abs=1e-13)
-        assert told["net"] == told["measured"] - 0.3 * told["electrode_pulses"]
-        assert told["net"] == pytest.approx((of["total"] - 0.3 * of["given"]).mean(), rel=1e-12)
-        predicted = told["predicted"] - 0.3 * told["predicted_electrode_pulses"]
-        assert told["predicted_net"] == predicted
+        data = row.to_dict()
+        assert data["electrode_pulses"] == of["given"].sum() / len(of)
+        assert sorted(data["measured_returns"]) == pytest.approx(sorted(of["total"]), rel=1e-15, abs=1e-13)
+        assert data["net"] == data["measured"] - 0.3 * data["electrode_pulses"]
+        assert data["net"] == pytest.approx((of["total"] - 0.3 * of["given"]).mean(), rel=1e-12)
+        predicted = data["predicted"] - 0.3 * data["predicted_electrode_pulses"]
+        assert data["predicted_net"] == predicted
     text = gap.to_text()
     assert "electrode pulses  predicted net" in text and "; the optimal return ignores the cost" in text
     silent = next(row for row in gap.rows if row.name == "silent")
@@ -402,16 +402,16 @@ def test_constant_agents_cost_what_they_should_on_a_simulator() -> None:
 
 
 @pytest.mark.oracle
-def test_the_commands_train_and_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_and_evaluate_report_the_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, out = tmp_path / "recordings", tmp_path / "policies"
     folder.mkdir()
     write_nwb(recorded(), folder / "one.nwb")
     asked = ["train", "cartpole", "--recordings", str(folder), "--conditions", "electrode", "--out", str(out)]
     short = ["--iterations", "600", "--policies", "2", "--sac", "hidden=8", "--burst-threshold", "1"]
     assert main([*asked, *short, "--pulse-cost", "0.05", "--json"]) == 0
-    told = capsys.readouterr().out
-    assert "less 0.05 for each electrode pulse (" in told
-    results = json.loads(told.splitlines()[-1])
+    printed = capsys.readouterr().out
+    assert "less 0.05 for each electrode pulse (" in printed
+    results = json.loads(printed.splitlines()[-1])
     assert results["net_return"] == pytest.approx(
         np.mean(list(results["returns"].values())) - 0.05 * results["electrode_pulses"]
     )
@@ -421,7 +421,7 @@ def test_the_commands_train_and_tell(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("wrong", ["-1", "nan", "inf", "1e9", "much"])
-def test_a_cost_that_cannot_be_is_told_in_a_line(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_cost_is_refused_in_a_line(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "cartpole", "--pulse-cost", wrong]) != 0
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1 and "pulse" in said[0] and "cost" in said[0]

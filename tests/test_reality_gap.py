@@ -192,12 +192,12 @@ def test_the_table_holds_what_the_simulator_and_the_session_say(
         assert row.gap.value == pytest.approx(row.measured.mean() - row.predicted.mean())
         assert row.gap.low <= row.gap.value + 1e-9
         assert row.gap.value <= row.gap.high + 1e-9
-    told = json.loads(json.dumps(gap.to_dict()))
-    assert [row["name"] for row in told["rows"]] == list(rows)
+    data = json.loads(json.dumps(gap.to_dict()))
+    assert [row["name"] for row in data["rows"]] == list(rows)
     text = gap.to_text()
     assert all(name in text for name in rows)
-    better = {row["name"] for row in told["rows"][3:] if row["p"] < 0.01 and row["wins"] > 0.5}
-    assert set(told["not_outperformed"]) == {row.name for row in gap.rows[3:]} - better
+    better = {row["name"] for row in data["rows"][3:] if row["p"] < 0.01 and row["wins"] > 0.5}
+    assert set(data["not_outperformed"]) == {row.name for row in gap.rows[3:]} - better
     assert gap.verdict() in text
 
 
@@ -209,8 +209,8 @@ def test_with_few_responses_to_a_condition_there_is_no_optimal_return(tmp_path: 
     few = replace(calibration, adjusted=replace(calibration.adjusted, responses_hz=(*of_each[:4], of_each[4][:3])))
     with FakeCulture() as culture:
         gap = run_policies({"p0": policy_of(0, series)}, culture, few, tmp_path, episodes=1, with_controls=False)
-    told = json.loads(json.dumps(gap.to_dict()))
-    assert (told["optimum"], told["gap_share"]) == (None, None)
+    data = json.loads(json.dumps(gap.to_dict()))
+    assert (data["optimum"], data["gap_share"]) == (None, None)
     (message,) = [finding.message for finding in gap.findings if finding.name == "no-optimum"]
     assert message == "no optimal return: these conditions have too few responses: 80 Hz (3)"
     assert message in gap.to_text() and "optimal return on this" not in gap.to_text()
@@ -224,7 +224,7 @@ def test_a_session_on_a_simulation_is_not_lost_if_the_optimal_return_fails(
     def fail(*_: Any, **__: Any) -> Any:
         raise MemoryError("no room")
 
-    monkeypatch.setattr("animat.reality_gap.optimum.rough_values", fail)
+    monkeypatch.setattr("animat.reality_gap.optimum.optimal_values", fail)
     of = {"p0": policy_of(0, series)}, FakeCulture(), Calibration.of_series(series)
     # On a device the optimal return is computed before the loop begins.
     with of[1], pytest.raises(MemoryError):
@@ -256,11 +256,11 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.001, 0.9, at).endswith("larger in at least 90 % of the pairs of episodes)")
     looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
     for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
-        told = (
+        unexplained = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
             "(looked for: "
         )
-        assert f"{told}{looked} commands)" in verdict(0.001, 0.9, measured)
+        assert f"{unexplained}{looked} commands)" in verdict(0.001, 0.9, measured)
     uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
         "; their measured return is 20.0 less than predicted, within the uncertainty due to the number of responses in "
@@ -359,8 +359,8 @@ def test_one_episode_gives_no_interval_of_the_gap(without_controls: Ran) -> None
     assert (row.gap.low, row.gap.high) == (-np.inf, np.inf)
     alone = replace(gap, rows=(row, *gap.rows[1:]))
     assert "less than predicted" not in alone.verdict()
-    told = json.loads(json.dumps(alone.to_dict(), allow_nan=False))["rows"][0]["gap"]
-    assert (told["low"], told["high"]) == (None, None)
+    data = json.loads(json.dumps(alone.to_dict(), allow_nan=False))["rows"][0]["gap"]
+    assert (data["low"], data["high"]) == (None, None)
     assert "unknown" in alone.to_text()
 
 
@@ -709,13 +709,13 @@ class TestCommand:
     def test_run(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert self.command(folder, "--json") == 0
         printed = capsys.readouterr()
-        told = json.loads(printed.out.splitlines()[-1])
-        assert len(told["rows"]) == 12
-        assert told["session"]["ended_by"] == "plan"
+        data = json.loads(printed.out.splitlines()[-1])
+        assert len(data["rows"]) == 12
+        assert data["session"]["ended_by"] == "plan"
         assert "heuristic" in printed.out
         (folder / "session" / "session.nwb").unlink()
         assert main(["recover", str(folder / "session"), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == told["session"]["ticks"]
+        assert json.loads(capsys.readouterr().out.splitlines()[-1])["ticks"] == data["session"]["ticks"]
         assert main(["inspect", str(folder / "session" / "session.nwb")]) == 0
 
     def test_an_existing_session_is_not_overwritten(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -78,11 +78,11 @@ def test_unknown_electrodes_are_reported_with_their_file(
     file = tmp_path / "mine.json"
     file.write_text("[[1], [99999]]")
     assert main([*replayed, "--places", str(file), "--trials", "2"]) == 1
-    told = r"expected electrodes among the \d+ that stimulate this culture \(.*\), got .*99999\n"
-    assert re.fullmatch(rf"animat: --places {re.escape(str(file))}: {told}", capsys.readouterr().err)
+    expected = r"expected electrodes among the \d+ that stimulate this culture \(.*\), got .*99999\n"
+    assert re.fullmatch(rf"animat: --places {re.escape(str(file))}: {expected}", capsys.readouterr().err)
     file.write_text('{"places": [[1], [99999]]}')
     assert main([*replayed, "--protocol", str(file)]) == 1
-    assert re.fullmatch(rf"animat: {re.escape(str(file))}: places: {told}", capsys.readouterr().err)
+    assert re.fullmatch(rf"animat: {re.escape(str(file))}: places: {expected}", capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
 
 
@@ -199,9 +199,9 @@ def test_the_protocol_in_the_documentation_takes_as_long_as_it_says(tmp_path: Pa
     assert protocol.pulse == BALANCED_PULSE
     schedule = make_schedule(protocol, PATTERNS, seed=1)
     stimulated_s = sum(protocol.pulses * protocol.trials / f for f in protocol.frequencies_hz)
-    told = re.search(r"([\d,]+)\s+pulses, ([\d.]+) s of stimulation, ([\d.]+) s with set-up and pause", page)
-    assert told is not None
-    pulses, stimulated, whole = told.groups()
+    stated = re.search(r"([\d,]+)\s+pulses, ([\d.]+) s of stimulation, ([\d.]+) s with set-up and pause", page)
+    assert stated is not None
+    pulses, stimulated, whole = stated.groups()
     assert int(pulses.replace(",", "")) == len(schedule)
     assert float(stimulated) == pytest.approx(stimulated_s, abs=0.05)
     assert float(whole) == pytest.approx(schedule.duration_s, abs=0.06)

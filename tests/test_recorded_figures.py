@@ -1,7 +1,7 @@
 """The virtual culture's figures through animat's own scan, electrodes, protocol and responses, over seeds 1 to 5.
 
 The measuring is in `recorded_figures.py`. What takes hours of culture is held by the bare tissue, in
-`test_virtual_culture.py`: one recording tells all the rest.
+`test_virtual_culture.py`: one recording shows the rest.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def test_medians_rise_with_frequency() -> None:
     assert np.all(np.diff(np.mean([figures(seed).medians_hz for seed in SEEDS], axis=0)) > 0)
 
 
-def test_a_train_of_five_tells_frequencies_apart_better_than_one_pulse() -> None:
+def test_five_pulses_distinguish_frequencies_better_than_one() -> None:
     """Method, section 9: what pulses buy when frequencies are mixed."""
     apart = {
         name: np.mean([figures(seed).over_median[name][4] - figures(seed).over_median[name][0] for seed in SEEDS])

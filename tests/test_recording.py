@@ -135,8 +135,8 @@ def test_the_response_is_read_after_the_last_pulse_of_a_trial() -> None:
     assert table.is_last_of_presentation.tolist() == [False, False, True, False, True]
 
 
-def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
-    noted = (Finding("a-thing", "warning", "something: odd"), Finding("another", "note", "less odd"))
+def test_provenance_protocol_and_findings_survive_a_file() -> None:
+    noted = (Finding("a-thing", "warning", "something: odd", 0.1), Finding("another", "note", "less odd"))
     words = {"source": "virtual culture: of a test", "seed": "7", "of a rig": "its: words"}
     made = recording(provenance=words, protocol=PAPER, culture=RecordedCulture("virtual", 7), findings=noted)
     again = from_metadata(to_metadata(made))
@@ -148,6 +148,9 @@ def test_what_is_told_of_a_recording_travels_in_the_words_of_a_file() -> None:
     assert from_metadata({"source": "rig.h5", "seed": "1"})["culture"] is None
     with pytest.raises(InvalidArgument, match="protocol: expected JSON"):
         from_metadata({"protocol": "mixed"})
+    for values in ("many", '{"note: another": "many"}'):
+        with pytest.raises(InvalidArgument, match=r"^values of findings.*: expected "):
+            from_metadata({"values of findings": values})
     found = recording_findings(recording(findings=noted))
     assert [(f.name, f.severity, f.message) for f in found[:2]] == [
         ("a-thing", "warning", "something: odd"),
@@ -177,6 +180,10 @@ def test_a_file_that_is_named_after_a_kind_of_culture_is_not_of_it(
 def test_two_findings_of_one_name_are_both_kept() -> None:
     noted = (Finding("columns-left-out", "note", "x of a.csv"), Finding("columns-left-out", "note", "y of b.csv"))
     assert merged(noted) == (Finding("columns-left-out", "note", "x of a.csv; y of b.csv"),)
+    # Their values cannot be one value, but a finding that is alone keeps its own.
+    valued = [dataclasses.replace(finding, value=1.0) for finding in noted]
+    alone = Finding("start-unknown", "warning", "the start is not stated", 3.5)
+    assert merged([*valued, alone]) == (*merged(noted), alone)
 
 
 def test_problems_in_the_data_are_reported() -> None:

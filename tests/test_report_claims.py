@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Pair, draw_comparisons
@@ -27,7 +27,7 @@ from animat.studies.captions import CULTURE
 from animat.studies.cultures import CulturesRun
 from animat.studies.cultures_page import _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
-from animat.studies.optima import kinds_of, rough_kinds
+from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
@@ -248,7 +248,7 @@ def test_decisions_follow_a_changed_study() -> None:
 # --- robots of one kind -----------------------------------------------------------------------------------------------
 
 
-def test_two_robots_of_a_kind_are_told_apart(tmp_path: Path) -> None:
+def test_two_robots_of_a_kind_are_distinguished(tmp_path: Path) -> None:
     """The pole mass as printed beside the simulator's, in one study."""
     printed = RobotSpec("as printed", kind="cartpole", parameters={"pole_mass_kg": 0.55})
     study = Study(robots=(RobotSpec("cartpole"), printed))
@@ -333,7 +333,7 @@ def test_controllability_shows_what_binning_moves_and_what_is_left_out(tmp_path:
 def test_every_mapping_has_its_own_optima_over_time() -> None:
     study = paper_study()
     assert [kind.mapping for kind in kinds_of(study)] == ["1-threshold", "9-thresholds", "linear", "none"]
-    assert [kind.mapping for kind in rough_kinds(study)] == ["1-threshold", "9-thresholds"]
+    assert [kind.mapping for kind in kinds_over_time(study)] == ["1-threshold", "9-thresholds"]
 
 
 def test_every_line_of_a_figure_is_in_its_legend() -> None:
@@ -424,6 +424,20 @@ def test_on_a_phone_the_headline_fits_the_screen(tmp_path: Path) -> None:
     assert "<picture>" not in alone.read_text()
 
 
+@pytest.mark.parametrize("part", ["file", "narrow"])
+def test_a_figure_that_is_gone_is_named_by_the_error(part: str, tmp_path: Path) -> None:
+    there = save_figure(
+        draw_headline([(score("arm", "1-threshold", 5.0, 4.0, 6.0, 0.0, 10.0), np.ones(2))]), tmp_path / "a.png"
+    )
+    gone = tmp_path / "gone.png"
+    picture = replace(Picture(there, "a", "b", narrow=there), **{part: gone})
+    with pytest.raises(InvalidFile, match=f"^{gone}: cannot be read: No such file or directory; run the command again"):
+        write_page(tmp_path / "page.html", "t", "l", [Section("s", pictures=(picture,))], [])
+    assert not (tmp_path / "page.html").exists()
+    with pytest.raises(InvalidFile, match=f"^{gone}: cannot be read: "):
+        _ = Picture(gone, "a", "b").width_px
+
+
 def test_there_is_one_kind_of_minus() -> None:
     assert with_minus("constant -1 from -0.5 to -.5, 1.5e-05") == "constant −1 from −0.5 to −.5, 1.5e−05"
     same = "2-10 ms, p0-1, --at-min 5, tables/-1.csv, Mann-Whitney, recording_0-1, 2022-11-23"
@@ -442,7 +456,7 @@ def test_files_that_a_page_names_are_links() -> None:
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
 
 
-def test_optima_over_time_are_labelled_rough_and_missing_arms_are_counted() -> None:
+def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> None:
     minutes = np.array([0.0, 10.0])
     returns = {f"c{i}": np.zeros((2, 2)) for i in range(8)}
     panels = [

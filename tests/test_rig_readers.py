@@ -397,7 +397,7 @@ def test_stimuli_whose_electrodes_have_no_sound_index_are_read_without(
 
 
 def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> None:
-    def told(units: list[list[float]]) -> str | None:
+    def unsorted_message(units: list[list[float]]) -> str | None:
         import pynwb
 
         start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
@@ -411,8 +411,10 @@ def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> 
         assert recording.spike_times_s.tolist() == sorted(t for times_s in units for t in times_s)
         return next((f.message for f in recording.findings if f.name == "unsorted-spikes"), None)
 
-    assert told([[0.1, 0.5, 0.9], [0.2, 0.4]]) is None
-    assert str(told([[0.1, 0.9, 0.5], [0.4, 0.2]])).startswith("spikes that follow a later one in the file: 2 of 5")
+    assert unsorted_message([[0.1, 0.5, 0.9], [0.2, 0.4]]) is None
+    assert str(unsorted_message([[0.1, 0.9, 0.5], [0.4, 0.2]])).startswith(
+        "spikes that follow a later one in the file: 2 of 5"
+    )
 
 
 def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False) -> Path:

@@ -131,7 +131,7 @@ def test_recordings_of_no_virtual_culture_are_reported(
 
 
 def recorded_by(series: Path, folder: Path, *pulses: Pulse | None) -> Path:
-    """The recordings as if they had been made with these pulses; None: as converted ones, which tell none."""
+    """The recordings as if they had been made with these pulses; None: as in converted ones, which state none."""
     for file, pulse in zip(sorted(series.glob("*.nwb")), pulses, strict=True):
         protocol = None if pulse is None else replace(PROTOCOL, pulse=pulse)
         write_nwb(replace(read_recording(file), protocol=protocol), folder / file.name)

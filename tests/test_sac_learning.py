@@ -87,7 +87,7 @@ def trained_for(
 @pytest.mark.oracle
 @pytest.mark.parametrize("rounds", [1, 4, 5, 7, 13])
 def test_the_replay_holds_the_newest_rounds_each_in_its_place(rounds: int) -> None:
-    limit = 3  # no divisor of the five rounds that the replay holds, so a row tells which round it is of
+    limit = 3  # no divisor of the five rounds that the replay holds, so a row shows which round it is from
     environment = WithoutNeurons(Payer(pay=7.0, shows_iteration=True, episode_limit=limit), DISCRETE)
     learner, finished = trained_for(environment, SMALL, rounds, learner=explored(start(environment, SMALL)))
     expected_rows = np.full((5, 2, 7), np.nan)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
+import weakref
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -359,3 +361,15 @@ def test_a_current_pulse_has_its_charge_in_nanocoulombs() -> None:
     assert Phase(1000, amplitude_ua=-3).charge == -3.0
     assert Pulse.from_list(PUBLISHED_PULSE.to_list()) == PUBLISHED_PULSE
     assert str(PUBLISHED_PULSE) == "-200 mV 500 us, then +200 mV 400 us"
+
+
+def test_a_dropped_guard_is_freed_without_garbage_collection() -> None:
+    gc.disable()
+    try:
+        guard = Guard(SIMULATED_LIMITS, SITES)
+        guard.admit([Stimulus(0.0, (10,), BALANCED_PULSE)], 0.0)
+        freed = weakref.ref(guard)
+        del guard
+        assert freed() is None
+    finally:
+        gc.enable()

@@ -48,7 +48,7 @@ class Given:
 
 
 class Bench(Culture):
-    """Writes down what it is given, in a time of its own that no session ends; it breaks off where it is told to."""
+    """Records what it is given, on a clock that no session ends; it fails where the test asks it to."""
 
     name: ClassVar[str] = "bench"
 
@@ -154,7 +154,7 @@ def test_no_second_holds_more_than_the_limits_whatever_is_opened_anew(seed: int,
             culture.open()
         except UnsafeStimulus as error:
             refused += 1
-            # A clock that goes on tells just what was given when: nothing that is safe is refused.
+            # A clock that goes on shows exactly when everything was given: nothing that is safe is refused.
             assert not allowed or clock == "begins anew" or breaks, f"{error}: {stimuli}"
     assert broken_limit(LIMITS, culture.given) is None
     assert min(passed, refused, opened) > 100

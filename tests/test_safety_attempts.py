@@ -539,7 +539,7 @@ def test_a_culture_cannot_be_copied(make: Callable[[Any], Any], is_open: bool) -
 # JAX, where another test imported it, warns of every fork; the child does nothing of JAX.
 @pytest.mark.filterwarnings("ignore:os.fork")
 def test_what_a_fork_copied_delivers_nothing_and_closes_nothing(tmp_path: Path) -> None:
-    told = tmp_path / "told"
+    report = tmp_path / "report"
     with Seen() as culture:
         child = os.fork()
         if child == 0:
@@ -547,15 +547,15 @@ def test_what_a_fork_copied_delivers_nothing_and_closes_nothing(tmp_path: Path) 
                 try:
                     culture.deliver([one()], 0.1)
                 except InvalidArgument as error:
-                    told.write_text(f"{error}; {len(culture.seen)}; ")
+                    report.write_text(f"{error}; {len(culture.seen)}; ")
                 closed: list[int] = []
                 culture._close = lambda: closed.append(1)  # type: ignore[method-assign]
                 culture.close()
-                told.write_text(told.read_text() + f"closed {len(closed)}")
+                report.write_text(report.read_text() + f"closed {len(closed)}")
             finally:
                 os._exit(0)
         os.waitpid(child, 0)
-        assert told.read_text() == (
+        assert report.read_text() == (
             "culture: expected one that this process opened, got a copy made by a fork; 0; closed 0"
         )
         culture.deliver([one()], 0.1)

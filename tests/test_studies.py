@@ -98,7 +98,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 @pytest.mark.long
 def test_killed_again_and_again_with_one_worker_it_ends_in_the_same_files(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
-    # Between the recordings, after the simulators, with a policy that no receipt tells of yet, among the figures.
+    # Between the recordings, after the simulators, with a policy that has no receipt yet, among the figures.
     moments = ("recordings/recording_0000_min.nwb", "jobs/fit.json", "policies/navigation/1-threshold/p0.safetensors",
                "figures/navigation-learning.png")  # fmt: skip
     for moment in moments:
@@ -388,7 +388,7 @@ def test_a_study_of_a_virtual_culture_is_one_of_its_tissue_s_revision(
     assert ("virtual tissue" in now["versions"]) == (kind == "virtual")
 
 
-def test_sources_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+def test_sources_of_the_same_name_are_distinguished(tmp_path: Path) -> None:
     for day in ("day1", "day2"):
         (tmp_path / day).mkdir()
         (tmp_path / day / "rec[1]_spikes.csv").write_text(day)
@@ -550,7 +550,7 @@ def test_simulators_are_kept_whole(finished: Path) -> None:
     assert [c.label for c in timeline.conditions] == ["5 Hz", "10 Hz", "20 Hz", "40 Hz", "80 Hz"]
     assert float(timeline.at(0.0).percentiles[5]) > 0
     (finished.parent / "cut").write_bytes((finished / "simulators/timeline.safetensors").read_bytes()[:50])
-    with pytest.raises(InvalidFile, match="cut: expected a study's simulators"):
+    with pytest.raises(InvalidFile, match="cut: expected simulators as animat study and animat tune write them"):
         load_timeline(finished.parent / "cut")
 
 
@@ -974,7 +974,7 @@ def test_no_two_arms_or_controls_share_a_file(tmp_path: Path) -> None:
     spec = RobotSpec("navigation")
     arms = [Arm(name, percentiles=held) for name in names for held in ("moving", "first")]
     places = {of(tmp_path, spec, arm) for arm in arms for of in (episodes_file, controls_file, paths_file)}
-    # An arm's name is its own, whether its percentiles are fixed or not; controls are told apart by that.
+    # An arm's name is its own, whether its percentiles are fixed or not; controls differ by that.
     assert len(places) == 2 * len(names) + 2
 
 

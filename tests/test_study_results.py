@@ -251,9 +251,9 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_named(
     known, arm = References(FEW, recorded, FEW.robots[0], random), FEW.arms[0]
     assert known.optimum(arm, 0.0) is None is known.score(arm, 0.0, 5.0)
     assert known.optimum(arm, 140.0) is not None is not known.score(arm, 140.0, 5.0)
-    rough = optima_of(recorded, "over-time")
-    assert [row.left_out for row in rough] == [at_first.left_out, None]
-    assert {row.low_95 for row in rough} == {None}
+    over_time = optima_of(recorded, "over-time")
+    assert [row.left_out for row in over_time] == [at_first.left_out, None]
+    assert {row.low_95 for row in over_time} == {None}
     note = optima_table((at_first, at_last, without))
     assert "1 of 3 optima leave out conditions with fewer than 30 responses" in note.note
     assert note.rows[0][-1] == at_first.left_out

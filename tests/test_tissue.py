@@ -458,7 +458,7 @@ def test_an_electrode_meets_as_many_axons_as_it_should() -> None:
     for i, reach in enumerate(reaches):
         distance_um = np.hypot(tissue.x_um[reach.axons] - x_um[i], tissue.y_um[reach.axons] - y_um[i])
         own_ms = reach.axon_latency_ms - parameters.axon_latency_ms - distance_um / parameters.conduction_um_per_ms
-        # Positions are told apart to 0.1 um.
+        # Positions are distinguished to 0.1 um.
         assert np.all((own_ms > -1e-3) & (own_ms < parameters.axon_latency_spread_ms + 1e-3))
 
 

@@ -114,7 +114,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     np.testing.assert_array_equal(whole.rate_hz, [tick.rate_hz for tick in stimulated])
 
     # The thresholds adapt to each half on its own, computed again here from the responses before.
-    told = iter([w["percentiles_hz"] for w in session.log.fields() if "percentiles_hz" in w])
+    adapted = iter([w["percentiles_hz"] for w in session.log.fields() if "percentiles_hz" in w])
     now, moved = np.asarray(loop.percentiles, np.float32), 0
     answered_hz: list[list[tuple[int, float, float]]] = [[], []]
     for tick in session.ticks:
@@ -124,10 +124,10 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
             assert tick.command == tuple(wanted)
             moved += len(set(tick.command)) > 1
         if (tick.agent != "constant" or tick.handled == "warm-up") and tick.patterns and not tick.is_burst:
-            now = np.asarray(next(told), np.float32)
+            now = np.asarray(next(adapted), np.float32)
             for d, of_half in enumerate(answered_hz):
                 of_half.append((tick.delivered, tick.readout_hz[d], 0.0))
-    assert next(told, None) is None
+    assert next(adapted, None) is None
     for d, of_half in enumerate(answered_hz):
         recorded_hz = [responses.read_of(i)[:, d] for i in range(5)]
         np.testing.assert_allclose(now[d], thresholds_after(recorded_hz, of_half), rtol=1e-5)
@@ -339,7 +339,7 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     assert "two-wheels, 9-thresholds" in ran.stdout and (tmp_path / "session" / "session.nwb").exists()
 
 
-def test_electrodes_of_readouts_that_no_channel_reads_are_told_with_their_file(
+def test_electrodes_of_readouts_that_no_channel_reads_are_refused_with_their_file(
     recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, there, out = tmp_path / "groups.json", str(tmp_path / "one.nwb"), str(tmp_path / "out")

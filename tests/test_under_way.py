@@ -106,7 +106,7 @@ def test_the_page_shows_a_recording_as_far_as_it_is(tmp_path: Path, monkeypatch:
     assert (ended["state"], ended["message"]) == ("ended", "2 recordings")
 
 
-def test_one_that_fails_leaves_nothing_and_one_that_was_killed_is_told(tmp_path: Path) -> None:
+def test_a_failed_recording_leaves_nothing_and_a_killed_one_is_shown_as_interrupted(tmp_path: Path) -> None:
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
         raise DeviceFailed("out of order")
 

@@ -93,7 +93,7 @@ def test_known_distributions_have_their_entropy_and_are_calibrated(known: Valida
         assert scores.p_value is None if kind == "memory" else scores.p_value is not None and scores.p_value > 0.05
         assert scores.autocorrelation.low[0] < 0 < scores.autocorrelation.high[0]
     assert known.of(MARGINAL).bits.mean() == pytest.approx(-np.log2(10), abs=0.01)
-    # What the condition tells of the command.
+    # The information that the condition has about the command.
     gain = known.gain("empirical", MARGINAL)
     assert gain.value == pytest.approx(np.log2(10) - entropy_bits, abs=0.05)
     assert gain.is_certain

@@ -22,6 +22,7 @@ from animat.watch.session import SessionView
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
 from animat.watch.tuning import TuningView
+from animat.watch.view import View
 from watching import session_in
 
 HOSTILE = (
@@ -174,6 +175,39 @@ def test_folders_with_anything_in_them(tmp_path: Path, seed: int) -> None:
         json.dumps([view.about(), view.view(None, 8.0)], allow_nan=False).encode()
     except AnimatError as error:
         assert name in str(error)
+
+
+EVALUATION = {"rows": [{"name": "random", "mean_return": 2.5}], "optimum": {"value": 50.0}, "recorded_at_min": 5.0}
+ROW = {"name": "policies", "mean_return": 61.5, "actors": 4, "episodes": 400}
+FINAL = {"trial": 1, "mean_return": 6.25, "standard_error": 0.5, "settings": {"batch": 64}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "marker", "description", "file", "words"),
+    [
+        (TrainingView, "training.json", TRAINING, "evaluation.json", EVALUATION),
+        (TrainingView, "training.json", TRAINING, ".unfinished/.notices/p0.json", [0.5, "return 3"]),
+        (StudyView, "study.json", STUDY, ".unfinished/.planned.json", {"a": 1.0, "b": 2.0}),
+        (StudyView, "study.json", STUDY, ".unfinished/.notices/b.json", [0.5, "return 3"]),
+        (StudyView, "study.json", STUDY, "jobs/a.json", {"job": "a", "outputs": {"file": "x"}}),
+        (StudyView, "study.json", STUDY, "culture-2/shuttle/simulated.json", {"rows": [ROW]}),
+        (TuningView, "tune.json", TUNING, "journal.jsonl", TRIAL),
+        (TuningView, "tune.json", TUNING, "results.json", {"finals": [FINAL, FINAL | {"mean_return": None}]}),
+    ],
+)
+def test_a_strange_file_costs_no_more_than_its_own_panel(
+    kind: type[View], marker: str, description: Any, file: str, words: Any, tmp_path: Path
+) -> None:
+    (tmp_path / marker).write_text(json.dumps(description))
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).write_text(json.dumps(words))
+    first, *_ = kind(tmp_path).view(None, 8.0)["blocks"]
+    for place in places(words):
+        for strange in (None, True, -1, 10**400, 1e300, math.nan, math.inf, *HOSTILE[:3], [], {}, [1, None], {"a": 1}):
+            (tmp_path / file).write_text(json.dumps(changed(words, place, strange)))
+            found = kind(tmp_path).view(None, 8.0)
+            json.dumps(found, allow_nan=False).encode()
+            assert found["blocks"][0]["title"] == first["title"] and len(found["blocks"]) > 2
 
 
 def test_a_study_that_names_code_imports_none_of_it(tmp_path: Path) -> None:

@@ -310,9 +310,10 @@ def test_a_strange_file_beside_a_run_is_left_out_and_the_rest_is_shown(tmp_path:
     (folder / "training.json").write_text(json.dumps({"training": training, "random_return": 9.0}))
     (folder / "evaluation.json").write_text('{"rows": [{"of": "mine"}, 3], "optimum": 7}')
     (folder / UNFINISHED / NOTICES / "p0.json").write_text('{"mine": 1}')
-    np.savez(folder / UNFINISHED / "from-p0.npz", curve=np.zeros((3, 1, len(CURVE))), members=np.arange(5))
-    titles = [block["title"] for block in TrainingView(folder).view(None, 8.0)["blocks"]]
-    assert titles[:2] == ["So far", "Learning curves"] and "Policies" in titles
+    for members in (np.arange(5), np.array(["mine"]), np.array([math.nan])):
+        np.savez(folder / UNFINISHED / "from-p0.npz", curve=np.zeros((3, 1, len(CURVE))), members=members)
+        titles = [block["title"] for block in TrainingView(folder).view(None, 8.0)["blocks"]]
+        assert titles[:2] == ["So far", "Learning curves"] and "Policies" in titles
 
     tuning = tmp_path / "tuning"
     tuning.mkdir()
@@ -323,6 +324,10 @@ def test_a_strange_file_beside_a_run_is_left_out_and_the_rest_is_shown(tmp_path:
     (tuning / "journal.jsonl").write_text(lines + '\n\n{"trial": 1, "sett')
     *_, journal = TuningView(tuning).view(None, 8.0)["blocks"]
     assert journal["rows"] == [[0, "complete", 1.5, "tau 0.1"]]
+    (tuning / "results.json").write_text('{"finals": 7}')
+    *_, retrained, journal = TuningView(tuning).view(None, 8.0)["blocks"]
+    assert (retrained["rows"], retrained["words"]) == ([], "none is known")
+    assert journal["rows"] == [[0, "complete", 1.5, "tau 0.1"]]
 
     study = tmp_path / "study"
     (study / "jobs").mkdir(parents=True)
@@ -331,3 +336,17 @@ def test_a_strange_file_beside_a_run_is_left_out_and_the_rest_is_shown(tmp_path:
     (study / "jobs" / "fit.json").write_text('{"job": "fit", "outputs": {"a": "1"}}')
     *_, done = StudyView(study).view(None, 8.0)["blocks"]
     assert done["rows"] == [["fit", 1]]
+    row = {"mean_return": 61.5, "actors": 4, "episodes": 400}
+    for culture, content in (("1", {"rows": [row]}), ("2", {"rows": 7}), ("3", {"rows": [{"of": "mine"}]})):
+        (study / f"culture-{culture}" / "shuttle").mkdir(parents=True)
+        (study / f"culture-{culture}" / "shuttle" / "simulated.json").write_text(json.dumps(content))
+    (study / "episodes" / "arm" / "paper").mkdir(parents=True)
+    np.savez(study / "episodes" / "arm" / "paper" / "episodes.npz", **{"return": np.zeros(3), "actor": np.zeros(2)})
+    (study / UNFINISHED).mkdir()
+    (study / UNFINISHED / PLANNED).write_text('{"fit": 1.0, "train": "mine"}')
+    found = StudyView(study).view(None, 8.0)
+    results = block(found, "Results")
+    assert results["rows"] == [["shuttle", "policies, culture-1", 61.5, 4, 400]]
+    strange = "episodes/arm/paper/episodes.npz, culture-2/shuttle/simulated.json, culture-3/shuttle/simulated.json"
+    assert results["words"].endswith(f" Left out, as they cannot be read: {strange}.")
+    assert block(found, "Waiting")["rows"] == [["train"]]

@@ -17,7 +17,7 @@ from animat.progress import Progress
 HELD: list[bytearray] = []
 
 
-def tell_process(holds_mib: int = 0) -> tuple[int, list[int]]:
+def describe_process(holds_mib: int = 0) -> tuple[int, list[int]]:
     """The process and the cores that it may use; afterwards it holds so much memory."""
     print("a library that talks")
     HELD.append(bytearray(os.urandom(1024)) * 1024 * holds_mib)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_args
 
@@ -82,13 +84,17 @@ def record(kind: type[T]) -> type[T]:
     return made  # type: ignore[no-any-return]
 
 
+_adapter: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
+"""Building one takes much longer than checking with it."""
+
+
 def read_record(kind: type[T], data: Any, where: str = "") -> T:
     """A record, or any other type, from plain data as in a file; missing fields take their defaults.
 
     InvalidArgument names the key (in `where`, the name of the whole), what was expected and what came.
     """
     try:
-        return TypeAdapter(kind).validate_python(data)
+        return _adapter(kind).validate_python(data)  # type: ignore[no-any-return]
     except ValidationError as error:
         raise InvalidArgument(_message(error, kind, where)) from error
 

@@ -221,7 +221,6 @@ class Run(StimulationOptions):
         self, recordings: Sequence[Recording], calibrating: Recording, pulse: Pulse, progress: Progress
     ) -> Culture:
         from animat.cultures.kinds import culture_of, recorded_culture
-        from animat.cultures.safety import Guard
 
         known = recorded_culture(self.culture, [calibrating], self.recordings)
         if self.culture_seed is not None:
@@ -232,7 +231,7 @@ class Run(StimulationOptions):
         )
         # Checked again once it is open: some devices report their amplitude step only then.
         try:
-            Guard(culture.limits, ()).check_pulse(pulse)
+            culture.limits.check_pulse(pulse)
         except UnsafeStimulus as error:
             source = "--recordings" if calibrating.protocol or not self.protocol else "--protocol"
             raise Mismatch(

@@ -34,7 +34,6 @@ from animat.cultures.base import Culture
 from animat.cultures.budget import Account
 from animat.cultures.failures import describe_error
 from animat.cultures.observed import more_left_out
-from animat.cultures.safety import Guard
 from animat.errors import AnimatError, InvalidArgument, Mismatch, expect_at_least, shown, some_of
 from animat.evaluation.statistics import Interval
 from animat.progress import Progress, Silent
@@ -362,7 +361,7 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
             "got none"
         )
     loop.readouts.members(culture.channels)
-    Guard(culture.limits, ()).check_pulse(loop.pulse)
+    culture.limits.check_pulse(loop.pulse)
     if unknown := sorted({*loop.encoder.electrodes} - {*culture.stimulation_electrodes}):
         raise Mismatch(
             f"conditions: expected electrodes that the {culture.name} culture can stimulate "

@@ -5,12 +5,13 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import fields, replace
+from itertools import pairwise
 from math import floor
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.records import Flag, FromZero, Positive, Whole, record
 from animat.stimulation.pulse import Kind, Pulse
 
@@ -80,6 +81,66 @@ class Limits:
                     f"limits.{field.name}: expected no looser than the device's {theirs}, got {ours}: limits can be "
                     "tightened, never loosened"
                 )
+
+    def check_pulse(self, pulse: Pulse) -> float:
+        """The net charge of a pulse as the device rounds it.
+
+        Raises:
+            UnsafeStimulus: unless the pulse is within the limits, both as requested and as rounded.
+        """
+        if pulse.kind != self.kind:
+            raise UnsafeStimulus(
+                "kind",
+                f"expected a {self.kind} pulse, which this kind of culture takes, got a {pulse.kind} pulse ({pulse})",
+                argument="pulse",
+            )
+        if len(pulse.phases) > self.phases_per_pulse:
+            raise UnsafeStimulus(
+                "phases_per_pulse",
+                f"expected at most {self.phases_per_pulse} phases in a pulse, got {len(pulse.phases)} ({pulse})",
+            )
+        for phase in pulse.phases:
+            shortest, longest = self.phase_us
+            if not shortest <= phase.duration_us <= longest:
+                raise UnsafeStimulus(
+                    "phase_us", f"expected phases of {shortest:g} to {longest:g} us, got {phase.duration_us:g}"
+                )
+            if not is_multiple(phase.duration_us, self.phase_step_us):
+                raise UnsafeStimulus(
+                    "phase_step_us",
+                    f"expected phases in steps of {self.phase_step_us:g} us, got {phase.duration_us:g}: round it",
+                )
+        self._check_shape(pulse)
+        made, charge_unit = delivered_pulse(pulse, self.amplitude_step), self.units[1]
+        rounding = "" if made == pulse else f", which the device makes of {pulse}"
+        self._check_shape(made, rounding)
+        for phase in made.phases:
+            if not abs(phase.charge) <= self.charge_per_phase:
+                raise UnsafeStimulus(
+                    "charge_per_phase",
+                    f"expected -{self.charge_per_phase:g} to {self.charge_per_phase:g} {charge_unit} per phase, "
+                    f"got {phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
+                )
+        if not abs(made.net_charge) <= self.net_charge:
+            raise UnsafeStimulus(
+                "net_charge",
+                f"expected phases that balance to within {self.net_charge:g} {charge_unit}, got {made.net_charge:g} "
+                f"({made}{rounding}): give the phases equal and opposite charge",
+            )
+        return made.net_charge
+
+    def _check_shape(self, pulse: Pulse, rounding: str = "") -> None:
+        """Check the limits on amplitudes and signs."""
+        for phase in pulse.phases:
+            if not abs(phase.amplitude) <= self.amplitude:
+                raise UnsafeStimulus(
+                    "amplitude",
+                    f"expected -{self.amplitude:g} to {self.amplitude:g} {self.units[0]}, got {phase.amplitude:g}"
+                    f"{rounding}: lower it",
+                )
+        signs = [sign_of(phase.amplitude) for phase in pulse.phases]
+        if self.alternates and any(before == after for before, after in pairwise(signs)):
+            raise UnsafeStimulus("alternates", f"expected successive phases of different signs, got {pulse}{rounding}")
 
 
 def plain_limits(limits: Limits) -> Limits:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from itertools import pairwise
 from math import isfinite
 from typing import Final, NoReturn
 
 from animat.cultures.history import NS, Event, History
-from animat.cultures.limits import SIMULATED_LIMITS, Limits, delivered_pulse, is_multiple, plain_limits, sign_of
+from animat.cultures.limits import SIMULATED_LIMITS, Limits, plain_limits
 from animat.errors import InvalidArgument, UnsafeStimulus
 from animat.stimulation.plain import seconds
-from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimulus, plain_stimuli
 
 __all__ = ["SIMULATED_LIMITS", "Admitted", "Guard", "Limits"]
@@ -69,7 +67,7 @@ class Guard:
     ) -> None:
         self.limits = plain_limits(limits)
         self._sites = frozenset(sites)
-        self._net_charge_of = lru_cache(1000)(self.check_pulse)
+        self._net_charge_of = lru_cache(1000)(self.limits.check_pulse)
         self._left_on: dict[int, float] = {}
         self._stopped: str | None = None
         self._delivered = 0
@@ -204,68 +202,6 @@ class Guard:
                     f"electrode, got {left:g} on electrode {electrode}: use a balanced pulse, or begin a new session "
                     "after a rest",
                 )
-
-    def check_pulse(self, pulse: Pulse) -> float:
-        """The net charge of a pulse as the device rounds it.
-
-        Raises:
-            UnsafeStimulus: unless the pulse is within the limits, both as requested and as rounded.
-        """
-        limits = self.limits
-        if pulse.kind != limits.kind:
-            raise UnsafeStimulus(
-                "kind",
-                f"expected a {limits.kind} pulse, which this kind of culture takes, got a {pulse.kind} pulse ({pulse})",
-                argument="pulse",
-            )
-        if len(pulse.phases) > limits.phases_per_pulse:
-            raise UnsafeStimulus(
-                "phases_per_pulse",
-                f"expected at most {limits.phases_per_pulse} phases in a pulse, got {len(pulse.phases)} ({pulse})",
-            )
-        for phase in pulse.phases:
-            shortest, longest = limits.phase_us
-            if not shortest <= phase.duration_us <= longest:
-                raise UnsafeStimulus(
-                    "phase_us", f"expected phases of {shortest:g} to {longest:g} us, got {phase.duration_us:g}"
-                )
-            if not is_multiple(phase.duration_us, limits.phase_step_us):
-                raise UnsafeStimulus(
-                    "phase_step_us",
-                    f"expected phases in steps of {limits.phase_step_us:g} us, got {phase.duration_us:g}: round it",
-                )
-        self._check_shape(pulse)
-        made, charge_unit = delivered_pulse(pulse, limits.amplitude_step), limits.units[1]
-        rounding = "" if made == pulse else f", which the device makes of {pulse}"
-        self._check_shape(made, rounding)
-        for phase in made.phases:
-            if not abs(phase.charge) <= limits.charge_per_phase:
-                raise UnsafeStimulus(
-                    "charge_per_phase",
-                    f"expected -{limits.charge_per_phase:g} to {limits.charge_per_phase:g} {charge_unit} per phase, "
-                    f"got {phase.charge:g}{rounding}: lower the amplitude or shorten the phase",
-                )
-        if not abs(made.net_charge) <= limits.net_charge:
-            raise UnsafeStimulus(
-                "net_charge",
-                f"expected phases that balance to within {limits.net_charge:g} {charge_unit}, got {made.net_charge:g} "
-                f"({made}{rounding}): give the phases equal and opposite charge",
-            )
-        return made.net_charge
-
-    def _check_shape(self, pulse: Pulse, rounding: str = "") -> None:
-        """Check the limits on amplitudes and signs."""
-        limits = self.limits
-        for phase in pulse.phases:
-            if not abs(phase.amplitude) <= limits.amplitude:
-                raise UnsafeStimulus(
-                    "amplitude",
-                    f"expected -{limits.amplitude:g} to {limits.amplitude:g} {limits.units[0]}, got {phase.amplitude:g}"
-                    f"{rounding}: lower it",
-                )
-        signs = [sign_of(phase.amplitude) for phase in pulse.phases]
-        if limits.alternates and any(before == after for before, after in pairwise(signs)):
-            raise UnsafeStimulus("alternates", f"expected successive phases of different signs, got {pulse}{rounding}")
 
     def _check_pace(self, event: Event, requested: History) -> None:
         """Check the limits on pace, after stimuli delivered and those `requested` before it."""

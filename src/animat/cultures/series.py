@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from animat.cultures.base import Culture
-from animat.cultures.safety import Guard
 from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
@@ -98,7 +97,7 @@ def record_series(
         check_interval(protocol, sessions, interval_min, n_patterns)
         files, interval_s = [folder / recording_name(n * interval_min) for n in range(sessions)], 60 * interval_min
         if virtual is not None:
-            Guard(virtual.limits, ()).check_pulse(protocol.pulse)
+            virtual.limits.check_pulse(protocol.pulse)
             _check_recordings(files, virtual, protocol, interval_s, seed)
             recorded = _restore(virtual, folder / STATE_FILE)
             if not all(file.exists() for file in files[:recorded]):

@@ -174,11 +174,11 @@ def best_returns(
     for start in range(0, len(cases), at_once):
         batch = cases[start : start + at_once]
         part = Part(progress, start, len(batch), len(cases))
-        rough = _Programme(coarse, batch).run(None, seed, Part(part, 0, 1, 4))
+        on_coarse = _Programme(coarse, batch).run(None, seed, Part(part, 0, 1, 4))
         programme = _Programme(fine, batch)
         tables = _Tables(fine, programme.n_layers, robot.episode_limit) if episodes else None
         values = programme.run(tables, seed, Part(part, 1, 3, 4))
-        for case, (value, coarser) in enumerate(zip(values.tolist(), rough.tolist(), strict=True)):
+        for case, (value, coarser) in enumerate(zip(values.tolist(), on_coarse.tolist(), strict=True)):
             run = math.nan, math.nan, math.nan, math.nan
             if tables is not None:
                 known, unknown = (programme.play(tables, case, episodes, seed, clock=clock) for clock in (True, False))
@@ -188,7 +188,7 @@ def best_returns(
     return tuple(optima)
 
 
-def rough_values(
+def optimal_values(
     cases: Sequence[Case], grid: Grid, seed: int, progress: Progress | None = None
 ) -> tuple[Float64[np.ndarray, " cases"], tuple[float, float]]:
     """Only the values, of many cases on a given grid, and the lowest and the highest possible return."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from animat.environment import Animat
 from animat.errors import UnusableData
-from animat.evaluation.optimum import Optimum, rough_values
+from animat.evaluation.optimum import Optimum, optimal_values
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.simulator import NeuronSimulator
@@ -24,7 +24,7 @@ from animat.wrappers import ShuffledDelivery
 
 RESAMPLES = 39
 """The smallest number whose extremes are the 2.5 and 97.5 % quantiles: the k-th of n lies at k / (n + 1)."""
-ROUGH, ROUGH_SMOOTH = 0.5, 0.2
+COARSE, COARSE_SMOOTH = 0.5, 0.2
 """Steps along each axis of the grid for bootstrapped responses, as a share of the usual ones. The latter applies where
 a command acts smoothly and never decides whether an episode ends: its quantiles are those of 0.5 within 0.1."""
 
@@ -100,15 +100,15 @@ class WellSampled:
         responses, rng = self.responses, np.random.default_rng(seed)
         drawn = [responses, *(responses.bootstrapped(rng) for _ in range(resamples))]
         cases = [(self.environment, self.fit(each)) for each in drawn]
-        grid = _rough(grid_for(self.environment.robot), resolution)
-        values, (least, most) = rough_values(cases, grid, seed, progress)
+        grid = _coarse(grid_for(self.environment.robot), resolution)
+        values, (least, most) = optimal_values(cases, grid, seed, progress)
         low, high = np.quantile(values[1:] - values[0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="weibull")
         low, high = min(low, -high, 0.0), max(high, 0.0)
         rates_hz = [responses.read_of(i) for i in range(len(responses.conditions))]
         is_flat = len(rates_hz) == 1 or np.ptp(np.concatenate(rates_hz)) == 0
         if is_flat or not kruskal(*rates_hz).pvalue <= 1 - CONFIDENCE:
             at_random = ShuffledDelivery(self.environment), cases[0][1]
-            low = min(low, float(rough_values([at_random], grid, seed)[0][0] - values[0]))
+            low = min(low, float(optimal_values([at_random], grid, seed)[0][0] - values[0]))
         error = optimum.grid_error
         ends = np.clip(optimum.value + np.array([low - error, high + error]), least, most)
         return replace(optimum, interval=Interval(optimum.value, float(ends[0]), float(ends[1]), CONFIDENCE))
@@ -146,9 +146,9 @@ def too_few(conditions: Sequence[Condition], n: Sequence[int]) -> tuple[str, ...
     return tuple(f"{c.label} ({count})" for c, count in zip(conditions, n, strict=True) if count < FEW_SAMPLES)
 
 
-def _rough(grid: Grid, resolution: float) -> Grid:
+def _coarse(grid: Grid, resolution: float) -> Grid:
     """A grid with fewer steps, three commands instead of five, and no robot noise: only the responses differ."""
     smooth = None if grid.smooth_commands is None else min(grid.smooth_commands, 3)
     noise = None if grid.noise_in_command is None else 0.0
-    resolution = min(ROUGH if smooth is None else ROUGH_SMOOTH, resolution)
+    resolution = min(COARSE if smooth is None else COARSE_SMOOTH, resolution)
     return replace(grid.scaled(resolution, periodic=True), smooth_commands=smooth, noise_in_command=noise)

@@ -217,7 +217,7 @@ def load_timeline(path: Path) -> SimulatorTimeline:
     """Read what `save_timeline` wrote; raises InvalidFile if it cannot be read."""
     try:
         with safe_open(path, framework="numpy") as file:
-            metadata: dict[str, Any] = json.loads(file.metadata()["animat"])
+            metadata: dict[str, Any] = json.loads((file.metadata() or {})["animat"])
             arrays = {name: to_jax(file.get_tensor(name), None) for name in file.keys()}  # noqa: SIM118 - no dictionary
         conditions = tuple(Condition(**each) for each in metadata["conditions"])
         labels = tuple(condition.label for condition in conditions)
@@ -236,4 +236,8 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             readouts=readouts,
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
-        raise InvalidFile(f"{path}: expected a study's simulators, got a file that cannot be read: {error}") from error
+        reason = f"no entry {error}" if isinstance(error, KeyError) else error
+        raise InvalidFile(
+            f"{path}: expected simulators as animat study and animat tune write them, got a file that cannot be read "
+            f"as such: {reason}; run the command again to replace it"
+        ) from error

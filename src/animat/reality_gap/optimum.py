@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from animat.environment import Animat
-from animat.evaluation.optimum import rough_values
+from animat.evaluation.optimum import optimal_values
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Progress, in_phase
 from animat.robots.grid import grid_for
@@ -24,7 +24,7 @@ def begin_optimum(environment: Animat[Any], simulator: NeuronSimulator) -> Futur
         try:
             # Only the value, which is reported as "about": its uncertainty would take a third longer.
             grid = grid_for(environment.robot).scaled(RESOLUTION)
-            (value,), _ = rough_values([(environment, simulator)], grid, seed=1)
+            (value,), _ = optimal_values([(environment, simulator)], grid, seed=1)
             optimum.set_result(float(value))
         except BaseException as error:
             optimum.set_exception(error)

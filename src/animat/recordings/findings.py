@@ -55,12 +55,15 @@ def left_out_findings(
 
 
 def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings with the same name and severity merged into one with all their messages, as a recording keeps them."""
-    messages: dict[tuple[str, Severity], str] = {}
+    """Findings with the same name and severity merged into one with all their messages, as a recording keeps them.
+
+    Several have no value of their own: a sum would be wrong for times and shares.
+    """
+    kept: dict[tuple[str, Severity], Finding] = {}
     for finding in findings:
         key = finding.name, finding.severity
-        messages[key] = f"{messages[key]}; {finding.message}" if key in messages else finding.message
-    return tuple(Finding(*key, message) for key, message in messages.items())
+        kept[key] = Finding(*key, f"{kept[key].message}; {finding.message}") if key in kept else finding
+    return tuple(kept.values())
 
 
 def warnings_once(findings: Sequence[Finding]) -> Iterator[str]:

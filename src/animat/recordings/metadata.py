@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any, get_args
 
 from animat.errors import InvalidArgument
 from animat.recordings.findings import Finding, Severity
 from animat.recordings.recording import RecordedCulture, Recording
+from animat.records import json_data, read_record
 from animat.stimulation.protocol import Protocol
+
+_VALUES = "values of findings"
+"""The key of the findings' values, as JSON by the keys of their messages."""
 
 
 def to_metadata(recording: Recording) -> dict[str, str]:
@@ -18,29 +23,33 @@ def to_metadata(recording: Recording) -> dict[str, str]:
         InvalidArgument: for a provenance that would be read back as something else.
     """
     metadata = dict(recording.provenance)
-    if reserved := [key for key in metadata if key == "protocol" or _is_finding(key)]:
+    if reserved := [key for key in metadata if key in ("protocol", _VALUES) or _is_finding(key)]:
         raise InvalidArgument(f"provenance: expected no key of a file's protocol or findings, got {reserved[0]!r}")
     if (culture := _culture_of(metadata)) != recording.culture:
         raise InvalidArgument(f"culture: expected {culture!r} by the provenance's source, got {recording.culture!r}")
     if recording.protocol is not None:
         metadata["protocol"] = recording.protocol.to_json()
-    return metadata | {f"{finding.severity}: {finding.name}": finding.message for finding in recording.findings}
+    findings = {f"{finding.severity}: {finding.name}": finding for finding in recording.findings}
+    if values := {key: finding.value for key, finding in findings.items() if finding.value is not None}:
+        metadata[_VALUES] = json.dumps(values)
+    return metadata | {key: finding.message for key, finding in findings.items()}
 
 
 def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
     """A recording's `provenance`, `protocol`, `culture` and `findings`.
 
     Raises:
-        InvalidArgument: for a protocol that is not one.
+        InvalidArgument: for a protocol that is not one, or values that are no numbers.
     """
     provenance, findings, protocol = dict[str, str](), list[Finding](), None
+    values = read_record(dict[str, float], json_data(metadata.get(_VALUES, "{}"), _VALUES), _VALUES)
     for key, text in metadata.items():
         if key == "protocol":
             protocol = Protocol.from_json(text)
         elif _is_finding(key):
             severity, _, name = key.partition(": ")
-            findings.append(Finding(name, severity, text))  # type: ignore[arg-type]
-        else:
+            findings.append(Finding(name, severity, text, values.get(key)))  # type: ignore[arg-type]
+        elif key != _VALUES:
             provenance[key] = text
     culture = _culture_of(metadata)
     return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}

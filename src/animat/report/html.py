@@ -13,10 +13,12 @@ from typing import Any, TypeAlias
 
 from PIL import Image
 
+from animat.errors import as_invalid_file
 from animat.report.style import PNG_DPI
 from animat.writing import write_whole
 
 MINUS = "\u2212"
+_DRAW_AGAIN = "; run the command again, which draws it again"
 
 # Hyphens that are minus signs: not those within words, ranges such as 2-10, options and file names, but those of
 # exponents such as 1.5e-05.
@@ -60,7 +62,7 @@ class Picture:
     @property
     def width_px(self) -> int:
         """Width on the page: 100 pixels per inch, so that text in figures is as large as text around them."""
-        with Image.open(self.file) as png:
+        with as_invalid_file(self.file, ending=_DRAW_AGAIN), Image.open(self.file) as png:
             return png.width * 100 // PNG_DPI
 
 
@@ -132,7 +134,7 @@ def write_page(
     The lead follows the title; the colophon is lines at the end, with versions and seeds.
 
     Raises:
-        InvalidFile: if the page cannot be written.
+        InvalidFile: if the page cannot be written, or a figure cannot be read.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -149,7 +151,9 @@ def write_page(
 
 
 def _data_url(png: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode()
+    with as_invalid_file(png, ending=_DRAW_AGAIN):
+        content = png.read_bytes()
+    return "data:image/png;base64," + base64.b64encode(content).decode()
 
 
 def cell(value: Any) -> str:

@@ -22,9 +22,9 @@ from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study
 from animat.studies.task import StudyTask
 
-ROUGH = 0.5
+STEPS_OVER_TIME = 0.5
 """Grid steps along each axis for the optima of every recording, as a fraction of those elsewhere."""
-COARSER = 0.8
+STEPS_BOOTSTRAPPED = 0.8
 """Grid steps along each axis for bootstrapped responses, at most, as a fraction of the optimum's."""
 
 _COPIED = ("grid_error", "monte_carlo", "standard_error", "without_clock", "without_clock_standard_error", "nodes")
@@ -37,7 +37,7 @@ def kinds_of(study: Study) -> list[Arm]:
     return list(dict.fromkeys(kinds))
 
 
-def rough_kinds(study: Study) -> list[Arm]:
+def kinds_over_time(study: Study) -> list[Arm]:
     """The `kinds_of` whose optimum is computed at every recording, which takes too long for mappings without steps."""
     return [kind for kind in kinds_of(study) if kind.has_steps]
 
@@ -93,8 +93,8 @@ class FindOptima(StudyTask):
         kinds, minutes = kinds_of(study), study.optimum_minutes(first, last)
         resolution, episodes = self.spec.optimum_resolution or study.optimum_resolution, study.optimum_episodes
         if self.over_time and timeline is not None:
-            kinds, minutes = rough_kinds(study), timeline.start_min.tolist()
-            resolution, episodes = min(ROUGH, resolution), 0
+            kinds, minutes = kinds_over_time(study), timeline.start_min.tolist()
+            resolution, episodes = min(STEPS_OVER_TIME, resolution), 0
         if timeline is not None:
             timeline = replace(timeline, responses=tuple(read_series(study, folder)))
         requests = [
@@ -120,7 +120,9 @@ class FindOptima(StudyTask):
             done += len(batch)
         for each in bootstrapped:
             assert each.counted is not None and each.optimum is not None
-            each.optimum = each.counted.with_interval(each.optimum, resolution=COARSER * resolution, seed=study.seed)
+            each.optimum = each.counted.with_interval(
+                each.optimum, resolution=STEPS_BOOTSTRAPPED * resolution, seed=study.seed
+            )
             done += 1
             progress.update(done, steps, "intervals")
         return [write_typed(file, [each.to_row(self.spec.name) for each in requests])]

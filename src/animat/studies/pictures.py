@@ -97,10 +97,10 @@ class RobotPictures(StudyTask):
         known = References(study, folder, self.spec, table)
         results = read_typed(results_file(folder), Results)
         # For every recording, with the optimum on a coarse grid.
-        rough = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
+        coarse = References(study, folder, self.spec, table, over_time=True) if study.needs_neurons else known
         figures: dict[str, Figure] = {}
         tables: list[Path] = []
-        curves = _curves(known, rough, timeline)
+        curves = _curves(known, coarse, timeline)
         if curves:
             figures["learning"] = draw_learning_curves(curves, f"{name}: learning")
             tables.append(figure_tables.write_learning(folder, name, curves))
@@ -108,7 +108,7 @@ class RobotPictures(StudyTask):
             pairs = [_pair(row, known) for row in results.comparisons if row.robot == name]
             figures["comparisons"] = draw_comparisons(pairs, f"{name}: comparisons")
         if timeline is not None and len(timeline) > 1:
-            courses = _courses(known, rough, timeline)
+            courses = _courses(known, coarse, timeline)
             until_min = float(timeline.start_min[0]) + study.training_min
             figures["over-time"] = draw_over_time(courses, f"{name}: at every recording", trained_until_min=until_min)
             tables.append(figure_tables.write_courses(folder, name, courses))
@@ -138,15 +138,15 @@ def _save(folder: Path, of: str, figures: Mapping[str, Figure], progress: Progre
     return files
 
 
-def _curves(known: References, rough: References, timeline: SimulatorTimeline | None) -> list[LearningCurve]:
+def _curves(known: References, coarse: References, timeline: SimulatorTimeline | None) -> list[LearningCurve]:
     curves, study = [], known.study
     for arm in (arm for arm in study.arms if arm.trained):
         learning = learning_of(study, known.folder, known.spec, arm)
         random, optimum = [], []
         for at_min in _minutes_in_training(study, arm, timeline, learning.shape[1]):
-            random.append((rough if arm.through_neurons else known).random(arm, at_min))
+            random.append((coarse if arm.through_neurons else known).random(arm, at_min))
             best = known.best_return(arm, at_min)
-            optimum.append(rough.best_return(arm, at_min) if best is None else best)
+            optimum.append(coarse.best_return(arm, at_min) if best is None else best)
         levels = np.array(random, np.float64), np.array(optimum, np.float64)
         iterations = learning[0, :, 0]
         returns = over_rounds(iterations, learning[:, :, 1], learning[:, :, 2], round_of(study, known.spec))
@@ -176,7 +176,7 @@ def _pair(row: ComparedReturns, known: References) -> Pair:
     return Pair(row, a, b, known.random(first, row.at_min))
 
 
-def _courses(known: References, rough: References, timeline: SimulatorTimeline) -> list[Courses]:
+def _courses(known: References, coarse: References, timeline: SimulatorTimeline) -> list[Courses]:
     every_min: list[float] = timeline.start_min.tolist()
     over_time = rows_where(known.table, agent=POLICY, over_time=True)
     panels = []
@@ -185,11 +185,11 @@ def _courses(known: References, rough: References, timeline: SimulatorTimeline) 
         for arm in known.study.arms_of(kind):
             of_minute = rows_where(over_time, arm=arm.name).groupby("at_min")
             returns[arm.name] = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
-        random = np.array([rough.random(kind, at_min) for at_min in every_min])
-        optimum = [rough.best_return(kind, at_min) for at_min in every_min]
+        random = np.array([coarse.random(kind, at_min) for at_min in every_min])
+        optimum = [coarse.best_return(kind, at_min) for at_min in every_min]
         fine = {at_min: best for at_min in every_min if (best := known.best_return(kind, at_min)) is not None}
-        coarse = None if optimum[0] is None else np.array(optimum, np.float64)
-        panels.append(Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, coarse, fine))
+        values = None if optimum[0] is None else np.array(optimum, np.float64)
+        panels.append(Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, values, fine))
     return panels
 
 

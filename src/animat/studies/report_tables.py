@@ -18,7 +18,7 @@ from animat.report.results import (
 )
 from animat.responses.quality.responses import FEW_SAMPLES
 from animat.studies.heuristic import NOT
-from animat.studies.optima import complete_optima, key_of, read_optima, rough_kinds
+from animat.studies.optima import complete_optima, key_of, kinds_over_time, read_optima
 from animat.studies.specification import Study, mapping_label
 from animat.studies.tabulating import FIRST, LEVEL, SECOND
 
@@ -129,7 +129,7 @@ def optima_table(optima: Sequence[StudyOptimum]) -> Table:
 
 def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidelity]) -> Table:
     """How often each condition exceeds the median in every recording, in the data and in the simulator."""
-    kind = next(iter(rough_kinds(study)), None)
+    kind = next(iter(kinds_over_time(study)), None)
     names = [spec.name for spec in study.robots] if kind else []
     optima = {name: complete_optima(read_optima(folder, name, "over-time")) for name in names}
     labels = next(iter(kept.values())).labels

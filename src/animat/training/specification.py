@@ -128,10 +128,9 @@ class Training:
             value: Any = getattr(self, what)
             if not isinstance(value, kind) and (what, value) != ("mapping", None):
                 raise InvalidArgument(f"{what}: expected a {what} or the name of one, got {shown(value)}")
-        for name, expected in get_type_hints(Training, include_extras=True).items():
-            if name not in ("robot", "mapping"):
-                # The converted value: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
-                vars(self)[name] = read_record(expected, getattr(self, name), name)
+        for name, expected in _TYPES.items():
+            # The converted value: 60 and 60.0 are the same training, and numpy numbers cannot be written to a file.
+            vars(self)[name] = read_record(expected, getattr(self, name), name)
         if self.commands is not None:
             if not self.commands:
                 raise InvalidArgument("commands: expected at least 1 command to pick from, or None for any, got none")
@@ -221,3 +220,8 @@ class Training:
             "lessons": [asdict(lesson) for lesson in self.lessons],
             "chunks": CHUNKS,
         }
+
+
+_TYPES = get_type_hints(Training, include_extras=True)
+"""Of all other fields. Evaluated once, so that `read_record` knows them again."""
+del _TYPES["robot"], _TYPES["mapping"]

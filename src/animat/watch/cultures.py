@@ -12,7 +12,7 @@ from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import json_of
-from animat.watch.plain import text
+from animat.watch.plain import listed, mapped, text
 from animat.watch.state import is_locked, state_of
 from animat.watch.study import share_of
 from animat.watch.view import View, in_blocks
@@ -76,21 +76,21 @@ class CulturesView(View):
             larger = sum(after > before for before, after in pairs)
             rows.append([*comparison, first, second, f"{larger:,} of {len(pairs):,}"])
         head = ["comparison", "robot", "mean, first arm", "mean, second arm", "second larger in"]
-        note = _NOTE if rows else "none yet"
+        note = _NOTE if rows else "None yet."
         if left_out := len(done) - len(known):
             note += f" Left out, as their {_COMPARISONS} cannot be read: {left_out:,} of the cultures that are done."
         return table("Comparisons", head, rows, note, width=width)
 
     def _failed(self) -> dict[str, str]:
         """The cultures that the last run could not finish, each with its error."""
-        failed = json_of(self.file).get("failed", {})
+        failed = mapped(json_of(self.file).get("failed"))
         return {name: text(error) for name, error in list(failed.items())[:_MOST_CULTURES] if _is_name(name)}
 
     def _names(self) -> list[str]:
         # A link may lead out of the folder.
         names = [
             name
-            for name in json_of(self.file).get("cultures", ())
+            for name in listed(json_of(self.file).get("cultures"))
             if _is_name(name) and not (self.folder / name).is_symlink()
         ]
         if not names:

@@ -49,7 +49,9 @@ def job_progress(folder: Path) -> JobProgress:
 def curves_of_checkpoint(path: Path) -> dict[int, Float64[np.ndarray, "chunks columns"]]:
     """The learning curves in a checkpoint, by policy number; empty if it cannot be read."""
     arrays = _arrays_in(path, ("curve", "members"), _MOST_CURVE_BYTES)
-    if arrays is None or (curve := _complete(arrays[0], 3)) is None or arrays[1].shape != curve.shape[1:2]:
+    if arrays is None or (curve := _complete(arrays[0], 3)) is None:
+        return {}
+    if arrays[1].dtype.kind not in "iu" or arrays[1].shape != curve.shape[1:2]:
         return {}
     return {int(member): curve[:, row] for row, member in enumerate(arrays[1].tolist())}
 
@@ -73,10 +75,13 @@ def _complete(curve: np.ndarray, dimensions: int) -> Float64[np.ndarray, "*_ col
 
 
 def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
-    """Mean return, number of policies and number of episodes of an arm of a study; None if not known."""
+    """Mean return, number of policies and number of episodes of an arm of a study; None if it has no own episodes.
+
+    A file that holds something else may raise any error.
+    """
     arrays = _arrays_in(path, ("return", "actor", "over_time", "agent", "at_min"), _MOST_EPISODES_BYTES)
     if arrays is None:
-        return None
+        raise InvalidFile(f"{path}: expected the episodes of an arm")
     returns, actors, over_time, agents, at_min = arrays
     # Episodes over time are few per recording, and a comparison's episodes may be on another recording.
     own = ~over_time.astype(bool) & (agents == "policy") & (at_min == at_min.max(initial=-np.inf))

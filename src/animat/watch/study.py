@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from animat.errors import some_of
 from animat.execution.task import PLANNED, UNFINISHED
 from animat.watch.blocks import Width, facts, table, time_left
 from animat.watch.files import JobProgress, job_progress, json_of, mean_of_episodes
-from animat.watch.plain import mapped, text
+from animat.watch.plain import mapped, number, text
 from animat.watch.state import changed_s, state_of
 from animat.watch.view import View, in_blocks
 
@@ -68,7 +69,7 @@ def share_of(folder: Path) -> float:
 
 def _work(folder: Path, done: dict[str, int], progress: JobProgress) -> tuple[float, dict[str, float]]:
     """The work done, and the cost of each job, as the unfinished study lists it."""
-    costs = {text(name): float(cost) for name, cost in json_of(folder / UNFINISHED / PLANNED).items()}
+    costs = {text(name): number(cost) or 0.0 for name, cost in json_of(folder / UNFINISHED / PLANNED).items()}
     worked = sum(costs.get(name, 0.0) for name in done)
     return worked + sum(share * costs.get(name, 0.0) for name, (share, _) in progress.items()), costs
 
@@ -97,13 +98,24 @@ def running_table(progress: JobProgress, width: Width = "two-thirds") -> dict[st
 def _results_table(folder: Path, width: Width) -> dict[str, Any]:
     """The mean return of each arm on each robot, as soon as its policies have been evaluated."""
     rows: list[list[Any]] = []
-    for path in sorted(folder.glob("episodes/*/*/episodes.npz"))[:_MOST_SHOWN]:
-        means = mean_of_episodes(path)
-        if means is not None:
-            rows.append([path.parts[-3], path.parts[-2], *means])
-    for path in sorted(folder.glob("culture-*/*/simulated.json"))[:_MOST_SHOWN]:
-        for row in json_of(path).get("rows", ())[:1]:
-            values = [row[name] for name in ("mean_return", "actors", "episodes")]
-            rows.append([path.parts[-2], f"policies, {path.parts[-3]}", *values])
-    note = "Over all policies, on the last recording; the report has comparisons." if rows else "none yet"
+    left_out = []
+    for files in ("episodes/*/*/episodes.npz", "culture-*/*/simulated.json"):
+        for path in sorted(folder.glob(files))[:_MOST_SHOWN]:
+            try:
+                rows += _results_of(path)
+            except Exception:  # anything may be in a file
+                left_out.append(path.relative_to(folder).as_posix())
+    note = "Over all policies, on the last recording; the report has comparisons." if rows else "None yet."
+    if left_out:
+        note += f" Left out, as they cannot be read: {some_of(left_out)}."
     return table("Results", ["robot", "arm", "mean return", "policies", "episodes"], rows, note, width=width)
+
+
+def _results_of(path: Path) -> list[list[Any]]:
+    robot, arm = path.parts[-3:-1]
+    if path.suffix == ".npz":
+        means = mean_of_episodes(path)
+        return [] if means is None else [[robot, arm, *means]]
+    culture, robot = robot, arm
+    rows = json_of(path)["rows"][:1]
+    return [[robot, f"policies, {culture}", row["mean_return"], row["actors"], row["episodes"]] for row in rows]

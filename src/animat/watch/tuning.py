@@ -11,7 +11,7 @@ from animat.errors import InvalidFile
 from animat.plain_file import read_plain_text
 from animat.watch.blocks import chart, curve, facts, table, time_left
 from animat.watch.files import json_of
-from animat.watch.plain import mapped, number, settings, short, text
+from animat.watch.plain import listed, mapped, number, settings, short, text
 from animat.watch.state import state_of
 from animat.watch.study import running_jobs, running_table
 from animat.watch.view import View, in_blocks
@@ -75,13 +75,15 @@ def _trial(line: str) -> dict[str, Any] | None:
 
 def _finals(results: dict[str, Any]) -> dict[str, Any]:
     """The trials that were retrained at the end, the best first."""
-    # One that diverged has no mean.
-    diverged = [row for row in results["finals"] if row["mean_return"] is None]
-    finals = [row for row in results["finals"] if row["mean_return"] is not None]
-    finals.sort(key=lambda row: (-row["mean_return"], row["trial"]))
+
+    def place(row: dict[str, Any]) -> tuple[bool, float, float]:
+        mean = number(row.get("mean_return"))
+        # One that diverged has no mean.
+        return mean is None, -(mean or 0.0), number(row.get("trial")) or 0
+
     rows = [
-        [row["trial"], row["mean_return"], row.get("standard_error"), settings(row.get("settings", {}))]
-        for row in finals + diverged
+        [row.get("trial"), row.get("mean_return"), row.get("standard_error"), settings(mapped(row.get("settings")))]
+        for row in sorted(map(mapped, listed(results.get("finals"))), key=place)
     ]
     head = ["trial", "mean return", "standard error", "settings"]
     note = "With all policies of the study, different random numbers and fresh episodes." if rows else "none is known"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -80,11 +81,12 @@ class Coupling:
 
     def __init__(self, seed: int, parameters: TissueParameters, network: Network) -> None:
         rng = np.random.default_rng([seed, 3])
-        self._seed, self._parameters, self._network = seed, parameters, network
-        self._kick_factor = rng.lognormal(0.0, parameters.kick_sigma, len(network))
-        self._own_latency_ms = parameters.axon_latency_spread_ms * rng.uniform(0, 1, len(network))
-        self._reach_of_one = cache(self._find_reach)
-        self._reach_of_all = lru_cache(10_000)(self._join_reaches)
+        kick_factor = rng.lognormal(0.0, parameters.kick_sigma, len(network))
+        own_latency_ms = parameters.axon_latency_spread_ms * rng.uniform(0, 1, len(network))
+        self._parameters = parameters
+        # Not of methods: with caches of its own methods a coupling would stay in memory until it is garbage-collected.
+        reach_of_one = cache(partial(_find_reach, seed, parameters, network, kick_factor, own_latency_ms))
+        self._reach_of_all = lru_cache(10_000)(partial(_join_reaches, reach_of_one))
 
     def reach(self, x_um: Float64[np.ndarray, " electrodes"], y_um: Float64[np.ndarray, " electrodes"]) -> Reach:
         """What a pulse on the electrodes at (x, y) reaches; positions are distinguished to 0.1 um."""
@@ -111,23 +113,30 @@ class Coupling:
             np.concatenate([reach.kick_mv * pulse.strength, np.full(len(arrival), AXONAL_KICK_MV)], dtype=np.float32),
         )
 
-    def _join_reaches(self, places: tuple[tuple[int, int], ...]) -> Reach:
-        reaches = [self._reach_of_one(place) for place in places]
-        return Reach(*(np.concatenate(columns) for columns in zip(*reaches, strict=True)))
 
-    def _find_reach(self, place: tuple[int, int]) -> Reach:
-        parameters, network = self._parameters, self._network
-        distance_um = np.hypot(network.x_um - place[0] / 10, network.y_um - place[1] / 10)
-        kick_mv = parameters.kick_mv * self._kick_factor / (1 + (distance_um / parameters.kick_reach_um) ** 2)
-        near = np.flatnonzero(kick_mv > SMALLEST_KICK_MV)
-        passing = np.exp(-distance_um / parameters.axon_reach_um)
-        chance = parameters.axons_per_electrode * passing / passing.sum()
-        rng = np.random.default_rng([self._seed, 4, place[0] % 2**32, place[1] % 2**32])
-        rank = rng.uniform(size=len(network)) / chance
-        key = rng.integers(0, 2**64, len(network), dtype=np.uint64)
-        axons = np.flatnonzero(rank < LARGEST_STRENGTH)
-        latency_ms = parameters.axon_latency_ms + self._own_latency_ms + distance_um / parameters.conduction_um_per_ms
-        return Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
+def _join_reaches(reach_of_one: Callable[[tuple[int, int]], Reach], places: tuple[tuple[int, int], ...]) -> Reach:
+    return Reach(*(np.concatenate(columns) for columns in zip(*map(reach_of_one, places), strict=True)))
+
+
+def _find_reach(
+    seed: int,
+    parameters: TissueParameters,
+    network: Network,
+    kick_factor: Float64[np.ndarray, " neurons"],
+    own_latency_ms: Float64[np.ndarray, " neurons"],
+    place: tuple[int, int],
+) -> Reach:
+    distance_um = np.hypot(network.x_um - place[0] / 10, network.y_um - place[1] / 10)
+    kick_mv = parameters.kick_mv * kick_factor / (1 + (distance_um / parameters.kick_reach_um) ** 2)
+    near = np.flatnonzero(kick_mv > SMALLEST_KICK_MV)
+    passing = np.exp(-distance_um / parameters.axon_reach_um)
+    chance = parameters.axons_per_electrode * passing / passing.sum()
+    rng = np.random.default_rng([seed, 4, place[0] % 2**32, place[1] % 2**32])
+    rank = rng.uniform(size=len(network)) / chance
+    key = rng.integers(0, 2**64, len(network), dtype=np.uint64)
+    axons = np.flatnonzero(rank < LARGEST_STRENGTH)
+    latency_ms = parameters.axon_latency_ms + own_latency_ms + distance_um / parameters.conduction_um_per_ms
+    return Reach(near, kick_mv[near], axons, rank[axons], latency_ms[axons], key[axons])
 
 
 def in_order(*kicks: Kicks) -> Kicks:
