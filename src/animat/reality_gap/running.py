@@ -235,7 +235,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
     if calibration.simulator.has_memory and loop.pulses == 1 and not loop.warm_up:
         message = (
             "episodes begin after a rest (--warm-up 0), but on the simulator as after stimuli of all conditions: the "
-            "measured return will be less than predicted"
+            "measured return may differ from the prediction"
         )
         yield Finding("no-warm-up", "warning", message)
     if calibration.adaptive and first.percentiles == "first":
