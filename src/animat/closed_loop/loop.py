@@ -67,8 +67,8 @@ class Loop:
         pause_s: seconds without a stimulus before each episode, and each time in the settling.
         warm_up: trials of each condition after the pause, in random order, before the robot moves: a rested culture
             responds differently from a recorded one. None: 2 where an action is one pulse, 0 where it is several.
-        settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode, as a culture
-            recovers from its recording. None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
+        settling: how many times `pause_s` and a warm-up of `SETTLING_ROUNDS` precede the first episode, so that
+            thresholds adapt. None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
         patience_s: time beyond the expected that a culture may take to answer before it counts as hung; and the time
             that the robot, and an agent, may take.
         real_time: whether a culture that is faster is held back to real time.
