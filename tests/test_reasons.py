@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
+from animat.neurons.adjusted_rank import AdjustedRanks
+from animat.neurons.history import NO_MEMORY, ranks_among
+from animat.neurons.history_tracker import HistoryTracker
 from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.reality_gap.session_responses import CommandSums, SessionResponses
@@ -50,7 +53,11 @@ def session(
         CommandSums(everywhere, summed(recorded)[..., None]),
         CommandSums(everywhere + 0 * drawn[..., 0], anew[..., None]),
     )
+    pooled_hz = np.sort(recorded, axis=None)
+    ranks = tuple(ranks_among(pooled_hz, x_hz)[:, None] for x_hz in recorded)
+    without_memory = HistoryTracker(NO_MEMORY, 0.0, pooled_hz, np.array([rank.mean() for rank in ranks]))
     calibration: Any = SimpleNamespace(
+        adjusted=AdjustedRanks(without_memory, pooled_hz, np.zeros((2, 1)), tuple(recorded), ranks),
         responses_hz=tuple(recorded),
         presentation=Presentation("mixed", 1),
         burst_share=0.02,
@@ -79,7 +86,7 @@ def session(
         float("nan"),
         presentation=Presentation("mixed", 1),
         time_s=time_s,
-        presented=Trials(condition, data["rate_hz"], data["is_burst"], np.zeros(len(EVERY), bool)),
+        presented=Trials(condition, data["rate_hz"], data["is_burst"], np.zeros(len(EVERY), bool), time_s),
         place=EVERY,
     )
     command = commands(data["rate_hz"][None], recorded)[0]
@@ -102,6 +109,12 @@ def remembering(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
     return rate_hz + 1.5 * np.sign(np.concatenate([[0.0], rate_hz[:-1] - 12.0]))
 
 
+def repeating(condition: np.ndarray, rate_hz: np.ndarray) -> np.ndarray:
+    """A response is larger after one to the same condition."""
+    is_repeated = np.concatenate([[False], condition[1:] == condition[:-1]])
+    return rate_hz + 3.0 * is_repeated
+
+
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "presentation": (
         {"calibration": {"presentation": Presentation("blocked", 1)}},
@@ -121,6 +134,10 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "trend": ({"rate_hz": falling, "returns": worse}, "13 min: responses to 80 Hz fall by "),
     "memory": ({"rate_hz": remembering}, " of the responses pass the median if the previous response did, "),
+    "repetition": (
+        {"rate_hz": repeating, "calibration": {"simulator": SimpleNamespace(has_memory=True)}},
+        "responses depend on repetition, which simulators do not model: their mean rank differs by -",
+    ),
     "answers": (
         {"rate_hz": lambda condition, rate_hz: rate_hz - 3.0 * (condition == 1)},
         "conditions lead to different mean commands than predicted: 80 Hz to ",

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float64
 
+from animat.errors import UnusableData
 from animat.neurons.history import NO_MEMORY, Ranked, ranks_among
 from animat.neurons.history_tracker import HistoryState, HistoryTracker
 from animat.neurons.simulator import NeuronSimulator
@@ -57,6 +58,19 @@ class AdjustedRanks:
     ) -> Float64[np.ndarray, " readouts"]:
         """y of another response, with the history state at its trial (`HistoryTracker.when`)."""
         return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)
+
+    def of_responses(self, responses: Responses) -> Float64[np.ndarray, "responses readouts"]:
+        """y of other responses, with the times of all their trials."""
+        presented, place = responses.presentations
+        if presented.time_s is None:
+            raise UnusableData("responses.presented.time_s: expected the times of all trials, got none")
+        state, history = HistoryState(), []
+        trials = (presented.time_s, presented.is_rested, presented.condition, presented.rate_hz, presented.is_burst)
+        for at_s, is_rested, condition, rate_hz, is_burst in zip(*(x.tolist() for x in trials), strict=True):
+            came = self.remembering.when(state, at_s, is_rested=is_rested)
+            state = self.remembering.after(came, condition, rate_hz, is_burst=is_burst)
+            history.append((came.trace, came.load))
+        return np.asarray(_ranks(self.sorted_hz, responses.read_hz) - np.array(history)[place] @ self.slopes)
 
 
 def _ranks(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Prediction
@@ -14,6 +16,7 @@ from animat.reality_gap.session_responses import SessionResponses
 from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.repetition import repetitions
 from animat.responses.quality.responses import FEW_SAMPLES
 
 LEVEL = 0.01
@@ -29,6 +32,9 @@ LEAST_TREND = 0.1
 """Least change over the session, as a share of a condition's mean response."""
 LEAST_COMMAND = 0.1
 """Least difference in a condition's mean command."""
+LEAST_REPETITION, _LEAST_SHARE = 0.05, 0.1
+"""Least difference in mean rank, and least share of the responses, of a group with alike repetitions."""
+_REPETITIONS = {"after another condition": (0, 0), "after 1 to 4 of its own": (1, 4), "after more": (5, np.inf)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +168,9 @@ def answers(evidence: Evidence) -> Finding | None:
     tested = [(i, d) for i in conditions.tolist() for d in range(len(names))]
     differences, most = [], 0.0
     for i, d in tested:
-        n, total = measured.presented[:, i], measured.total[:, i, d]
-        mean, expected = float(total.sum() / n.sum()), float(predicted.commanded.mean[i, d])
-        between = episodes / (episodes - 1) * float(np.sum((total - mean * n) ** 2)) / float(n.sum()) ** 2
-        error = max(between, _variance(mean, int(n.sum()))) ** 0.5
+        n, expected = measured.presented[:, i], float(predicted.commanded.mean[i, d])
+        mean, between = _mean_over(measured.total[:, i, d], n)
+        error = max(between, _variance(mean, int(n.sum())) ** 0.5)
         bootstrapped = float(np.nanvar(predicted.commanded_bootstraps.mean[:, i, d]))
         expected_error = max(bootstrapped, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = mean - expected
@@ -185,6 +190,46 @@ def answers(evidence: Evidence) -> Finding | None:
     return Finding("answers", "note", message, most)
 
 
+def repetition(evidence: Evidence) -> Finding | None:
+    """Responses depend on how often their condition was presented directly before, which simulators do not model.
+
+    For three groups of responses by the number of repetitions, the mean of y less its mean over the session's responses
+    to the same condition; y: a response's rank less the effect of its history (`animat.neurons.adjusted_rank`), each
+    readout separately. As in `answers`, its error is from differences between episodes.
+    """
+    from scipy.stats import t as student
+
+    session, names = evidence.session, evidence.session.responses.readouts.names
+    responses, episodes = session.responses, len(session.returns)
+    usable = ~responses.is_burst
+    if episodes < FEWEST_EPISODES or not usable.any():
+        return None
+    y = evidence.calibration.adjusted.of_responses(responses)
+    for condition in range(len(responses.conditions)):
+        of = responses.condition == condition
+        if (of & usable).any():
+            y[of] -= y[of & usable].mean(axis=0)
+    repeats, groups, most = repetitions(responses), [], 0.0
+    tested = [(label, d, *ends) for label, ends in _REPETITIONS.items() for d in range(len(names))]
+    for label, d, low, high in tested:
+        of = usable & (repeats >= low) & (repeats <= high)
+        n = np.bincount(session.episode[of], minlength=episodes)
+        total = np.bincount(session.episode[of], y[of, d], episodes)
+        if np.count_nonzero(n) < FEWEST_EPISODES or n.sum() < _LEAST_SHARE * usable.sum():
+            continue
+        mean, error = _mean_over(total, n)
+        if abs(mean) > max(LEAST_REPETITION, student.isf(LEVEL / len(tested) / 2, episodes - 1) * error):
+            most = max(most, mean, key=abs)
+            on = f" on {names[d]}" if len(names) > 1 else ""
+            groups.append(f"{mean:+.2f} +- {error:.2f}{on} {label}")
+    if not groups:
+        return None
+    message = (
+        f"responses depend on repetition, which simulators do not model: their mean rank differs by {', '.join(groups)}"
+    )
+    return Finding("repetition", "note", message, most)
+
+
 CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
     "a different presentation": presentation,
     "few responses": few_samples,
@@ -192,9 +237,16 @@ CHECKS: dict[str, Callable[[Evidence], Finding | None]] = {
     "bursts": bursts,
     "a trend over the session": trend,
     "memory": memory,
+    "repetition": repetition,
     "mean commands": answers,
 }
 """All checks, by their descriptions in messages."""
+
+
+def _mean_over(total: Float64[np.ndarray, " episodes"], n: Int64[np.ndarray, " episodes"]) -> tuple[float, float]:
+    """The mean of n values in each episode with their total, and its error from differences between episodes."""
+    mean = float(total.sum() / n.sum())
+    return mean, math.sqrt(len(n) / (len(n) - 1) * np.sum((total - mean * n) ** 2)) / float(n.sum())
 
 
 def _variance(command: float, n: int) -> float:

@@ -2,55 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from animat.recordings.findings import Finding
+from animat.responses.quality.within_conditions import compare_passing
 from animat.responses.responses import Responses
-
-CERTAIN = 4.0
-"""Standard errors by which the difference must differ from 0."""
-STRETCH = 250
-"""Responses in a stretch of the recording; each stretch has its own median, as drift is not memory."""
 
 
 def memory_findings(responses: Responses) -> Iterator[Finding]:
     """A finding on the culture's memory from one response to the next (`memory`), if there is any.
 
-    For each condition in each stretch of the recording, p1 is how often its non-burst responses pass the stretch's
-    median after a response that did, and p0 after one that did not. The difference is averaged over all of these with
-    the weights w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count as memory. Its standard
-    error is that of independent responses, sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0).
-
-    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
+    Responses after one that passed the median are compared with those after one that did not.
     """
     last_hz = responses.last_hz
-    tables = []
-    for stretch in np.array_split(np.arange(len(responses)), max(1, len(responses) // STRETCH)):
-        usable = stretch[~responses.is_burst[stretch] & ~np.isnan(last_hz[stretch])]
-        if not len(usable):
-            continue
-        median_hz = np.median(responses.rate_hz[usable])
-        for condition in range(len(responses.conditions)):
-            chosen = usable[responses.condition[usable] == condition]
-            passes, after = responses.rate_hz[chosen] >= median_hz, last_hz[chosen] >= median_hz
-            n1 = int(np.count_nonzero(after))
-            if 0 < n1 < len(chosen):
-                tables.append((n1, len(chosen) - n1, float(passes[after].mean()), float(passes[~after].mean())))
-    if not tables:
-        return
-    n1s, n0s, p1, p0 = (np.array(column, np.float64) for column in zip(*tables, strict=True))
-    weights = n1s * n0s / (n1s + n0s)
-    pooled = (n1s * p1 + n0s * p0) / (n1s + n0s)
-    error = math.sqrt(float(np.sum(weights * pooled * (1 - pooled)))) / float(weights.sum())
-    after_one, after_none = (float(np.average(p, weights=weights)) for p in (p1, p0))
-    if abs(after_one - after_none) <= CERTAIN * error:
+    after_one = compare_passing(responses, ~np.isnan(last_hz), lambda rows, median_hz: last_hz[rows] >= median_hz)
+    if after_one is None or not after_one.is_certain:
         return
     message = (
-        f"the culture remembers: {100 * after_one:.0f} % of the responses pass the median if the previous response "
-        f"did, {100 * after_none:.0f} % if it did not (within conditions); histogram simulators ignore this, memory "
-        f"simulators do not{' (fitted to recordings with --order mixed)' if responses.is_blocked else ''}"
+        f"the culture remembers: {100 * after_one.group:.0f} % of the responses pass the median if the previous "
+        f"response did, {100 * after_one.others:.0f} % if it did not (within conditions); histogram simulators ignore "
+        f"this, memory simulators do not{' (fitted to recordings with --order mixed)' if responses.is_blocked else ''}"
     )
-    yield Finding("memory", "note", message, after_one - after_none)
+    yield Finding("memory", "note", message, after_one.difference)

@@ -19,6 +19,7 @@ from animat.responses.conditions import NO_CONDITION, Assignment, conditions_nam
 from animat.responses.psth import ResponseTime, find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.quality.drift import drift_findings
 from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.repetition import repetition_findings
 from animat.responses.quality.resolution import resolution_findings
 from animat.responses.quality.timing import artefact_findings
 from animat.responses.readouts import CUT_NAMES
@@ -81,6 +82,7 @@ def findings_on(
         *_readouts(responses),
         *drift_findings(responses),
         *memory_findings(responses),
+        *repetition_findings(responses),
     )
 
 

@@ -1,0 +1,74 @@
+"""Two groups of responses compared within conditions: how often they pass the median."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from animat.responses.responses import Responses
+
+CERTAIN = 4.0
+"""Standard errors by which a difference must differ from 0."""
+STRETCH = 250
+"""Responses in a stretch of the recording; each stretch has its own median, as drift is not a difference."""
+
+
+class Passing(NamedTuple):
+    """How often the responses of a group, and all others, pass the median; `error`: of the difference."""
+
+    group: float
+    others: float
+    error: float
+
+    @property
+    def difference(self) -> float:
+        """How much more often those of the group pass."""
+        return self.group - self.others
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the difference is more than chance."""
+        return abs(self.difference) > CERTAIN * self.error
+
+
+def compare_passing(
+    responses: Responses,
+    is_usable: Bool[np.ndarray, " responses"],
+    in_group: Callable[[Int64[np.ndarray, " rows"], float], Bool[np.ndarray, " rows"]],
+) -> Passing | None:
+    """Compare a group of non-burst responses with all others, within conditions and stretches; None without both.
+
+    For each condition in each stretch of the recording, p1 is how often the group's responses pass the stretch's
+    median, and p0 how often the others do. The difference is averaged over all of these with the weights
+    w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count. Its standard error is that of
+    independent responses, sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0).
+
+    Args:
+        is_usable: which responses to compare.
+        in_group: which of some rows are in the group, given the median of their stretch, Hz.
+
+    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
+    """
+    tables = []
+    for stretch in np.array_split(np.arange(len(responses)), max(1, len(responses) // STRETCH)):
+        usable = stretch[~responses.is_burst[stretch] & is_usable[stretch]]
+        if not len(usable):
+            continue
+        median_hz = float(np.median(responses.rate_hz[usable]))
+        for condition in range(len(responses.conditions)):
+            chosen = usable[responses.condition[usable] == condition]
+            passes, group = responses.rate_hz[chosen] >= median_hz, in_group(chosen, median_hz)
+            n1 = int(np.count_nonzero(group))
+            if 0 < n1 < len(chosen):
+                tables.append((n1, len(chosen) - n1, float(passes[group].mean()), float(passes[~group].mean())))
+    if not tables:
+        return None
+    n1s, n0s, p1, p0 = (np.array(column, np.float64) for column in zip(*tables, strict=True))
+    weights = n1s * n0s / (n1s + n0s)
+    pooled = (n1s * p1 + n0s * p0) / (n1s + n0s)
+    error = math.sqrt(float(np.sum(weights * pooled * (1 - pooled)))) / float(weights.sum())
+    return Passing(float(np.average(p1, weights=weights)), float(np.average(p0, weights=weights)), error)
