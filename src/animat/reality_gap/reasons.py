@@ -34,7 +34,7 @@ LEAST_COMMAND = 0.1
 """Least difference in a condition's mean command."""
 LEAST_REPETITION, _LEAST_SHARE = 0.05, 0.1
 """Least difference in mean rank, and least share of the responses, of a group with alike repetitions."""
-_REPETITIONS = {"after another condition": (0, 0), "after 1 to 4 of its own": (1, 4), "after more": (5, np.inf)}
+_REPETITIONS = {"after another condition": (0, 0), "after 1 to 4 of the same": (1, 4), "after more": (5, np.inf)}
 
 
 @dataclass(frozen=True, eq=False)
