@@ -205,6 +205,12 @@ def test_a_file_that_lies_about_where_a_robot_is_from_gets_a_short_line(place: A
     assert len(str(raised.value)) < 300 and "\x1b" not in str(raised.value)
 
 
+@pytest.mark.parametrize("name", [["cartpole"], {"cartpole": 1}, None, 5])
+def test_a_name_in_a_file_that_is_no_text_is_refused(name: Any) -> None:
+    with pytest.raises(InvalidArgument, match=r'robot: expected \{"name": \.\.\., "parameters": \{\.\.\.\}\}, got'):
+        robot_from_dict({"name": name, "parameters": {}})
+
+
 def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> None:
     @register_robot
     @dataclass(frozen=True)

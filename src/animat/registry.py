@@ -167,7 +167,8 @@ class Registry(Generic[Thing]):
             not isinstance(data, Mapping)
             or not {"name", "parameters"} <= set(data) <= {"name", "parameters", "import"}
             or not isinstance(data["parameters"], Mapping)
-            or ":" in str(data["name"])
+            or not isinstance(data["name"], str)
+            or ":" in data["name"]
         ):
             raise InvalidArgument(f'{noun}: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
         if "import" in data and not _PLACE.fullmatch(place := str(data["import"])):
