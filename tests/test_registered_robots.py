@@ -293,6 +293,7 @@ def test_robots_are_listed_with_what_each_can_do(
         ((("@dataclass(frozen=True)", ""),), "expected a frozen dataclass"),
         ((('name = "rover"', 'name = "a/b"'),), "name: expected letters, digits"),
         ((('name = "rover"', 'name = "cartpole"'),), "no other robot has, got 'cartpole', which is animat.robots"),
+        ((('name = "rover"', 'name = "gymnasium"'),), "no other robot has, got 'gymnasium', which is part of animat"),
     ],
 )
 def test_what_cannot_be_imported_or_registered_is_named_in_a_line(place: Any, words: str, package: Path) -> None:

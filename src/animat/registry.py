@@ -68,7 +68,7 @@ class Registry(Generic[Thing]):
         if not (isinstance(name, str) and _NAME.fullmatch(name)):
             raise InvalidArgument(f"{place}.name: expected letters, digits, - and _, a letter first, got {shown(name)}")
         other = place_of(self._registered[name]) if name in self._registered else "part of animat"
-        if name in self._reserved or (name in self._registered and other != place):
+        if name in (*self._reserved, *self._families) or (name in self._registered and other != place):
             raise InvalidArgument(
                 f"{place}.name: expected a name that no other {noun} has, got {name!r}, which is {other}"
             )
