@@ -157,6 +157,12 @@ def test_links_that_reach_nothing_and_too_long_steps_are_refused() -> None:
         TwoLinkArm(upper_length_m=1.0, lower_length_m=0.01)
     with pytest.raises(InvalidArgument, match=r"step_s: expected at most .* for links so light and joints so damped"):
         TwoLinkArm(damping_n_m_s=0.1)
+    # Each of these reached infinite speeds within an episode.
+    for strong in ({"torque_n_m": 1.0}, {"torque_n_m": 0.2, "damping_n_m_s": 0.0}):
+        with pytest.raises(InvalidArgument, match=r"step_s: expected at most 0\.0.* for motors so strong, got 0\.05"):
+            TwoLinkArm(**strong)
+    # The longest step that the message names is accepted.
+    assert TwoLinkArm(torque_n_m=1.0, step_s=0.02).step_s == 0.02
 
 
 @pytest.mark.oracle

@@ -438,6 +438,26 @@ def test_a_limit_of_zero_and_episodes_too_long_to_keep_are_reported() -> None:
     assert "20,001 iterations" in caveat and not Snapshot.initial(robot, 2).commands.size
 
 
+def test_settings_are_numbers_and_whole_ones_stay_whole() -> None:
+    """`frame_skip=5` must reach MuJoCo as a whole number, also from a file, which has 5.0."""
+    robot = named("Slider", after=200)
+    assert robot.settings == (("after", 200.0),) and robot_from_dict(robot_to_dict(robot)) == robot
+    for made in (robot, replace(robot, settings=(("after", 200.0), ("gain", 0.25)))):
+        environment = made.body()._env.unwrapped  # type: ignore[attr-defined]
+        assert type(environment.after) is int and type(environment.gain) is float
+    for value in ([1], "many", True):
+        with pytest.raises(InvalidArgument, match="bodies_of_others:Slider-v0: after: expected a number, got"):
+            named("Slider", after=value)
+    with pytest.raises(InvalidArgument, match=r"episode_limit: expected a whole number, got \[9\]"):
+        named("Slider", episode_limit=[9])
+
+
+@pytest.mark.filterwarnings("ignore:.*unversioned environment:UserWarning")
+def test_an_id_without_a_version_is_refused_in_one_line() -> None:
+    with pytest.raises(InvalidArgument, match=r"gymnasium:CartPole: expected a Gymnasium environment.* id: CartPole$"):
+        robot_named("gymnasium:CartPole")
+
+
 def test_the_name_of_a_body_needs_none_of_its_parameters() -> None:
     # Made without parameters it has no limit, and is refused.
     assert REGISTRY.name_of(f"{TOY}Endless-v0") == named("Endless", episode_limit=9).name

@@ -380,7 +380,7 @@ UNITS = st.sampled_from(["", "m", "rad/s", "deg"])
 def parts(draw: Any) -> Range | Ball:
     name, unit = draw(NAMES), draw(UNITS)
     if draw(st.booleans()):
-        names = draw(st.lists(NAMES, min_size=1, max_size=3))
+        names = draw(st.lists(NAMES, min_size=1, max_size=3, unique=True))
         return Ball(tuple(names), tuple(draw(NUMBERS) for _ in names), draw(st.floats(1e-9, 1e9)), unit)
     low, high = sorted((draw(NUMBERS), draw(NUMBERS)))
     if low == high:
@@ -440,6 +440,7 @@ def test_units_are_those_of_the_robot() -> None:
         ("avoid pole_angle above 1 rad weight 1e308", "weight: expected at most"),
         ("reach pole_angle, cart_position around 0, 0 radius 1 m", "expected a quantity in rad"),
         ("reach cart_position, cart_position around 0 radius 1 m", "a centre of 2 numbers"),
+        ("reach cart_position, cart_position around 0, 1 radius 1 m", "cart_position: expected each quantity once"),
         ("reach cart_position around 0 radius -1 m", "radius: expected more than 0"),
         ("drive pole_angle in -1..1 deg within 0", "within: expected at least 1"),
         ("drive pole_angle in -1..1 deg within 2.5", "within: expected a whole number"),
@@ -460,6 +461,19 @@ def test_an_invalid_goal_is_reported_in_one_line(goal: str, message: str) -> Non
     with pytest.raises(InvalidArgument, match=message) as error:
         with_goal(Cartpole(), goal)
     assert str(error.value).startswith("goal") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "unit"), [("pole angle", "rad"), ("rate", "1/s"), ("x", "°C"), ("in", "m")])
+def test_a_goal_whose_text_could_not_be_read_back_from_a_file_is_refused(name: str, unit: str) -> None:
+    @dataclass(frozen=True)
+    class Odd(Slider):
+        @property
+        def observation_spec(self) -> tuple[Quantity, ...]:
+            return (Quantity(name, unit, 1.0),)
+
+    goal = Goal((Objective("drive", (Range(name, -1.0, 1.0, unit),)),))
+    with pytest.raises(InvalidArgument, match="goal: expected quantities and units that can be read back from its"):
+        with_goal(Odd(), goal)
 
 
 def test_bodies_that_are_stepped_on_the_host_are_refused() -> None:

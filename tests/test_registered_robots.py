@@ -205,6 +205,12 @@ def test_a_file_that_lies_about_where_a_robot_is_from_gets_a_short_line(place: A
     assert len(str(raised.value)) < 300 and "\x1b" not in str(raised.value)
 
 
+@pytest.mark.parametrize("name", [["cartpole"], {"cartpole": 1}, None, 5])
+def test_a_name_in_a_file_that_is_no_text_is_refused(name: Any) -> None:
+    with pytest.raises(InvalidArgument, match=r'robot: expected \{"name": \.\.\., "parameters": \{\.\.\.\}\}, got'):
+        robot_from_dict({"name": name, "parameters": {}})
+
+
 def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> None:
     @register_robot
     @dataclass(frozen=True)
@@ -287,6 +293,7 @@ def test_robots_are_listed_with_what_each_can_do(
         ((("@dataclass(frozen=True)", ""),), "expected a frozen dataclass"),
         ((('name = "rover"', 'name = "a/b"'),), "name: expected letters, digits"),
         ((('name = "rover"', 'name = "cartpole"'),), "no other robot has, got 'cartpole', which is animat.robots"),
+        ((('name = "rover"', 'name = "gymnasium"'),), "no other robot has, got 'gymnasium', which is part of animat"),
     ],
 )
 def test_what_cannot_be_imported_or_registered_is_named_in_a_line(place: Any, words: str, package: Path) -> None:

@@ -211,6 +211,8 @@ def test_goals_are_drawn_from_all_places_that_can_be_reached_and_from_no_other()
         ({"start_x_m": 3.0}, "start_x_m, start_y_m: expected a place within the walls"),
         ({"obstacles": (), "walls": ()}, "start_x_m, start_y_m: expected a place within the walls"),
         ({"walls": FAR}, r"in at most 196 m\^2"),
+        ({"walls": ((0.0, 0.0, 1e200, 0.0),)}, r"in at most 196 m\^2"),
+        ({"obstacles": ((0.0, 0.0, 1.0), (-1e308, 1e308, 1.0))}, r"in at most 196 m\^2"),
         ({"walls": Wheels().walls[:3]}, "walls: expected walls all around the robot, got a gap"),
         ({"walls": (*Wheels().walls[:3], (0.0, 1.0, 0.0, 0.1))}, "walls: expected walls all around the robot"),
         ({"step_s": 0.3}, "step_s: expected at most 0.269 at this speed, got 0.3"),

@@ -29,7 +29,7 @@ from animat.training.group import programs
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import Training
-from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery, Wrapper
+from animat.wrappers import EpisodeLimit, NeuralObservation, ShuffledDelivery, Wrapper, YokedDelivery
 from test_memory import persistent
 from test_optimum import STEPS, Stairs
 from test_training import SMALL, timeline_of, trained
@@ -88,6 +88,20 @@ def test_wrappers_go_together_in_any_order() -> None:
         assert len(environment.scales) == len(leaves[0]) == 3
         seen.append([np.asarray(leaf).tolist() for leaf in leaves])
     assert all(each == seen[0] for each in seen)
+
+
+def test_the_neurons_seen_are_those_of_the_episode_that_the_agent_acts_in() -> None:
+    """Yoked delivery shows the agent another episode, whichever wrapper is the outer one."""
+    animat, simulator = Animat(Stairs(2), Thresholds(1), 2), persistent()
+    seen = []
+    for environment in (NeuralObservation(YokedDelivery(animat)), YokedDelivery(NeuralObservation(animat))):
+        state, observations = environment.reset(jax.random.key(0)), []
+        for i in range(3):
+            state = environment.step(jax.random.key(i), state, jnp.int32(i % 2), simulator)
+            observations.append(np.asarray(environment.observe(state)).tolist())
+        seen.append(observations)
+    assert seen[0] == seen[1]
+    assert seen[0][-1][-2] != float(state.neurons[0])
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class Registry(Generic[Thing]):
         if not (isinstance(name, str) and _NAME.fullmatch(name)):
             raise InvalidArgument(f"{place}.name: expected letters, digits, - and _, a letter first, got {shown(name)}")
         other = place_of(self._registered[name]) if name in self._registered else "part of animat"
-        if name in self._reserved or (name in self._registered and other != place):
+        if name in (*self._reserved, *self._families) or (name in self._registered and other != place):
             raise InvalidArgument(
                 f"{place}.name: expected a name that no other {noun} has, got {name!r}, which is {other}"
             )
@@ -167,7 +167,8 @@ class Registry(Generic[Thing]):
             not isinstance(data, Mapping)
             or not {"name", "parameters"} <= set(data) <= {"name", "parameters", "import"}
             or not isinstance(data["parameters"], Mapping)
-            or ":" in str(data["name"])
+            or not isinstance(data["name"], str)
+            or ":" in data["name"]
         ):
             raise InvalidArgument(f'{noun}: expected {{"name": ..., "parameters": {{...}}}}, got {shown(data)}')
         if "import" in data and not _PLACE.fullmatch(place := str(data["import"])):

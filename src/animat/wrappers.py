@@ -120,7 +120,9 @@ class NeuralObservation(NeuralWrapper[RobotState]):
         return (*self.inside.observation_spec, trace, load)
 
     def observe(self, state: State) -> Float[Array, " observations"]:
-        return jnp.concatenate([self.inside.observe(state), state.neurons])
+        # With `YokedDelivery` inside, the agent is in the other episode.
+        acting: State = state.info.get(_OTHER, state)  # type: ignore[assignment]
+        return jnp.concatenate([self.inside.observe(state), acting.neurons])
 
 
 @final

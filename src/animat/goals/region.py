@@ -110,6 +110,8 @@ class Ball:
                 f"{', '.join(self.quantities)}: expected a centre of {len(self.quantities)} numbers, got "
                 f"{len(self.centre)}"
             )
+        if len(set(self.quantities)) < len(self.quantities):
+            raise InvalidArgument(f"{', '.join(self.quantities)}: expected each quantity once")
 
     def __str__(self) -> str:
         centre = ", ".join(map(number, self.centre))

@@ -15,7 +15,7 @@ from animat.errors import InvalidArgument, shown, within
 from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
 from animat.goals.tally import Margins, Outcome, Tally, add_iteration, empty_tally, outcome
-from animat.goals.text import read_goal
+from animat.goals.text import is_text, read_goal
 from animat.lazy import Array, jax, jnp
 from animat.robots.base import WITHOUT, Quantity, Robot, Transition, Uniforms, capability
 from animat.robots.grid import Grid
@@ -74,6 +74,11 @@ class RobotWithGoal(Robot[GoalState]):
         if len(self._spec) != len(robot.observation_spec):
             raise InvalidArgument(f"goal: expected quantities of different names, {robot.name} has one name twice")
         _ = self._objectives
+        if not is_text(self.goal):
+            raise InvalidArgument(
+                "goal: expected quantities and units that can be read back from its text, which files hold, such as "
+                f"pole_angle and rad/s, got {shown(str(self.goal))}"
+            )
         # Other robots have these as class attributes.
         for name in ("name", "n_commands", "noise_size", "paper_iterations", "baseline_commands", "episode_limit"):
             object.__setattr__(self, name, getattr(robot, name))

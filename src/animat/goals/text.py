@@ -48,6 +48,14 @@ def read_goal(text: Any) -> Goal:
         return Goal(tuple(objectives))
 
 
+def is_text(goal: Goal) -> bool:
+    """Whether a goal can be read back from its text."""
+    try:
+        return read_goal(str(goal)) == goal
+    except InvalidArgument:
+        return False
+
+
 def _objective(text: str) -> Objective:
     kind, _, rest = text.partition(" ")
     if kind not in KINDS:

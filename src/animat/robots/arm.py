@@ -23,6 +23,9 @@ SUBSTEPS = 4
 STIFFEST = 2.5
 """Largest product of rate and step: the Runge-Kutta method of fourth order is stable up to 2.78."""
 
+TURN_RAD = 1.0
+"""Largest turn of a joint in an integration step; with 2.5 times that, states grow without bound."""
+
 PULL, BRAKE_S = 40.0, 1.0
 """The heuristic's commands for a distance of one arm's length, and for a joint velocity of 1 rad/s."""
 
@@ -102,6 +105,13 @@ class TwoLinkArm(Robot[ArmState]):
                 f"step_s: expected at most {STIFFEST * SUBSTEPS * least / self.damping_n_m_s:.3g} for links so light "
                 f"and joints so damped, got {self.step_s:g}"
             )
+        # At the speed at which damping balances full torque, or, if that is less, that of the elbow alone at the end of
+        # an episode.
+        torque_n_m, elbow_kg_m2 = max(self.torque_n_m, 1e-9), self._inertia[2]
+        damped_s = TURN_RAD * SUBSTEPS * self.damping_n_m_s / torque_n_m
+        longest_s = max(damped_s, math.sqrt(TURN_RAD * SUBSTEPS * elbow_kg_m2 / (torque_n_m * self.episode_limit)))
+        if self.step_s > longest_s:
+            raise InvalidArgument(f"step_s: expected at most {longest_s:.3g} for motors so strong, got {self.step_s:g}")
 
     @property
     def return_range(self) -> tuple[float, float]:

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from pydantic import Field
 
-from animat.errors import InvalidArgument, first_line, shown
+from animat.errors import InvalidArgument, first_line, shown, within
 from animat.extras import install_command, pip_install
-from animat.records import Flag, Number, Whole, record
+from animat.records import Flag, Number, Whole, read_record, record
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Iterations, Quantity
 from animat.robots.host import LONGEST_KEPT, Body, HostRobot, time_limit
 from animat.robots.measuring import is_repeatable, measured_scales
@@ -150,7 +150,6 @@ class GymnasiumRobot(HostRobot):
             ) from error
 
     @classmethod
-    @lru_cache(maxsize=32)  # a study asks for its robots often
     def named(cls, id: str, /, *, episode_limit: int | None = None, **settings: float) -> GymnasiumRobot:
         """The environment with this id, which is made, inspected, and moved at random for some steps.
 
@@ -165,18 +164,25 @@ class GymnasiumRobot(HostRobot):
         """
         if not _ID.fullmatch(id):
             raise InvalidArgument(f"robot: expected gymnasium: and an environment's id, got {shown(f'{FAMILY}:{id}')}")
-        cls.import_module(id)
-        items = tuple(settings.items())
-        with time_limit(f"{FAMILY}:{id}", "being made"):
-            body = _Environment(id, items)
-        limit = body.limit if episode_limit is None else episode_limit
-        if limit is None:
-            raise InvalidArgument(
-                f"{FAMILY}:{id}: expected an episode limit, got an environment without one: "
-                "--parameters episode_limit=1000"
-            )
-        robot = cls(id, items, limit, body.low, body.high, body.levels, (1.0,) * body.observed, False)
-        return replace(robot, scales=measured_scales(robot, body.bounds), keeps_state=is_repeatable(robot))
+        with within(f"{FAMILY}:{id}"):
+            limit = None if episode_limit is None else read_record(Iterations, episode_limit, "episode_limit")
+            items = tuple((name, read_record(Number, value, name)) for name, value in settings.items())
+        return _inspected(id, limit, items)
+
+
+@lru_cache(maxsize=32)  # a study asks for its robots often
+def _inspected(id: str, episode_limit: int | None, settings: tuple[tuple[str, float], ...]) -> GymnasiumRobot:
+    """As `GymnasiumRobot.named`."""
+    GymnasiumRobot.import_module(id)
+    with time_limit(f"{FAMILY}:{id}", "being made"):
+        body = _Environment(id, settings)
+    limit = body.limit if episode_limit is None else episode_limit
+    if limit is None:
+        raise InvalidArgument(
+            f"{FAMILY}:{id}: expected an episode limit, got an environment without one: --parameters episode_limit=1000"
+        )
+    robot = GymnasiumRobot(id, settings, limit, body.low, body.high, body.levels, (1.0,) * body.observed, False)
+    return replace(robot, scales=measured_scales(robot, body.bounds), keeps_state=is_repeatable(robot))
 
 
 REGISTRY.add_family(FAMILY, GymnasiumRobot)
@@ -190,15 +196,17 @@ class _Environment(Body):
         from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
         name = f"{FAMILY}:{id}"
-        arguments = dict[str, Any](settings) | ({"render_mode": "rgb_array"} if with_pictures else {})
+        # Files have 5.0 for 5, and an environment may need a whole number (`frame_skip`).
+        arguments: dict[str, Any] = {key: int(value) if value.is_integer() else value for key, value in settings}
+        arguments |= {"render_mode": "rgb_array"} if with_pictures else {}
         try:
+            self.limit: int | None = gymnasium.spec(id.rpartition(":")[2]).max_episode_steps
             env: Any = gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **arguments)
             actions, observations = env.action_space, env.observation_space
         except (Exception, SystemExit) as error:
             # Anything may go wrong in an external environment.
             raise InvalidArgument(f"{name}: expected a Gymnasium environment, got {_reason(error)}") from error
         _expect_sound_mujoco(name, env)
-        self.limit: int | None = gymnasium.spec(id.rpartition(":")[2]).max_episode_steps
         while isinstance(env, OrderEnforcing | PassiveEnvChecker):
             env = env.env
         self._env, self._step = env, env.step

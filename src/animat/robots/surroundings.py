@@ -105,10 +105,12 @@ def places_within_reach(
     from scipy.ndimage import label
 
     left, top, right, bottom = around.box_m() if around.walls or around.obstacles else (*start_m, *start_m)
-    steps = [
-        np.arange(math.floor((low - at) / spacing_m), math.ceil((high - at) / spacing_m) + 1)
-        for at, low, high in ((start_m[0], left, right), (start_m[1], top, bottom))
-    ]
+    spans_m = ((start_m[0], left, right), (start_m[1], top, bottom))
+    ends = [((low - at) / spacing_m, (high - at) / spacing_m) for at, low, high in spans_m]
+    # A single side may be too long for the memory, or infinite.
+    if max(abs(end) for side in ends for end in side) > MOST_PLACES:
+        return np.zeros((0, 2))
+    steps = [np.arange(math.floor(low), math.ceil(high) + 1) for low, high in ends]
     if len(steps[0]) * len(steps[1]) > MOST_PLACES:
         return np.zeros((0, 2))
     x_m, y_m = np.meshgrid(*(at + spacing_m * of for at, of in zip(start_m, steps, strict=True)), indexing="ij")
