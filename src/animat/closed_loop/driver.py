@@ -71,6 +71,8 @@ class Driver:
             # Compile now, like its step.
             self._runner.switch_goal(0)
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
+        # A device keeps its own time, from which the machine's clock drifts away.
+        self._is_held_back = loop.real_time and culture.device is None
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
@@ -287,7 +289,7 @@ class Driver:
         """
         now_s = self._now_s()
         first_s = max(due_s - now_s, 0.0)
-        if self.loop.real_time:
+        if self._is_held_back:
             # A culture that is held back to real time stands still meanwhile, and has to catch up.
             behind_s = self.clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
             first_s = max(first_s, behind_s)
@@ -347,7 +349,7 @@ class Driver:
         self._observed_until_s = offset_s + observed.duration_s
         if pause:
             self.records.append(stretch_record(stretch, (), None))
-        if self.loop.real_time:
+        if self._is_held_back:
             until_s = self._wall_zero_s + (self._now_s() - self._zero_s)
             self._set_deadline("the clock", max(0.0, until_s - self.clock.now_s()))
             self.clock.sleep_until(until_s)
