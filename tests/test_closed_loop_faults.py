@@ -606,6 +606,15 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         LogWriter(tmp_path / "other.log", {})
 
 
+def test_a_log_that_cannot_be_begun_leaves_nothing_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with FakeCulture() as culture:
+        with monkeypatch.context() as patched, pytest.raises(InvalidFile, match="No space left"):
+            patched.setattr("animat.closed_loop.log.os.write", Disk(500).write)
+            run(tmp_path, culture)
+        assert list(tmp_path.iterdir()) == [] and culture.pulses == 0
+        assert run(tmp_path, culture).ending.by == "plan"
+
+
 @pytest.mark.parametrize(("at", "by", "why"), [(999, "disk", "all 1 episodes were run"), (4, "culture", "the culture")])
 def test_a_disk_that_is_full_once_the_loop_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, by: str, why: str
