@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -87,15 +86,14 @@ class Driver:
         """Conditions delivered in the last whole episode of each agent, the newest last."""
 
     def stopped_by_file(self) -> Ending | None:
-        """The ending if a person created the stop file.
-
-        Raises:
-            OSError: if that cannot be determined, for example in an unreadable folder.
-        """
-        with suppress(FileNotFoundError):
+        """The ending if a person created the stop file, or if the folder can no longer be read."""
+        try:
             self.stop_file.stat()
-            return Ending("person", f"stopped by a person (the file {self.stop_file.name})")
-        return None
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            return Ending("disk", f"{self.stop_file} cannot be looked for: {error.strerror or error}")
+        return Ending("person", f"stopped by a person (the file {self.stop_file.name})")
 
     def run(self) -> Ending:
         """Run all episodes; every failure is an ending, never an exception."""
