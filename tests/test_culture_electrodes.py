@@ -6,7 +6,7 @@ import gc
 import itertools
 import json
 import weakref
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +209,10 @@ def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
         small_culture(2).restore_state(tmp_path / "culture.state")
     with pytest.raises(Mismatch, match="which differs in scan_s"):
         small_culture(scan_s=2.0).restore_state(tmp_path / "culture.state")
+    fewer = replace(again.selection, recording=again.selection.recording[:50])
+    with pytest.raises(Mismatch, match=r"which differs in selection: .* or use the same electrodes"):
+        small_culture(selection=fewer).restore_state(tmp_path / "culture.state")
+    small_culture(selection=again.selection).restore_state(tmp_path / "culture.state")
     whole = (tmp_path / "culture.state").read_bytes()
     for damaged in (b"", whole[:100], whole[: len(whole) // 2], b"text", whole[:-200]):
         (tmp_path / "bad.state").write_bytes(damaged)
