@@ -143,6 +143,15 @@ def test_pulses_faster_than_200_hz_are_refused_on_one_channel_and_not_on_two() -
         culture.deliver([Stimulus(t, (1,), CL1_PULSE) for t in (0.0, 0.005)], 0.1)
 
 
+@pytest.mark.parametrize("begins_us", [0, 20, 50, 100, 130, 300])
+def test_a_train_at_the_limit_keeps_its_pace_wherever_it_begins(neurons: Neurons, begins_us: int) -> None:
+    """Half of these begin half-way between two frames: rounded to even, every other interval would be too short."""
+    with CL1Culture() as culture:
+        train = [Stimulus((begins_us + 5000 * n) / 1e6, (1,), CL1_PULSE) for n in range(20, 60)]
+        began = np.rint(culture.deliver(train, 0.4).stimulus_time_s * 25_000)
+    assert set(np.diff(began)) == {125}
+
+
 def test_the_five_frequencies_are_delivered_to_a_frame(neurons: Neurons) -> None:
     with CL1Culture() as culture:
         recording = culture.record(Protocol(pulse=CL1_PULSE, trials=20, setup_s=0.1, pause_s=0.5), seed=2)
@@ -153,7 +162,8 @@ def test_the_five_frequencies_are_delivered_to_a_frame(neurons: Neurons) -> None
     for block in range(5):
         rows = slice(20 * block, 20 * block + 20)
         # The pause before the first pulse leaves time to be in time.
-        np.testing.assert_array_equal(np.diff(delivered[rows]), np.diff(np.rint(asked[rows] * 25_000)))
+        frames = np.floor(np.round(asked[rows] * 25_000, 6) + 0.5)
+        np.testing.assert_array_equal(np.diff(delivered[rows]), np.diff(frames))
     assert recording.presentation == Protocol().presentation
     assert len(neurons.pulses) == 500
     for row, electrodes in enumerate(recording.stimuli.electrodes):

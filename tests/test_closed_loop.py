@@ -573,8 +573,9 @@ def test_a_session_needs_an_open_culture_agents_and_a_folder_of_its_own(tmp_path
     with pytest.raises(InvalidArgument, match="closed"):
         run_session(culture, loop_of(), [RANDOM], tmp_path)
     with culture:
-        for agents in ([], [RANDOM, RANDOM]):
-            with pytest.raises(InvalidArgument, match="agents"):
+        twice = "agents: expected each name once, got random more than once: rename the policy's file"
+        for agents, words in (([], "agents: expected at least one, got none"), ([RANDOM, RANDOM], twice)):
+            with pytest.raises(InvalidArgument, match=words):
                 run_session(culture, loop_of(), agents, tmp_path)
         with pytest.raises(InvalidArgument, match="patterns"):
             run_session(culture, loop_of(patterns=9), [RANDOM], tmp_path)

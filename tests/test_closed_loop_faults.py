@@ -216,6 +216,31 @@ def test_a_file_ends_a_session_whose_culture_is_still_answering(tmp_path: Path, 
             released.set()
 
 
+@pytest.mark.parametrize("takes_s", [0.0, 0.2])
+def test_a_folder_that_can_no_longer_be_read_ends_the_session(
+    takes_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a network disk that is gone: whether the loop or its supervisor notices first."""
+    stat, gone = Path.stat, threading.Event()
+
+    def fails(path: Path, **how: Any) -> os.stat_result:
+        if gone.is_set() and path.name == "STOP":
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+        return stat(path, **how)
+
+    def answering(culture: FakeCulture, observed: Observed) -> Observed:
+        gone.set()
+        time.sleep(takes_s)
+        return observed
+
+    monkeypatch.setattr(Path, "stat", fails)
+    with FakeCulture(fault=answering, at=8) as culture:
+        session = run(tmp_path, culture, robot=LONG)
+        assert session.ending.by == "disk"
+        assert session.ending.message == f"{tmp_path / 'STOP'} cannot be looked for: {os.strerror(errno.ESTALE)}"
+        assert_safe(session, culture, 7)
+
+
 def test_a_file_of_before_is_refused_and_no_pulse_is_given(tmp_path: Path) -> None:
     (tmp_path / "STOP").touch()
     with FakeCulture() as culture, pytest.raises(InvalidArgument, match="STOP: expected none yet"):
@@ -604,6 +629,15 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     )
     with pytest.raises(InvalidFile, match="No space left"):
         LogWriter(tmp_path / "other.log", {})
+
+
+def test_a_log_that_cannot_be_begun_leaves_nothing_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with FakeCulture() as culture:
+        with monkeypatch.context() as patched, pytest.raises(InvalidFile, match="No space left"):
+            patched.setattr("animat.closed_loop.log.os.write", Disk(500).write)
+            run(tmp_path, culture)
+        assert list(tmp_path.iterdir()) == [] and culture.pulses == 0
+        assert run(tmp_path, culture).ending.by == "plan"
 
 
 @pytest.mark.parametrize(("at", "by", "why"), [(999, "disk", "all 1 episodes were run"), (4, "culture", "the culture")])

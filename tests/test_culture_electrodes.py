@@ -6,7 +6,7 @@ import gc
 import itertools
 import json
 import weakref
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from animat.stimulation.pulse import PUBLISHED_PULSE, Phase, Pulse
 from animat.stimulation.selection import Selection, SelectionRule
 from animat.stimulation.stimulus import Stimulus
 from cultures import FEW, small_culture
+from fake_culture import FakeCulture
 
 SHORT = Protocol((10.0, 40.0), patterns=5, trials=5, setup_s=0.5, pause_s=0.2)
 
@@ -208,6 +209,10 @@ def test_a_state_goes_on_bit_for_bit(tmp_path: Path) -> None:
         small_culture(2).restore_state(tmp_path / "culture.state")
     with pytest.raises(Mismatch, match="which differs in scan_s"):
         small_culture(scan_s=2.0).restore_state(tmp_path / "culture.state")
+    fewer = replace(again.selection, recording=again.selection.recording[:50])
+    with pytest.raises(Mismatch, match=r"which differs in selection: .* or use the same electrodes"):
+        small_culture(selection=fewer).restore_state(tmp_path / "culture.state")
+    small_culture(selection=again.selection).restore_state(tmp_path / "culture.state")
     whole = (tmp_path / "culture.state").read_bytes()
     for damaged in (b"", whole[:100], whole[: len(whole) // 2], b"text", whole[:-200]):
         (tmp_path / "bad.state").write_bytes(damaged)
@@ -371,6 +376,17 @@ def test_a_replay_answers_with_what_was_measured() -> None:
         pytest.raises(InvalidArgument, match=r"expected one that was recorded \(10, 40 Hz\), got 20"),
     ):
         replay.deliver([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)], 0.01)
+
+
+def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
+    """A place that is one of the culture's patterns has a number, and one that is not has none."""
+    places = ((100, 101), (103, 105, 107))
+    with FakeCulture() as fake:
+        sources = [fake.record(Protocol((20.0, 40.0), places=places, trials=3), seed) for seed in (0, 1)]
+        sources.append(fake.record(Protocol((20.0,), places=((102, 106),), trials=3), 2))
+    with ReplayCulture(sources) as replay:
+        assert replay.stimulation_electrodes == (100, 101, 102, 103, 105, 106, 107)
+        assert len(replay.record(Protocol((20.0, 40.0), places=places, trials=2)).stimuli) == 8
 
 
 def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -258,6 +258,23 @@ def test_what_another_revision_of_the_tissue_made_is_not_gone_on_with(
         record(tmp_path, sessions=2)
 
 
+@pytest.mark.parametrize(
+    ("interval_min", "words"),
+    [
+        (2.0, r"recording_0001_min\.nwb: expected a recording at a multiple of the interval, 2 min, got one"),
+        # The order of its stimuli is that of another place in the series.
+        (0.5, r"recording_0001_min\.nwb: .* got another \(protocol_seed: 10001 there, 10002 now\)"),
+    ],
+)
+def test_a_series_of_another_interval_is_not_mixed_with_it(
+    undisturbed: list[Path], tmp_path: Path, interval_min: float, words: str
+) -> None:
+    folder = copied(undisturbed, tmp_path / "copy")
+    with pytest.raises(Mismatch, match=words):
+        record_series(lambda: small_culture(), SHORT, folder, sessions=2, interval_min=interval_min)
+    assert sorted(folder.glob("*.nwb")) == [folder / file.name for file in undisturbed]
+
+
 def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"interval_min: expected at least the 0\.04 min"):
         record_series(lambda: small_culture(), SHORT, tmp_path, sessions=2, interval_min=0.01)

@@ -224,6 +224,9 @@ def test_what_cannot_be_filmed_is_an_error_in_one_line_and_leaves_nothing(
         ("expected a start from 0 s and a later end", folder, "--out", out, "--span-s", 2, 1),
         ("--recordings: expected none with a session", folder, "--out", out, "--recordings", folder),
         ("--at-min: expected none with a session", folder, "--out", out, "--at-min", 0),
+        ("--simulator: expected none with a session", folder, "--out", out, "--simulator", "histogram"),
+        ("--window-ms: expected none with a session", folder, "--out", out, "--window-ms", 2, 9),
+        ("--seed: expected none with a session", folder, "--out", out, "--seed", 2),
         ("expected a session of cartpole, got one of navigation", folder, "--out", out, "--robot", "cartpole"),
     ):
         assert film(*arguments) == 1

@@ -16,6 +16,7 @@ from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session
+from animat.closed_loop.timing import Clock
 from animat.coding.mapping import Thresholds
 from animat.cultures.base import Culture
 from animat.cultures.devices.cl1 import CL1_PULSE, CL1Culture
@@ -43,6 +44,7 @@ def loop_at(
     pulse: Pulse,
     chosen: int,
     conditions: tuple[Condition, ...] = BY_FREQUENCY,
+    clock: Clock | None = None,
 ) -> Session:
     loop = Loop(
         robot=Navigation(episode_limit=10),
@@ -54,9 +56,10 @@ def loop_at(
         pause_s=0.1,
         warm_up=0,
         on_late="stop",
+        real_time=clock is not None,
     )
     with culture:
-        return run_session(culture, loop, [Agent("one", "", OneCondition(chosen))], tmp_path, episodes=2)
+        return run_session(culture, loop, [Agent("one", "", OneCondition(chosen))], tmp_path, episodes=2, clock=clock)
 
 
 def assert_in_time(session: Session, chosen: int, frame_s: float) -> None:
@@ -82,6 +85,24 @@ def test_a_cl1_is_in_time(tmp_path: Path, chosen: int, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(neurons, "timestamp", running)
     assert_in_time(loop_at(tmp_path, CL1Culture(), CL1_PULSE, chosen), chosen, 1 / 25_000)
+
+
+@pytest.mark.parametrize("rate", [0.9, 1.1])
+def test_a_device_keeps_its_own_time_in_real_time_too(
+    tmp_path: Path, rate: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    neurons = stand_in_cl.install(monkeypatch)
+
+    class Drifting(Clock):
+        """The machine's clock, slower or faster than the device's."""
+
+        def now_s(self) -> float:
+            return rate * neurons.now / 25_000
+
+        def sleep_until(self, time_s: float) -> None:
+            neurons.now = max(neurons.now, int(time_s * 25_000 / rate))
+
+    assert_in_time(loop_at(tmp_path, CL1Culture(), CL1_PULSE, 1, clock=Drifting()), 1, 1 / 25_000)
 
 
 @pytest.mark.parametrize("chosen", [0, 1])

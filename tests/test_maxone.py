@@ -383,6 +383,15 @@ def test_a_stream_that_falls_silent_is_a_lost_connection(monkeypatch: pytest.Mon
     assert isinstance(failed.value.__cause__, ConnectionError)
 
 
+def test_frames_that_begin_anew_are_refused_as_no_wait_for_a_later_one_would_end() -> None:
+    stream = ZmqSpikes()
+    for number in (1000, 1001):
+        stream.hear([np.uint64(number).tobytes(), b""])
+    with pytest.raises(DeviceFailed, match="expected frames after 1001, got 3: MaxLab Live's server was restarted"):
+        stream.hear([np.uint64(3).tobytes(), b""])
+    assert stream.frame() == 1001
+
+
 def test_the_stream_hears_a_server() -> None:
     zmq = pytest.importorskip("zmq", reason="pyzmq is not installed")
     with zmq.Context() as context, context.socket(zmq.PUB) as server:

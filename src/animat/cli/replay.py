@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ from tyro.conf import Positional
 from animat.cli.responses import SimulatorOptions, policies_for
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.plain_file import is_absent
+
+_OF_SESSIONS = ("source", "span_s", "robot", "out", "json")
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,9 @@ class Replay(SimulatorOptions):
         if is_absent(self.source):
             raise InvalidFile(f"{self.source}: expected a session, a policy or a folder of policies, got no such file")
         if is_session(self.source):
-            for option in ("recordings", "at_min", "mapping"):
-                if getattr(self, option) != getattr(Replay, option):
-                    raise InvalidArgument(f"{option}: expected none with a session, which is shown as it was")
+            for option in fields(self):
+                if option.name not in _OF_SESSIONS and getattr(self, option.name) != option.default:
+                    raise InvalidArgument(f"{option.name}: expected none with a session, which is shown as it was")
             scene = scene_of_session(self.source, self.span_s)
             if expected not in (None, scene.robot.name):
                 raise Mismatch(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,6 +70,8 @@ class Driver:
             # Compile now, like its step.
             self._runner.switch_goal(0)
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
+        # A device keeps its own time, from which the machine's clock drifts away.
+        self._is_held_back = loop.real_time and culture.device is None
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
@@ -85,15 +86,14 @@ class Driver:
         """Conditions delivered in the last whole episode of each agent, the newest last."""
 
     def stopped_by_file(self) -> Ending | None:
-        """The ending if a person created the stop file.
-
-        Raises:
-            OSError: if that cannot be determined, for example in an unreadable folder.
-        """
-        with suppress(FileNotFoundError):
+        """The ending if a person created the stop file, or if the folder can no longer be read."""
+        try:
             self.stop_file.stat()
-            return Ending("person", f"stopped by a person (the file {self.stop_file.name})")
-        return None
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            return Ending("disk", f"{self.stop_file} cannot be looked for: {error.strerror or error}")
+        return Ending("person", f"stopped by a person (the file {self.stop_file.name})")
 
     def run(self) -> Ending:
         """Run all episodes; every failure is an ending, never an exception."""
@@ -287,7 +287,7 @@ class Driver:
         """
         now_s = self._now_s()
         first_s = max(due_s - now_s, 0.0)
-        if self.loop.real_time:
+        if self._is_held_back:
             # A culture that is held back to real time stands still meanwhile, and has to catch up.
             behind_s = self.clock.now_s() - self._wall_zero_s - (now_s - self._zero_s)
             first_s = max(first_s, behind_s)
@@ -347,7 +347,7 @@ class Driver:
         self._observed_until_s = offset_s + observed.duration_s
         if pause:
             self.records.append(stretch_record(stretch, (), None))
-        if self.loop.real_time:
+        if self._is_held_back:
             until_s = self._wall_zero_s + (self._now_s() - self._zero_s)
             self._set_deadline("the clock", max(0.0, until_s - self.clock.now_s()))
             self.clock.sleep_until(until_s)

@@ -61,6 +61,8 @@ class LogWriter:
         with as_invalid_file(path, "cannot be written"), ExitStack() as stack:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_WRONLY, 0o666)
+            # Without its first record it would be no session's, and in the way of the next.
+            stack.callback(path.unlink, missing_ok=True)
             stack.callback(self.close)
             self._write(MAGIC)
             self.append(Record(self._header))

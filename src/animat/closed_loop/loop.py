@@ -71,7 +71,7 @@ class Loop:
             thresholds adapt. None: `SETTLINGS` where thresholds adapt and an action is one pulse, else 0.
         patience_s: time beyond the expected that a culture may take to answer before it counts as hung; and the time
             that the robot, and an agent, may take.
-        real_time: whether a culture that is faster is held back to real time.
+        real_time: whether a simulated culture is held back to real time; a device always keeps its own.
         readouts: groups of channels that are read, by their electrodes: one for each command of the robot.
         remembering: how responses become the history state, for agents that see it; None: no agent does.
 

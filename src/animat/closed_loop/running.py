@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import asdict, replace
@@ -343,8 +344,13 @@ def check_session(culture: Culture, loop: Loop, agents: Sequence[Agent], episode
     if not culture.is_open or culture.is_stopped:
         state = "stopped" if culture.is_open else "closed"
         raise InvalidArgument(f"culture: expected an open one that can be stimulated, got one that is {state}")
-    if not agents or len({agent.name for agent in agents}) < len(agents):
-        raise InvalidArgument("agents: expected at least one, each name once")
+    if not agents:
+        raise InvalidArgument("agents: expected at least one, got none")
+    if twice := [name for name, n in Counter(agent.name for agent in agents).items() if n > 1]:
+        raise InvalidArgument(
+            f"agents: expected each name once, got {some_of(twice)} more than once: rename the policy's file if it has "
+            "the name of a control"
+        )
     if len(episodes) != len(agents):
         raise InvalidArgument(
             f"episodes: expected one number, or one for each of {len(agents)} agents, got {len(episodes)}"

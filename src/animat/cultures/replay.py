@@ -75,7 +75,9 @@ class ReplayCulture(ComputedCulture):
 
     @property
     def stimulation_electrodes(self) -> tuple[int, ...]:
-        return tuple(np.unique(self._patterns[self._patterns != UNKNOWN]).tolist())
+        """Those that were stimulated in the recordings, also on places, which need not be patterns."""
+        stimulated = np.unique(np.concatenate([each.stimuli.electrodes.ravel() for each in self._recordings]))
+        return tuple(stimulated[stimulated != UNKNOWN].tolist())
 
     @property
     def patterns(self) -> Int64[np.ndarray, "patterns size"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,8 +78,8 @@ def record_series(
     Raises:
         InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or a protocol with
             patterns or electrodes that the culture lacks.
-        Mismatch: if the folder has recordings that another culture, protocol or version made, or that lie ahead of the
-            culture's clock, or another run is at work in the folder.
+        Mismatch: if the folder has recordings that another culture, protocol, interval or version made, or that lie
+            ahead of the culture's clock, or another run is at work in the folder.
         InvalidFile: if the folder cannot be written to or the disk lacks room for a recording, before it is made; if a
             file cannot be written, or the state or an existing recording is damaged.
         UnsafeStimulus, DeviceFailed: as the culture raises them; earlier recordings are kept.
@@ -96,9 +96,10 @@ def record_series(
         n_patterns = len(culture.patterns) if virtual is None else virtual.n_patterns
         check_interval(protocol, sessions, interval_min, n_patterns)
         files, interval_s = [folder / recording_name(n * interval_min) for n in range(sessions)], 60 * interval_min
+        made = _made(folder, interval_min)
         if virtual is not None:
             virtual.limits.check_pulse(protocol.pulse)
-            _check_recordings(files, virtual, protocol, interval_s, seed)
+            _check_recordings(made, virtual, protocol, interval_s, seed)
             recorded = _restore(virtual, folder / STATE_FILE)
             if not all(file.exists() for file in files[:recorded]):
                 # Recordings before the state were removed: start from the beginning.
@@ -114,7 +115,7 @@ def record_series(
             # An impossible protocol is refused before anything is written.
             culture.schedule(protocol, seed)
         if virtual is None:
-            zero_s = _start_s(files, culture, protocol, interval_s)
+            zero_s = _start_s(made, culture, protocol, interval_s)
         # Partial files of a killed run; no reader takes them for complete ones.
         for name in (".recording_*_min.nwb", f".{STATE_FILE}", f".{SELECTION_FILE}"):
             for leftover in folder.glob(f"{name}.*.partial*"):
@@ -194,26 +195,35 @@ def minutes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
     return make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
 
 
+def _made(folder: Path, interval_min: float) -> dict[int, Path]:
+    """The existing recordings by their place in the series; raises for one that has none, as of another interval."""
+    made: dict[int, Path] = {}
+    for file in folder.glob("recording_*_min.nwb"):
+        place = -1
+        with suppress(ValueError, OverflowError):
+            place = round(float(file.name.removeprefix("recording_").removesuffix("_min.nwb")) / interval_min)
+        if place < 0 or recording_name(place * interval_min) != file.name:
+            raise _another(file, f"at a multiple of the interval, {interval_min:g} min, got one in between")
+        made[place] = file
+    return dict(sorted(made.items()))
+
+
 def _check_recordings(
-    files: list[Path], culture: VirtualCulture, protocol: Protocol, interval_s: float, seed: int
+    made: Mapping[int, Path], culture: VirtualCulture, protocol: Protocol, interval_s: float, seed: int
 ) -> None:
     """Raise unless the existing recordings are of a culture of these settings, each at its minute."""
-    for session, file in enumerate(files):
-        if not file.exists():
-            continue
+    for session, file in made.items():
         provenance = culture.settings | {"protocol_seed": str(order_seed(seed, session))}
         start_min = _read_expected(file, provenance, protocol).start_min
         if abs(start_min * 60 - session * interval_s) > 1e-6:
             raise _another(file, f"at {session * interval_s / 60:g} min, got one at {start_min:g} min")
 
 
-def _start_s(files: list[Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
+def _start_s(made: Mapping[int, Path], culture: Culture, protocol: Protocol, interval_s: float) -> float:
     """When the series began or begins, on the clock of an open culture; raises if recordings are of another one."""
     zero_s = None
     provenance = {name: text for name, text in culture.provenance.items() if name not in _MAY_DIFFER}
-    for session, file in enumerate(files):
-        if not file.exists():
-            continue
+    for session, file in made.items():
         recording = _read_expected(file, provenance, protocol)
         for name in ("label", "electrode"):
             if getattr(recording.channels, name).tolist() != getattr(culture.channels, name).tolist():

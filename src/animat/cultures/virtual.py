@@ -15,7 +15,7 @@ from animat.cultures.failures import once_opened
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
-from animat.errors import InvalidArgument, expect_at_least
+from animat.errors import InvalidArgument, Mismatch, expect_at_least
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recording import Channels, RecordedCulture
@@ -179,7 +179,7 @@ class VirtualCulture(ComputedCulture):
         write_state(path, self.settings, state)
 
     def restore_state(self, path: str | os.PathLike[str]) -> dict[str, int]:
-        """Restore the state of a culture of the same seed and settings, and return the remarks.
+        """Restore the state of a culture of the same seed, settings and electrodes, and return the remarks.
 
         Raises:
             InvalidFile: if the file is missing or damaged.
@@ -193,6 +193,11 @@ class VirtualCulture(ComputedCulture):
         path = expect_plain_file(path)
         tissue, visibility = self._grown()
         state = read_state(path, self.settings, tissue)
+        if self._selection is not None and self._selection.to_dict() != state.selection.to_dict():
+            raise Mismatch(
+                f"{path}: expected the state of this culture, got another's, which differs in selection: remove it to "
+                "start again, or use the same electrodes"
+            )
         # Only now: a failed restore leaves the culture unchanged.
         self._tissue, self._visibility = tissue, visibility
         self._selection, self._zero_ns, self._now_ns = state.selection, state.zero_ns, state.now_ns

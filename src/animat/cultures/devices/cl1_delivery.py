@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 from collections import defaultdict, deque
 from collections.abc import Sequence
@@ -75,7 +76,7 @@ class Session:
         Times of stimuli count from the frame `since`, no later than the start. Also returns how many spikes were not on
         electrodes; raises DeviceFailed if it was stopped half way, or a pulse never came.
         """
-        waiting, requested = deque(stimuli), [since + round(stimulus.time_s * FRAMES_PER_S) for stimulus in stimuli]
+        waiting, requested = deque(stimuli), [since + _frames(stimulus.time_s) for stimulus in stimuli]
         queued: list[int] = []
         frames, channels, reported = [], [], defaultdict[int, deque[int]](deque)
         late, start, stop = 0, None, 0
@@ -128,6 +129,11 @@ class Session:
 
     def _design(self, pulse: Pulse) -> Any:
         return self.cl.StimDesign(*(n for phase in pulse.phases for n in (round(phase.duration_us), phase.amplitude)))
+
+
+def _frames(time_s: float) -> int:
+    """A time in whole frames, halves rounded up: rounded to even, equal intervals would differ by two frames."""
+    return math.floor(round(time_s * FRAMES_PER_S, 6) + 0.5)
 
 
 def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], start: int) -> int:

@@ -123,10 +123,15 @@ class ZmqSpikes:
             self._failed = error
 
     def hear(self, parts: list[bytes]) -> None:
-        """Process one message; raises DeviceFailed for a layout of no known version."""
+        """Process one message; raises DeviceFailed for a layout of no known version, and if frames begin anew."""
         if len(parts[0]) != FRAME.itemsize:
             raise DeviceFailed(f"MaxOne: expected a frame's number in 8 bytes, got {len(parts[0])}")
         number = int(np.frombuffer(parts[0], FRAME)[0])
+        if number < self._frame:
+            raise DeviceFailed(
+                f"MaxOne: expected frames after {self._frame}, got {number}: MaxLab Live's server was restarted, and "
+                "no wait for a later frame would end; close and open again"
+            )
         if len(parts) > 2 and parts[2]:
             self._spikes.extend(self._read(parts[2], number))
         if self._frame >= 0 and number > self._frame + 1:
