@@ -200,6 +200,18 @@ def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
     assert not (tmp_path / "runs").exists()
 
 
+def test_ctrl_c_ends_processes_of_ours_that_several_plans_share(tmp_path: Path) -> None:
+    class Interrupted:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if (tmp_path / "log").exists():
+                raise KeyboardInterrupt
+
+    jobs = [joined("runs", log=tmp_path / "log", takes_s=3.0)]
+    with PinnedProcesses([CORE]) as executor, pytest.raises(KeyboardInterrupt):
+        run(jobs, tmp_path, executor, Interrupted())
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_receipt_of_the_first_plan_is_read(tmp_path: Path) -> None:
     """As commit 5e75c96 wrote it, byte for byte: digests of later receipts rest on it."""
     text = (

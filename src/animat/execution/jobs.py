@@ -195,14 +195,19 @@ class Jobs:
 def _executors_for(
     executor: Executor | None, workers: int | None, running: dict[Future[TaskResult], Job], has_gpu: bool
 ) -> Iterator[tuple[Executor, Executor | None]]:
-    """The given executor, or our own processes, with one for the GPU; if the block fails, nothing keeps running."""
+    """The given executor, or our own processes, with one for the GPU; if the block fails, nothing keeps running.
+
+    Ctrl-C ends running tasks in processes of ours; any other executor finishes them first.
+    """
     if executor is None:
         with PinnedProcesses(own_cores(workers)) as cores, PinnedProcesses([None]) as gpu:
             yield cores, gpu if has_gpu else None
         return
     try:
         yield executor, None
-    except BaseException:
+    except BaseException as error:
+        if isinstance(executor, PinnedProcesses) and isinstance(error, KeyboardInterrupt):
+            executor.kill_workers()
         # The folder must not be released while a task still writes to it.
         wait([future for future in running if not future.cancel()])
         raise
