@@ -189,8 +189,10 @@ def test_the_first_that_fails_ends_all_and_a_lent_executor_is_waited_for(tmp_pat
         executor.submit(len, "").result()
         assert sorted(path.name for path in tmp_path.iterdir()) == left
     said = log.read_text().splitlines()
-    assert said.count("runs begins") == said.count("runs ends")
+    assert said.count("runs begins") == said.count("runs ends") == 1
     assert len(left) < 12
+    # It is not done again.
+    assert Jobs([joined("runs")], tmp_path, tmp_path / "jobs", "study").waiting == []
 
 
 def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
