@@ -104,6 +104,25 @@ def test_a_place_that_is_no_scheduler_s_is_a_line(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "out").exists()
 
 
+def test_a_scheduler_s_file_may_be_in_a_new_folder_and_is_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def start(_: str, file: Path, *options: str) -> Any:
+        made.append(file.parent.is_dir())
+        raise AnimatError("stopped")
+
+    monkeypatch.setattr("animat.execution.local_cluster._start", start)
+    for file, said in (
+        (tmp_path / "new" / "cluster.json", "stopped"),
+        (tmp_path, f"{tmp_path}: expected no file, got a folder"),
+    ):
+        assert main(["cluster", "local", "--file", str(file)]) == 1
+        assert capsys.readouterr().err == f"animat: {said}\n"
+    assert made == [True]
+
+
 @dataclass
 class Running:
     """A cluster that runs: its file, and the processes of the scheduler and of what looks after the workers."""

@@ -82,6 +82,12 @@ def test_robots_with_more_commands_than_two_are_refused() -> None:
         ContextStudy(robots=("gymnasium:Pendulum-v1",))
 
 
+@pytest.mark.parametrize("size", ["policies", "episodes", "episodes_measured"])
+def test_sizes_are_refused_before_a_culture_is_recorded(size: str) -> None:
+    with pytest.raises(InvalidArgument, match=f"{size}: expected at least 1, got 0"):
+        ContextStudy(**{size: 0})
+
+
 @pytest.mark.parametrize("n_commands", [1, 2])
 def test_a_recording_is_over_when_the_next_one_is_due(
     n_commands: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

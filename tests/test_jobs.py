@@ -189,14 +189,28 @@ def test_the_first_that_fails_ends_all_and_a_lent_executor_is_waited_for(tmp_pat
         executor.submit(len, "").result()
         assert sorted(path.name for path in tmp_path.iterdir()) == left
     said = log.read_text().splitlines()
-    assert said.count("runs begins") == said.count("runs ends")
+    assert said.count("runs begins") == said.count("runs ends") == 1
     assert len(left) < 12
+    # It is not done again.
+    assert Jobs([joined("runs")], tmp_path, tmp_path / "jobs", "study").waiting == []
 
 
 def test_ours_end_at_once_where_one_fails(tmp_path: Path) -> None:
     jobs = [Job("fails", Fail(), cost_s=9.0), joined("runs", takes_s=600.0)]
     with pytest.raises(InvalidFile, match="fails: a"):
         Jobs(jobs, tmp_path, tmp_path / "jobs", "study").run(workers=2, executor=None, progress=Silent())
+    assert not (tmp_path / "runs").exists()
+
+
+def test_ctrl_c_ends_processes_of_ours_that_several_plans_share(tmp_path: Path) -> None:
+    class Interrupted:
+        def update(self, done: float, total: float, note: str = "") -> None:
+            if (tmp_path / "log").exists():
+                raise KeyboardInterrupt
+
+    jobs = [joined("runs", log=tmp_path / "log", takes_s=3.0)]
+    with PinnedProcesses([CORE]) as executor, pytest.raises(KeyboardInterrupt):
+        run(jobs, tmp_path, executor, Interrupted())
     assert not (tmp_path / "runs").exists()
 
 

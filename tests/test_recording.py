@@ -54,6 +54,8 @@ def recording(**changes: Any) -> Recording:
         ({"spike_times_s": [0.0, 1.0]}, "spike_channels: expected 2 values"),
         ({"spike_channels": [0, 1, 3]}, r"rows of the channel table \(0 to 2\), got 3 \(1 spikes on unknown"),
         ({"spike_channels": [0, 1, -1]}, "rows of the channel table"),
+        ({"spike_channels": [0, 1, -0.5]}, "spike_channels: expected whole numbers, got -0.5"),
+        ({"spike_channels": np.array([0, np.nan, 1])}, "spike_channels: expected whole numbers, got nan"),
         ({"duration_s": 1.0}, r"spike_times_s: expected times within the recording \(-1 to 0 s\)"),
         ({"duration_s": -1.0}, "start_s, duration_s: expected finite seconds"),
         ({"start_s": np.nan}, "start_s, duration_s: expected finite seconds"),
@@ -78,6 +80,8 @@ def test_a_recording_refuses_impossible_values(changes: dict[str, Any], message:
         ({"electrodes": [1, 2]}, r"stimuli.electrodes: expected shape \(stimuli, electrodes\)"),
         ({"presentation": [1, 0]}, "stimuli.presentation: expected numbers that never fall over time"),
         ({"pattern": [1]}, "pattern: expected 2 values"),
+        ({"pattern": [1, np.nan]}, "pattern: expected whole numbers, got nan"),
+        ({"presentation": [1, 1.9]}, "presentation: expected whole numbers, got 1.9"),
     ],
 )
 def test_a_stimulus_table_refuses_impossible_values(changes: dict[str, Any], message: str) -> None:

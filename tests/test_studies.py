@@ -38,7 +38,7 @@ from animat.execution.receipts import Receipt, digest_of
 from animat.execution.task import carry_out
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline, load_timeline
-from animat.progress import Silent
+from animat.progress import Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell, with_error
@@ -300,6 +300,22 @@ def test_a_specification_can_be_corrected_before_anything_is_made(tmp_path: Path
             run_study(replace(study, seed=seed), tmp_path / "study", base=TINY.parent, executor=Halts())
     assert read_study(tmp_path / "study" / "study.toml").seed == 2
     assert json.loads((tmp_path / "study" / "study.json").read_text())["study"]["seed"] == 2
+
+
+def test_a_specification_can_be_corrected_after_its_first_job_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(self: Record, folder: Path, progress: Progress) -> list[Path]:
+        progress.update(0.5, 1)
+        raise AnimatError("stopped")
+
+    monkeypatch.setattr(Record, "make", stop)
+    # Every other job needs the recordings.
+    study = replace(read_study(TINY), arms=(Arm("1 threshold"),), comparisons=())
+    for seed in (1, 2):
+        with ThreadPoolExecutor(1) as executor, pytest.raises(AnimatError, match="stopped"):
+            run_study(replace(study, seed=seed), tmp_path, base=TINY.parent, executor=executor)
+    assert read_study(tmp_path / "study.toml").seed == 2
 
 
 @pytest.mark.parametrize("damage", ["fewer spikes", "garbage", "gone"])
@@ -864,6 +880,7 @@ COMPARED = (
         ),
         ("optimum_resolution = 3.0", "optimum_resolution: expected at most 2, got 3"),
         ("[culture]\ninterval_min = 1e9", "expected recordings within a year"),
+        ("[culture]\nfrequencies_hz = []", "culture.frequencies_hz: expected at least 1, got "),
         ("[culture]\nchannels = 32", "channels: no such setting in [culture]; expected some of kind, files"),
         (f"policies = {'9' * 5000}", "expected TOML, got malformed text: Exceeds the limit (4300 digits)"),
         (f"policies = 0x{'f' * 5000}", "policies: expected at most 1,000, got a number of 20,000 bits"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from animat.cli import main
@@ -19,7 +20,8 @@ from animat.evaluation.optimum import best_return
 from animat.evaluation.rollouts import Episodes, networks_of, roll_out
 from animat.evaluation.statistics import holm
 from animat.neurons.simulator import fit_histogram
-from animat.neurons.timeline import fit_timeline
+from animat.neurons.synthetic import synthetic_simulator
+from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.progress import Silent
 from animat.recordings.reading import read_recordings
 from animat.report.results import ComparedReturns, Results, Score, StudyOptimum
@@ -28,6 +30,7 @@ from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
 from animat.studies.optima import FindOptima, read_optima
+from animat.studies.pictures import _courses, _minutes_in_training
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
 from animat.studies.report_tables import optima_table
@@ -43,6 +46,8 @@ from animat.wrappers import ShuffledDelivery
 
 # --- which side is better -------------------------------------------------------------------------------------------
 
+TIMELINE = SimulatorTimeline(synthetic_simulator(), np.array([0.0, 10.0]), (), (2.0, 10.0), None, (), ())
+"""Of two recordings whose simulators are of no interest."""
 HERE, RECORDED = Path(__file__).parent, Source("files", files=("data/tiny",))
 WORSE = Arm("worse", mapping="none", trained=False)
 BETTER = Arm("better", mapping="none", trained=False)
@@ -257,6 +262,39 @@ def test_conditions_of_few_responses_are_left_out_of_a_study_s_optima_and_named(
     note = optima_table((at_first, at_last, without))
     assert "1 of 3 optima leave out conditions with fewer than 30 responses" in note.note
     assert note.rows[0][-1] == at_first.left_out
+
+
+def synthetic_references(folder: Path, study: Study) -> tuple[References, References]:
+    """Of two recordings, the first without an optimum; policies and random actions return -80."""
+    spec, arm, minutes = study.robots[0], study.arms[0], (0.0, 10.0)
+    run = {"ran": episodes_of(np.array([[-80.0]])), "robot": spec.name, "over_time": True}
+    through = {"arm": mapping_label(*arm.kind), "agent": RANDOM}
+    table = pd.concat(
+        [episode_rows(**run, **of, at_min=at_min) for at_min in minutes for of in ({"arm": arm.name}, through)]
+    )
+    rows = [
+        StudyOptimum(spec.name, *arm.kind, at, *[20.0] * 8, 100, few) for at, few in ((0.0, "5 Hz (3)"), (10.0, None))
+    ]
+    for what in ("optima", "over-time"):
+        write_typed(optima_file(folder, spec.name, what), rows)
+    known, coarse = (References(study, folder, spec, table, over_time=over_time) for over_time in (False, True))
+    return known, coarse
+
+
+def test_an_optimum_that_is_known_only_later_is_shown_from_then_on(tmp_path: Path) -> None:
+    known, coarse = synthetic_references(tmp_path, Study(robots=(RobotSpec("navigation"),), policies=1))
+    (panel,) = _courses(known, coarse, TIMELINE)
+    assert panel.optimum is not None
+    np.testing.assert_equal(panel.optimum, [np.nan, 20.0])
+
+
+def test_lines_of_learning_curves_are_of_the_simulator_in_use(tmp_path: Path) -> None:
+    arms = [Arm(str(of).lower(), shadowing=of) for of in (True, False, "drawn")]
+    study = Study(robots=(RobotSpec("navigation"),), arms=tuple(arms), training_min=20.0)
+    known, _ = synthetic_references(tmp_path, study)
+    minutes = [_minutes_in_training(known, arm, TIMELINE) for arm in arms]
+    np.testing.assert_equal(minutes, [[0.0] * 30 + [10.0] * 30, [0.0] * 60, [np.nan] * 60])
+    assert known.random(arms[2], np.nan) is None is known.best_return(arms[2], np.nan)
 
 
 @pytest.mark.oracle

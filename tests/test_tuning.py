@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -23,10 +25,11 @@ from animat.cli import main
 from animat.errors import AnimatError, InvalidFile, Mismatch
 from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import fit_timeline
+from animat.progress import Silent
 from animat.responses.extraction import extract_responses
 from animat.studies.source import Source
 from animat.studies.toml import read_study
-from animat.training.group import programs
+from animat.training.group import programs, split_groups
 from animat.training.policy import CURVE
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
@@ -139,6 +142,24 @@ def test_the_better_ones_of_each_generation_go_on_and_the_study_s_own_settings_a
         assert {each.trial for each in generation if each.state == "complete"} == on
     assert all(each.chunks == ((20, 60) if each.state == "complete" else (20,)) for each in trials)
     assert trials[0].settings == {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
+
+
+def test_no_two_policies_of_a_final_meet_the_same_episodes(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = []
+
+    def roll_out(*_: Any, episodes: int, seed: int) -> Any:
+        seeds.append(seed)
+        return SimpleNamespace(returns=np.zeros((1, episodes)))
+
+    monkeypatch.setattr(tasks, "roll_out", roll_out)
+    monkeypatch.setattr(Trials, "train", lambda *_: None)
+    study = read_tuning(TINY).study
+    trial, place = Trial(0, first_settings(study, read_tuning(TINY).space)[0]), "finals-of-six"
+    for group in split_groups(6):
+        tasks.TrainTrials(study, (trial,), group[:1], (1, 2), 5, (0, CHUNKS), place).run(finished, Silent())
+    shutil.rmtree(finished / place)
+    assert len(set(seeds)) == 2
+    assert seeds[0] == 2, "the results of up to five policies are what they were"
 
 
 def test_the_best_is_a_study_of_the_settings_that_won(finished: Path) -> None:

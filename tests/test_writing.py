@@ -32,6 +32,19 @@ def test_a_whole_file_takes_the_old_ones_place_with_the_rights_of_a_new_one(tmp_
     assert [file.name for file in path.parent.iterdir()] == ["b.txt"]
 
 
+def test_the_umask_of_a_process_with_threads_is_never_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # It belongs to all threads: two that read it by setting it can leave it at 0, and a file open to everybody.
+    before = os.umask(0o077)
+    try:
+        monkeypatch.setattr(os, "umask", None)
+        with atomic_write(tmp_path / "b.txt") as beside:
+            beside.write_text("new")
+        assert stat.S_IMODE((tmp_path / "b.txt").stat().st_mode) == 0o600
+    finally:
+        monkeypatch.undo()
+        os.umask(before)
+
+
 @pytest.mark.parametrize(
     "error", [OSError(28, "No space left on device"), ValueError("something else"), KeyboardInterrupt()]
 )

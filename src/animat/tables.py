@@ -32,8 +32,15 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
 
 
 def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[Any, Any]:
-    """Turn an attribute of a frozen dataclass into a read-only array; returns it."""
-    array = np.array(getattr(table, attribute), dtype=dtype)
+    """Turn an attribute of a frozen dataclass into a read-only array; returns it.
+
+    Raises UnusableData if the type is of whole numbers and some are not, which would be truncated silently.
+    """
+    given = np.asarray(getattr(table, attribute))
+    with np.errstate(invalid="ignore"):
+        array = np.array(given, dtype=dtype)
+    if array.dtype.kind == "i" and given.dtype.kind in "fu" and np.any(differ := array != given):
+        raise UnusableData(f"{attribute}: expected whole numbers, got {given[differ][0]:g}")
     array.setflags(write=False)
     object.__setattr__(table, attribute, array)
     return array

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -33,15 +34,14 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = Path(path)
     with as_invalid_file(path, "cannot be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=f".partial{path.suffix}")
-    os.close(handle)
-    temporary = Path(name)
+        temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.partial{path.suffix}"
+        # Exclusively, as two processes may write the same file.
+        temporary.touch(exist_ok=False)
     with as_invalid_file(path, "cannot be written", UNCHANGED):
         try:
             yield temporary
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
-            temporary.chmod(0o666 & ~_umask())
             temporary.replace(path)
             sync_folder(path.parent)
         except BaseException:
@@ -161,10 +161,3 @@ def sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-
-def _umask() -> int:
-    # The only way to read the umask is to set it; mkstemp ignores it and makes files private.
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

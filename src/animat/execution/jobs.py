@@ -6,9 +6,9 @@ import json
 import math
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -114,7 +114,13 @@ class Jobs:
             note = f"{len(self._done)} of {counted(n_jobs, 'job')}; {'; '.join(parts)}" if parts else ""
             progress.update(total_s - left_s, total_s, note)
 
-        with _executors_for(executor, workers, running, has_gpu) as (cores, gpu):
+        def keep(future: Future[TaskResult]) -> None:
+            job, result = running[future], future.result()
+            self._done[job.name] = Receipt(job.name, self._fingerprint, self._inputs(job), result.files)
+            self._done[job.name].save(self._receipts)
+            cpu_s[job.name] = result.cpu_s
+
+        with _executors_for(executor, workers, running, keep, has_gpu) as (cores, gpu):
             # Jobs that need a failed one never become ready.
             while running or any(self._has_needs(job) for job in self.waiting):
                 ready = [job for job in self.waiting if self._has_needs(job)]
@@ -127,17 +133,14 @@ class Jobs:
                 # Successful ones first, so that their receipts are kept whatever the others raise.
                 ended = wait(running, _LOOK_EVERY_S, FIRST_COMPLETED).done
                 for future in sorted(ended, key=lambda each: each.cancelled() or each.exception() is not None):
-                    job = running[future]
                     try:
-                        result = _result_of(future, job)
+                        _expect_success(future, running[future])
                     except AnimatError as error:
                         if not isinstance(executor, Cluster) or future.cancelled():
                             raise
                         failed.append(error)
                     else:
-                        self._done[job.name] = Receipt(job.name, self._fingerprint, self._inputs(job), result.files)
-                        self._done[job.name].save(self._receipts)
-                        cpu_s[job.name] = result.cpu_s
+                        keep(future)
                     del running[future]
         report()
         if failed:
@@ -193,24 +196,37 @@ class Jobs:
 
 @contextmanager
 def _executors_for(
-    executor: Executor | None, workers: int | None, running: dict[Future[TaskResult], Job], has_gpu: bool
+    executor: Executor | None,
+    workers: int | None,
+    running: dict[Future[TaskResult], Job],
+    keep: Callable[[Future[TaskResult]], None],
+    has_gpu: bool,
 ) -> Iterator[tuple[Executor, Executor | None]]:
-    """The given executor, or our own processes, with one for the GPU; if the block fails, nothing keeps running."""
+    """The given executor, or our own processes, with one for the GPU; if the block fails, nothing keeps running.
+
+    Ctrl-C ends running tasks in processes of ours. Any other executor finishes them first, and they are kept.
+    """
     if executor is None:
         with PinnedProcesses(own_cores(workers)) as cores, PinnedProcesses([None]) as gpu:
             yield cores, gpu if has_gpu else None
         return
     try:
         yield executor, None
-    except BaseException:
+    except BaseException as error:
+        if isinstance(executor, PinnedProcesses) and isinstance(error, KeyboardInterrupt):
+            executor.kill_workers()
         # The folder must not be released while a task still writes to it.
-        wait([future for future in running if not future.cancel()])
+        for future in wait([future for future in running if not future.cancel()]).done:
+            if future.exception() is None:
+                with suppress(AnimatError):
+                    keep(future)
         raise
 
 
-def _result_of(future: Future[TaskResult], job: Job) -> TaskResult:
+def _expect_success(future: Future[TaskResult], job: Job) -> None:
+    """Raise an AnimatError that names the job if it failed."""
     try:
-        return future.result()
+        future.result()
     except AnimatError as error:
         error.args = (f"{job.name}: {error}",)
         raise

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from animat.errors import AnimatError, InvalidFile
+from animat.errors import AnimatError, InvalidFile, as_invalid_file
 from animat.execution.cluster import expect_distributed
 from animat.execution.dask_worker import work
 
@@ -29,14 +29,15 @@ runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
 def local_cluster(workers: int, file: Path, *, threads: int = 1) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler and workers until the block ends; a worker that dies is replaced.
 
-    The scheduler writes its address to the file, which may not exist yet, and is removed at the end. Yields the
-    processes of the scheduler and of the workers' nanny.
+    The scheduler writes its address to the file, which may not exist yet, and is removed at the end; its folder is
+    created if it is missing. Yields the processes of the scheduler and of the workers' nanny.
     """
     expect_distributed()
     if file.exists():
-        raise InvalidFile(
-            f"{file}: expected no file, got one; another cluster may be running: stop it, or remove the file"
-        )
+        got = "a folder" if file.is_dir() else "one; another cluster may be running: stop it, or remove the file"
+        raise InvalidFile(f"{file}: expected no file, got {got}")
+    with as_invalid_file(file, "cannot be written"):
+        file.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         stack.callback(file.unlink, missing_ok=True)
         scheduler = _start("scheduler", file, "--host", "127.0.0.1", "--port", "0")

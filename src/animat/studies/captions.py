@@ -89,7 +89,8 @@ ROBOT = {
         "iterations before, in which every environment ends at least one. Curves begin there, because the first "
         "episodes to end are not a representative sample. Actions are drawn. Lines: random actions and the optimal "
         "return with the simulator in use, which changes with it (from the second recording on: on a coarse grid). A "
-        "control has no such return: whatever it chooses is as good as random.",
+        "control has no such return: whatever it chooses is as good as random. An arm whose episodes draw their "
+        "recording has no lines, as it has no one simulator in use.",
         ("tables/{of}-learning.csv", "tables/learning-curves.csv"),
     ),
     "comparisons": Caption(

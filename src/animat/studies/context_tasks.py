@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import final
+from typing import Annotated, final
+
+from pydantic import Field
 
 from animat.coding.mapping import mapping_named
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
@@ -27,9 +29,11 @@ from animat.responses.series import extract_series
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
 from animat.stimulation import protocol
+from animat.studies.specification import Episodes, Resolution
 from animat.studies.task import draw_seed
 from animat.studies.training import work_on
 from animat.training.policy import load_policies
+from animat.training.settings import MOST_POLICIES
 from animat.training.specification import Training
 
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
@@ -55,11 +59,11 @@ class ContextStudy:
 
     cultures: tuple[Seed, ...] = (1, 2, 3, 4, 5)
     robots: tuple[str, ...] = ("cartpole", "navigation", "swing-up", "shuttle")
-    policies: Whole = 4
+    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 4
     iterations_share: Positive = 0.5
-    episodes: Whole = 400
-    episodes_measured: Whole = 5
-    optimum_resolution: Positive = 0.5
+    episodes: Episodes = 400
+    episodes_measured: Episodes = 5
+    optimum_resolution: Resolution = 0.5
     seed: Seed = 1
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.errors import InvalidArgument, Mismatch, as_invalid_file
 from animat.execution.receipts import sha256
+from animat.execution.task import NOTICES
 from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
@@ -132,7 +133,7 @@ def _is_claimed(folder: Path, what: str, manifest: dict[str, Any], files: list[s
         return all((folder / name).exists() for name in files)
     # Work that stopped at its first step left only these files, and may be replaced.
     left = (path for path in folder.rglob("*") if not path.is_dir() and not _is_hidden(path))
-    if any(path.name not in files for path in left):
+    if any(path.name not in files and path.parent.name != NOTICES for path in left):
         raise folder_mismatch(folder, what, first_difference(found, manifest, ignoring=("fingerprint",)))
     return False
 

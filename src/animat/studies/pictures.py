@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -42,7 +43,9 @@ from animat.studies.simulating import read_series
 from animat.studies.specification import Arm, RobotSpec, Study, mapping_label
 from animat.studies.tabulating import References, all_episodes, learning_of, performances
 from animat.studies.task import StudyTask
+from animat.studies.training import training_of
 from animat.training.settings import SAC
+from animat.training.specification import CHUNKS
 
 
 @final
@@ -143,7 +146,7 @@ def _curves(known: References, coarse: References, timeline: SimulatorTimeline |
     for arm in (arm for arm in study.arms if arm.trained):
         learning = learning_of(study, known.folder, known.spec, arm)
         random, optimum = [], []
-        for at_min in _minutes_in_training(study, arm, timeline, learning.shape[1]):
+        for at_min in _minutes_in_training(known, arm, timeline):
             random.append((coarse if arm.through_neurons else known).random(arm, at_min))
             best = known.best_return(arm, at_min)
             optimum.append(coarse.best_return(arm, at_min) if best is None else best)
@@ -159,15 +162,15 @@ def round_of(study: Study, spec: RobotSpec) -> int:
     return spec.robot().episode_limit * read_record(SAC, study.algorithm, "algorithm").environments
 
 
-def _minutes_in_training(study: Study, arm: Arm, timeline: SimulatorTimeline | None, chunks: int) -> list[float]:
-    """The minute of the recording in use in each chunk of training."""
+def _minutes_in_training(known: References, arm: Arm, timeline: SimulatorTimeline | None) -> list[float]:
+    """The minute of the recording in use in each chunk of training; NaN if each episode draws its recording."""
     if timeline is None or not arm.through_neurons:
         # Without neurons every minute is the same.
-        return [0.0] * chunks
-    every_min = timeline.start_min.tolist()
-    share = 1 / chunks if arm.shadowing else 0.0
-    rows = [timeline.row_at(every_min[0] + study.training_min * share * chunk) for chunk in range(chunks)]
-    return [every_min[row] for row in rows]
+        return [0.0] * CHUNKS
+    if arm.shadowing == "drawn":
+        return [math.nan] * CHUNKS
+    training, every_min = training_of(known.study, known.spec, arm), timeline.start_min.tolist()
+    return [every_min[timeline.row_at(every_min[0] + training.minute(chunk))] for chunk in range(CHUNKS)]
 
 
 def _pair(row: ComparedReturns, known: References) -> Pair:
@@ -186,9 +189,9 @@ def _courses(known: References, coarse: References, timeline: SimulatorTimeline)
             of_minute = rows_where(over_time, arm=arm.name).groupby("at_min")
             returns[arm.name] = np.stack([mean_returns(rows) for _, rows in of_minute], axis=1)
         random = np.array([coarse.random(kind, at_min) for at_min in every_min])
-        optimum = [coarse.best_return(kind, at_min) for at_min in every_min]
+        optimum = np.array([coarse.best_return(kind, at_min) for at_min in every_min], np.float64)
         fine = {at_min: best for at_min in every_min if (best := known.best_return(kind, at_min)) is not None}
-        values = None if optimum[0] is None else np.array(optimum, np.float64)
+        values = optimum if np.isfinite(optimum).any() else None
         panels.append(Courses(mapping_label(*kind.kind), timeline.start_min, returns, random, values, fine))
     return panels
 

@@ -87,7 +87,8 @@ class Source:
         """The protocol of each recording of a virtual culture; raises InvalidArgument if it is invalid."""
         places: dict[str, Any] = {} if self.places is None else {"places": self.places}
         if self.frequencies_hz is not None or self.places == "corners":
-            places["frequencies_hz"] = self.frequencies_hz or TWO_COMMANDS.frequencies_hz
+            given = self.frequencies_hz
+            places["frequencies_hz"] = TWO_COMMANDS.frequencies_hz if given is None else given
         return Protocol(order=self.order, pulses=self.pulses, trials=self.trials, **places)
 
 

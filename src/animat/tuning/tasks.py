@@ -68,7 +68,7 @@ class TrainTrials(StudyTask):
 
     Attributes:
         members: numbers of the trials' policies.
-        seeds: of training and of the episodes.
+        seeds: of training and, for the group of the first policies, of the episodes.
         episodes: per policy.
         chunks: the chunks of training, from the first up to but excluding the last.
         place: folder of the returns and, up to the end of training, of the learners, relative to the tuning's.
@@ -117,12 +117,14 @@ class TrainTrials(StudyTask):
 
         environment = training.environment_on(timeline)
         simulator = _at(judging, training.minute(CHUNKS - 1))
+        # Otherwise the first policies of two groups would meet the same episodes.
+        seed = self.seeds[1] + self.members[0]
         files = []
         for i, trial in enumerate(self.trials):
             networks = together.networks(i, greedy=self.study.actions == "most probable")
             returns: list[float] | None = None
             if networks is not None:
-                ran = roll_out(environment, simulator, networks, episodes=self.episodes, seed=self.seeds[1])
+                ran = roll_out(environment, simulator, networks, episodes=self.episodes, seed=seed)
                 means = ran.returns.mean(axis=1)
                 returns = means.tolist() if np.isfinite(means).all() else None
             file = returns_file(place, trial, last, self.members[0])
