@@ -164,8 +164,8 @@ class PlainColumns:
             expected = f"shape ({n}, electrodes), padded with {UNKNOWN}"
             raise UnusableData(f"stimulus_electrodes: expected {expected}, got {electrodes.shape}")
         whole = _whole("stimulus_electrodes", electrodes)
-        if whole.min(initial=UNKNOWN) < NOTHING:
-            expected = f"electrode numbers, with {UNKNOWN} for unknown and {NOTHING} for nothing delivered"
+        if whole.min(initial=UNKNOWN) < UNKNOWN:
+            expected = f"electrode numbers, or {UNKNOWN} for none (stimulus_pattern {NOTHING}: nothing was delivered)"
             raise UnusableData(f"stimulus_electrodes: expected {expected}, got {whole.min()}")
         return whole
 
@@ -209,7 +209,7 @@ def with_start(recording: Recording, start_s: float) -> Recording:
         UnusableData: if events come before the new start.
     """
     duration_s = _duration_s(start_s, max(recording.stop_s, start_s))
-    findings = tuple(finding for finding in recording.findings if finding.name != "start-unknown")
+    findings = tuple(finding for finding in recording.findings if finding.name not in ("start-unknown", "start-given"))
     if start_s != recording.start_s:
         message = f"the recording starts at {start_s:.12g} s, as given, instead of {recording.start_s:.12g} s"
         findings += (Finding("start-given", "note", message, float(start_s)),)
