@@ -55,7 +55,8 @@ def open_traces(
         else:
             base = read_foreign_nwb(file, stimuli, spikes=False)
             traces = _nwb(file, part, base)
-    start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
+    # The recording's own start may only be assumed.
+    start_s, rate_hz = float(base.stimuli.time_s.min(initial=traces.start_s)), traces.sampling_rate_hz
     stop_s = max(base.stop_s, traces.start_s + traces.samples / rate_hz)
     # Replaced together: stimuli lie within the new span, but perhaps not within the new start and the old duration.
     base = replace(
