@@ -22,9 +22,11 @@ def memory_findings(responses: Responses) -> Iterator[Finding]:
     For each condition in each stretch of the recording, p1 is how often its non-burst responses pass the stretch's
     median after a response that did, and p0 after one that did not. The difference is averaged over all of these with
     the weights w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count as memory. Its standard
-    error is that of independent responses, sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0).
+    error is that of independent responses, sqrt(sum w p (1 - p) n / (n - 1)) / sum w, with n = n1 + n0 and
+    p = (n1 p1 + n0 p0) / n.
 
-    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
+    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables; Mantel and Haenszel 1959
+    (doi:10.1093/jnci/22.4.719), n / (n - 1), as there may be few responses in a table.
     """
     last_hz = responses.last_hz
     tables = []
@@ -44,7 +46,8 @@ def memory_findings(responses: Responses) -> Iterator[Finding]:
     n1s, n0s, p1, p0 = (np.array(column, np.float64) for column in zip(*tables, strict=True))
     weights = n1s * n0s / (n1s + n0s)
     pooled = (n1s * p1 + n0s * p0) / (n1s + n0s)
-    error = math.sqrt(float(np.sum(weights * pooled * (1 - pooled)))) / float(weights.sum())
+    unbiased = pooled * (1 - pooled) * (n1s + n0s) / (n1s + n0s - 1)
+    error = math.sqrt(float(np.sum(weights * unbiased))) / float(weights.sum())
     after_one, after_none = (float(np.average(p, weights=weights)) for p in (p1, p0))
     if abs(after_one - after_none) <= CERTAIN * error:
         return
