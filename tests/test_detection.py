@@ -497,6 +497,14 @@ def write_nwb_traces(path: Path, voltage: np.ndarray, start_s: float) -> None:
         series["starting_time"].attrs["rate"] = RATE_HZ
 
 
+def write_stimuli(path: Path, time_s: list[float]) -> None:
+    with h5py.File(path, "r+") as file:
+        table = file.create_group("intervals/stimuli")
+        table.attrs["neurodata_type"] = "TimeIntervals"
+        table.attrs["colnames"] = ["start_time", "stop_time"]
+        table["start_time"] = table["stop_time"] = np.array(time_s)
+
+
 def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
     voltage, truth = noisy(2, 1.0, step_uv=1.0)
     write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
@@ -512,14 +520,14 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
 def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) -> None:
     voltage, _ = noisy(2, 6.0, step_uv=1.0)
     write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=-1.0)
-    with h5py.File(tmp_path / "a.nwb", "r+") as file:
-        table = file.create_group("intervals/stimuli")
-        table.attrs["neurodata_type"] = "TimeIntervals"
-        table.attrs["colnames"] = ["start_time", "stop_time"]
-        table["start_time"] = table["stop_time"] = np.array([1.0, 4.9])
+    write_stimuli(tmp_path / "a.nwb", [1.0, 4.9])
     recording = read_traces(tmp_path / "a.nwb", Detection())
     assert (recording.start_s, recording.duration_s) == (-1.0, 6.0)
     assert recording.stimuli.time_s.tolist() == [1.0, 4.9]
+    # A duration that rounds to before the last stimulus.
+    write_nwb_traces(tmp_path / "b.nwb", voltage, start_s=-1.6805853027283018)
+    write_stimuli(tmp_path / "b.nwb", [7.768889504673502])
+    assert read_traces(tmp_path / "b.nwb", Detection()).stimuli.time_s.tolist() == [7.768889504673502]
 
 
 def test_traces_that_begin_late_make_a_recording_that_begins_with_them(tmp_path: Path) -> None:

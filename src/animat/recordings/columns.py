@@ -86,7 +86,7 @@ class PlainColumns:
             stimuli=stimuli,
             sampling_rate_hz=float(self.sampling_rate_hz),
             start_s=start_s,
-            duration_s=_duration_s(start_s, stop_s) if self.duration_s is None else float(self.duration_s),
+            duration_s=duration_between(start_s, stop_s) if self.duration_s is None else float(self.duration_s),
             start_min=float(self.start_min),
             presentation=presentation,
             provenance={**provenance, **names},
@@ -208,7 +208,7 @@ def with_start(recording: Recording, start_s: float) -> Recording:
     Raises:
         UnusableData: if events come before the new start.
     """
-    duration_s = _duration_s(start_s, max(recording.stop_s, start_s))
+    duration_s = duration_between(start_s, max(recording.stop_s, start_s))
     findings = tuple(finding for finding in recording.findings if finding.name not in ("start-unknown", "start-given"))
     if start_s != recording.start_s:
         message = f"the recording starts at {start_s:.12g} s, as given, instead of {recording.start_s:.12g} s"
@@ -216,7 +216,7 @@ def with_start(recording: Recording, start_s: float) -> Recording:
     return replace(recording, start_s=float(start_s), duration_s=duration_s, findings=findings)
 
 
-def _duration_s(start_s: float, stop_s: float) -> float:
+def duration_between(start_s: float, stop_s: float) -> float:
     """The duration such that start + duration does not round to before the end."""
     duration_s = stop_s - start_s
     while start_s + duration_s < stop_s:
