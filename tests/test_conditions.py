@@ -62,6 +62,8 @@ def test_frequencies_computed_from_intervals_are_one_condition() -> None:
     index, labels = assigned(ByFrequency(), stimuli(time_s.tolist(), frequency_hz.tolist()))
     assert labels == ["5 Hz", "20 Hz"]
     assert index == [1] * 99 + [0] * 101
+    later = stimuli((time_s + 1000).tolist(), (1 / np.diff(time_s + 1000, append=time_s[-1] + 1000.2)).tolist())
+    assert ByFrequency().assign(later).conditions == ByFrequency().assign(stimuli([0, 1], [5.0, 20.0])).conditions
 
 
 def test_the_interval_is_the_one_before() -> None:

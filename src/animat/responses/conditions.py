@@ -68,7 +68,10 @@ class ByFrequency(Conditions):
         values_hz = list(self.values_hz)
         if not values_hz:
             for known_hz in np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]).tolist():
-                if not (values_hz and math.isclose(values_hz[-1], known_hz, rel_tol=SAME)):
+                if values_hz and math.isclose(values_hz[-1], known_hz, rel_tol=SAME):
+                    # In every recording of a series the same number.
+                    values_hz[-1] = float(f"{values_hz[-1]:.9g}")
+                else:
                     values_hz.append(known_hz)
         index = np.full(len(stimuli), NO_CONDITION)
         for i, value_hz in enumerate(values_hz):
