@@ -486,6 +486,17 @@ def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
     assert recording.stimuli.electrodes.tolist() == [[9]]
 
 
+def test_a_channel_that_is_saturated_most_of_the_time_is_not_taken_for_a_quiet_one() -> None:
+    voltage, truth = noisy(3, 3.0)
+    pulses = np.arange(2000, 58_000, 12_000)
+    for pulse in pulses.tolist():
+        voltage[pulse : pulse + 8000, 0] = 30_000
+    found = detect_spikes(RawTraces.from_array(voltage, channels(3), RATE_HZ, uv_per_step=0.1), pulses / RATE_HZ)
+    np.testing.assert_allclose(found.noise_uv, found.noise_uv[1], rtol=0.1)
+    free = truth[0][(truth[0] - 2000) % 12_000 > 8100]
+    assert abs(np.count_nonzero(found.channel == 0) - len(free)) <= 3
+
+
 def write_nwb_traces(path: Path, voltage: np.ndarray, start_s: float) -> None:
     with h5py.File(path, "w") as file:
         file.attrs["nwb_version"] = "2.7.0"
