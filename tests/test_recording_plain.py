@@ -632,6 +632,13 @@ def test_messages_say_what_is_missing(name: str, text: str, words: str, tmp_path
         read_source(tmp_path / name)
 
 
+def test_pulses_per_trial_that_are_not_stated_are_those_of_the_usual_trial(tmp_path: Path) -> None:
+    times = {"stimulus_time_s": np.arange(11) * 0.1, "presentation_order": np.array("mixed")}
+    trials = {"stimulus_presentation": np.arange(11) // 5}
+    assert read_recording(npz(tmp_path, **SPIKES, **times, **trials)).presentation == Presentation("mixed", 5)
+    assert read_recording(npz(tmp_path, **SPIKES, **times)).presentation == Presentation("mixed", 1)
+
+
 def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path) -> None:
     labels = {"channel_label": np.array(["17", "21", "40"])}
     numbers = {"spike_time_s": np.array([0.1, 0.2]), "spike_channel": np.array([17, 1])}

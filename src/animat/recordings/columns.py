@@ -75,7 +75,10 @@ class PlainColumns:
         stop_s = float(event_s.max(initial=start_s))
         presentation = None
         if self.presentation_order is not None:
-            pulses = 1 if self.presentation_pulses is None else self.presentation_pulses
+            pulses = self.presentation_pulses
+            if pulses is None:
+                per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
+                pulses = int(np.median(per_trial)) if len(per_trial) else 1
             presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
         elif self.presentation_pulses is not None:
             raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
