@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from skimage.filters import threshold_otsu
 
@@ -47,6 +48,21 @@ def test_no_cut_is_better(n_channels: int, active: list[int]) -> None:
     ratio = np.minimum(active, n_channels) / n_channels
     best = max(criterion(ratio, cut) for cut in np.unique(ratio))
     assert criterion(ratio, otsu_threshold(ratio)) == pytest.approx(best, rel=1e-9, abs=1e-12)
+
+
+@given(st.integers(1, 12), st.lists(st.integers(0, 12), min_size=2, max_size=12))
+@example(10, [2, 7, 7, 6, 6, 10, 5, 10, 8, 9])
+def test_of_equally_good_cuts_the_first_is_taken(n_channels: int, active: list[int]) -> None:
+    active = [min(each, n_channels) for each in active]
+
+    def exact(cut: int) -> Fraction:
+        upper, lower = [a for a in active if a > cut], [a for a in active if a <= cut]
+        if not upper:
+            return Fraction(0)
+        return len(upper) * len(lower) * (Fraction(sum(upper), len(upper)) - Fraction(sum(lower), len(lower))) ** 2
+
+    first = max(sorted(set(active)), key=exact)
+    assert otsu_threshold(np.array(active) / n_channels) == first / n_channels
 
 
 @given(st.lists(st.integers(0, 64), min_size=2, max_size=60), st.integers(1, 7), st.integers(-1000, 1000))

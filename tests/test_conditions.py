@@ -55,6 +55,17 @@ def test_a_frequency_survives_single_precision() -> None:
     assert assigned(ByFrequency((12.3,)), table) == ([0], ["12.3 Hz"])
 
 
+def test_frequencies_computed_from_intervals_are_one_condition() -> None:
+    time_s = 3 + np.cumsum(np.repeat([0.05, 0.2], 100))
+    frequency_hz = 1 / np.diff(time_s, append=time_s[-1] + 0.2)
+    assert len(np.unique(frequency_hz)) > 2
+    index, labels = assigned(ByFrequency(), stimuli(time_s.tolist(), frequency_hz.tolist()))
+    assert labels == ["5 Hz", "20 Hz"]
+    assert index == [1] * 99 + [0] * 101
+    later = stimuli((time_s + 1000).tolist(), (1 / np.diff(time_s + 1000, append=time_s[-1] + 1000.2)).tolist())
+    assert ByFrequency().assign(later).conditions == ByFrequency().assign(stimuli([0, 1], [5.0, 20.0])).conditions
+
+
 def test_the_interval_is_the_one_before() -> None:
     # Gaps 0.2 s (5 Hz), 0.1 s (10 Hz), 1 s (neither); the first pulse has none.
     assert assigned(ByInterval((5, 10)), stimuli([0, 0.2, 0.3, 1.3])) == ([-1, 0, 1, -1], ["5 Hz", "10 Hz"])

@@ -13,6 +13,7 @@ from animat.cli import main
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import Origin, convert_recording
 from animat.recordings.detection.settings import Detection
+from animat.recordings.formats import with_spikeinterface
 from animat.recordings.reading import read_recording
 from rig_files import event_table, mapping_table, spike_table, write_cl1, write_maxwell
 from test_detection import noisy
@@ -265,6 +266,35 @@ def test_traces_that_spikeinterface_reads(tmp_path: Path) -> None:
     assert len(written.channels) == 3
     assert written.stimuli.time_s.tolist() == [0.5]
     assert abs(len(written.spike_times_s) - sum(map(len, truth))) <= 3
+
+
+def test_stimuli_before_and_after_the_traces_of_a_reader_leave_spikes_where_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    voltage, _ = noisy(3, 1.0)
+
+    class Traces:
+        """As SpikeInterface has it."""
+
+        get_channel_ids = staticmethod(lambda: [0, 1, 2])
+        has_probe = has_scaleable_traces = staticmethod(lambda: False)
+        get_num_samples = staticmethod(lambda segment_index: len(voltage))
+        get_sampling_frequency = staticmethod(lambda: 20_000.0)
+        get_num_segments = staticmethod(lambda: 1)
+
+        @staticmethod
+        def get_traces(segment_index: int, start_frame: int, end_frame: int, return_in_uV: bool) -> np.ndarray:
+            return voltage[start_frame:end_frame] * 0.1
+
+    monkeypatch.setattr(with_spikeinterface, "_reader", lambda name: lambda path: Traces())
+    (tmp_path / "a.rhd").touch()
+    (tmp_path / "a_stimuli.csv").write_text("-3.0\n1.5\n")
+    recording = convert_recording(tmp_path / "a.rhd", tmp_path / "with.nwb", reader="intan")
+    (tmp_path / "a_stimuli.csv").unlink()
+    without = convert_recording(tmp_path / "a.rhd", tmp_path / "without.nwb", reader="intan")
+    assert len(without.spike_times_s) > 10 and (without.start_s, without.stop_s) == (0.0, 1.0)
+    assert recording.spike_times_s.tolist() == without.spike_times_s.tolist()
+    assert recording.start_s == -3.0 and recording.stop_s >= 1.5
 
 
 @pytest.mark.parametrize(("age", "fits"), [("P40D/P42D", True), ("P6W/P42D", True), ("P42D/P40D", False),

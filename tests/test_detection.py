@@ -486,6 +486,17 @@ def test_raw_traces_of_a_cl1_file(tmp_path: Path) -> None:
     assert recording.stimuli.electrodes.tolist() == [[9]]
 
 
+def test_a_channel_that_is_saturated_most_of_the_time_is_not_taken_for_a_quiet_one() -> None:
+    voltage, truth = noisy(3, 3.0)
+    pulses = np.arange(2000, 58_000, 12_000)
+    for pulse in pulses.tolist():
+        voltage[pulse : pulse + 8000, 0] = 30_000
+    found = detect_spikes(RawTraces.from_array(voltage, channels(3), RATE_HZ, uv_per_step=0.1), pulses / RATE_HZ)
+    np.testing.assert_allclose(found.noise_uv, found.noise_uv[1], rtol=0.1)
+    free = truth[0][(truth[0] - 2000) % 12_000 > 8100]
+    assert abs(np.count_nonzero(found.channel == 0) - len(free)) <= 3
+
+
 def write_nwb_traces(path: Path, voltage: np.ndarray, start_s: float) -> None:
     with h5py.File(path, "w") as file:
         file.attrs["nwb_version"] = "2.7.0"
@@ -495,6 +506,14 @@ def write_nwb_traces(path: Path, voltage: np.ndarray, start_s: float) -> None:
         series["data"].attrs["conversion"] = 1e-6
         series["starting_time"] = start_s
         series["starting_time"].attrs["rate"] = RATE_HZ
+
+
+def write_stimuli(path: Path, time_s: list[float]) -> None:
+    with h5py.File(path, "r+") as file:
+        table = file.create_group("intervals/stimuli")
+        table.attrs["neurodata_type"] = "TimeIntervals"
+        table.attrs["colnames"] = ["start_time", "stop_time"]
+        table["start_time"] = table["stop_time"] = np.array(time_s)
 
 
 def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
@@ -512,11 +531,21 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
 def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) -> None:
     voltage, _ = noisy(2, 6.0, step_uv=1.0)
     write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=-1.0)
-    with h5py.File(tmp_path / "a.nwb", "r+") as file:
-        table = file.create_group("intervals/stimuli")
-        table.attrs["neurodata_type"] = "TimeIntervals"
-        table.attrs["colnames"] = ["start_time", "stop_time"]
-        table["start_time"] = table["stop_time"] = np.array([1.0, 4.9])
+    write_stimuli(tmp_path / "a.nwb", [1.0, 4.9])
     recording = read_traces(tmp_path / "a.nwb", Detection())
     assert (recording.start_s, recording.duration_s) == (-1.0, 6.0)
     assert recording.stimuli.time_s.tolist() == [1.0, 4.9]
+    # A duration that rounds to before the last stimulus.
+    write_nwb_traces(tmp_path / "b.nwb", voltage, start_s=-1.6805853027283018)
+    write_stimuli(tmp_path / "b.nwb", [7.768889504673502])
+    assert read_traces(tmp_path / "b.nwb", Detection()).stimuli.time_s.tolist() == [7.768889504673502]
+
+
+def test_traces_that_begin_late_make_a_recording_that_begins_with_them(tmp_path: Path) -> None:
+    voltage, truth = noisy(2, 1.0, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=3600.0)
+    recording = read_traces(tmp_path / "a.nwb", Detection())
+    assert (recording.start_s, recording.stop_s) == (3600.0, 3601.0)
+    assert abs(len(recording.spike_times_s) - sum(map(len, truth))) <= 3
+    # Without an electrodes table all channels are known all the same.
+    assert "silent-channels-unknown" not in {finding.name for finding in recording.findings}

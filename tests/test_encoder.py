@@ -167,6 +167,17 @@ def test_what_is_open_is_dealt_evenly_and_what_is_not_is_as_recorded(pulses: int
     assert dealer.frequency_hz(1) == 5.0
 
 
+@pytest.mark.parametrize("pulses", [2, 4])
+def test_the_patterns_of_a_trial_are_different_while_there_are_enough(pulses: int) -> None:
+    conditions = tuple(Condition(str(i), 0.0, "", (5.0,), (one,), only_last=True) for i, one in enumerate(SETS))
+    dealer = Dealer(Encoder(conditions, pulses), PATTERNS, np.random.default_rng(1))
+    hands = [dealer.targets(i % 4) for i in range(400)]
+    assert all(len(set(hand)) == pulses for hand in hands)
+    assert [hand[-1].pattern for hand in hands] == [0, 1, 2, 3] * 100
+    before = Counter(target.pattern for hand in hands for target in hand[:-1])
+    assert max(before.values()) - min(before.values()) <= 4
+
+
 @pytest.mark.parametrize(
     ("condition", "words"),
     [

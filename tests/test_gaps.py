@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from animat.cli import main
 from animat.errors import AnimatError
 from animat.recordings.columns import PlainColumns
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -46,6 +47,9 @@ def test_a_clock_that_does_not_start_at_0_causes_a_warning_and_its_start_can_be_
     assert (with_start.start_s, with_start.stop_s) == (from_s, source.stop_s)
     assert said(with_start)["start-given"] == f"the recording starts at {from_s:.12g} s, as given, instead of 0 s"
     assert "start-given" not in said(read_recording(path, start_s=0.0))
+    write_nwb(with_start, tmp_path / "given.nwb")
+    again = read_recording(tmp_path / "given.nwb", start_s=from_s - 1)
+    assert [finding.name for finding in again.findings].count("start-given") == 1
     inspection = inspect_recording(with_start)
     # 20,000 spikes on 30 channels in 600 s, independent of each other.
     assert inspection.spontaneous_rate_hz == pytest.approx(20_000 / 30 / 600, rel=1e-3)
@@ -138,3 +142,7 @@ def test_unnumbered_pulses_are_trials_and_several_frequencies_in_one_cause_a_war
     assert said(mixed)["trials-of-several-frequencies"].startswith("2 of 2 trials have pulses of several frequencies")
     alike = trials(stimulus_presentation=np.repeat([0, 1], 25), stimulus_frequency_hz=np.repeat([5.0, 10.0], 25))
     assert "trials-of-several-frequencies" not in said(alike)
+    # Computed from times, they differ by rounding.
+    computed_hz = np.nextafter(np.full(50, 20.0), np.tile([0.0, 40.0], 25))
+    rounded = trials(stimulus_presentation=np.repeat([0, 1], 25), stimulus_frequency_hz=computed_hz)
+    assert "trials-of-several-frequencies" not in said(rounded)

@@ -37,6 +37,7 @@ from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.quality.memory import memory_findings
+from animat.responses.quality.within_conditions import compare_passing
 from animat.responses.responses import Responses, Trials
 from animat.robots.cartpole import Cartpole
 from animat.robots.navigation import Navigation
@@ -714,6 +715,28 @@ def test_memory_is_found_where_there_is_one_and_not_where_there_is_none(seed: in
     falls = independent(seed, 2500)
     drifting = replace(falls, rate_hz=falls.rate_hz * np.linspace(1.4, 0.6, 2500))
     assert not list(memory_findings(drifting))
+
+
+@pytest.mark.parametrize("of_each", [3, 40])
+def test_the_error_of_memory_is_that_of_tables_with_fixed_margins(of_each: int) -> None:
+    rng = np.random.default_rng(of_each)
+    n, n_conditions = 240, 240 // of_each
+    chained = np.cumsum(rng.normal(size=n)) * 0.2 + rng.normal(size=n)
+    condition, never = np.arange(n) % n_conditions, np.zeros(n, np.bool_)
+    conditions = tuple(Condition(str(c), float(c)) for c in range(n_conditions))
+    responses = Responses(condition, 10 + chained, np.zeros(n), never, conditions, (2.0, 10.0), 64, 1.0, 0.0)
+    passes = responses.rate_hz >= np.median(responses.rate_hz)
+    after = np.append(False, passes[:-1])
+    more, variance = 0.0, 0.0
+    for c in range(n_conditions):
+        of = condition == c
+        n1, m1 = int(after[of].sum()), int(passes[of].sum())
+        # The hypergeometric distribution of how many pass after one that did.
+        more += np.count_nonzero(passes[of] & after[of]) - n1 * m1 / of_each
+        variance += n1 * (of_each - n1) * m1 * (of_each - m1) / (of_each**2 * (of_each - 1))
+    found = compare_passing(responses, ~never, lambda rows, _: after[rows])
+    assert found is not None
+    assert found.difference / found.error == pytest.approx(more / np.sqrt(variance))
 
 
 def test_conditions_in_blocks_are_not_taken_for_memory() -> None:

@@ -12,8 +12,12 @@ from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
+from animat.responses.quality import drift
+from animat.responses.quality.drift import drift_findings
+from animat.responses.responses import Responses
 from animat.stimulation.protocol import Order, Presentation
 from synthetic_recordings import SyntheticCulture
 from test_inspection import answering
@@ -152,6 +156,30 @@ def test_conditions_that_are_mixed_are_not_to_be_mixed(order: Order) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_conditions_that_differ_one_after_the_other_are_no_drift(seed: int) -> None:
     assert "drift" not in findings(drifting(0.0, True, seed), burst_threshold=1.0)
+
+
+@pytest.mark.parametrize("of_each", [3, 20])
+def test_the_error_of_a_drift_is_that_of_least_squares_with_a_mean_per_condition(
+    of_each: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(of_each)
+    condition, n = rng.permutation(np.repeat(np.arange(30), of_each)), 30 * of_each
+    rate_hz = rng.normal(10, 2, n) + np.linspace(0, 2, n)
+    of = [np.flatnonzero(condition == c) for c in range(30)]
+    conditions = tuple(Condition(str(c), float(c)) for c in range(30))
+    never, no_ratio = np.zeros(n, np.bool_), np.zeros(n)
+    responses = Responses(condition, rate_hz, no_ratio, never, conditions, (2.0, 10.0), 64, 1.0, 0.0)
+    x, t, means = np.empty(n), np.empty(n), np.zeros((n, 30))
+    for c, rows in enumerate(of):
+        x[rows], t[rows], means[rows, c] = rate_hz[rows] / rate_hz[rows].mean(), rows / np.ptp(rows), 1.0
+    design = np.column_stack([t, means])
+    (slope, *_), (squares,), rank, _ = np.linalg.lstsq(design, x, rcond=None)
+    error = np.sqrt(squares / (n - rank) * np.linalg.inv(design.T @ design)[0, 0])
+    monkeypatch.setattr(drift, "CERTAIN", slope / error * 0.9999)
+    (found,) = drift_findings(responses)
+    assert found.value == pytest.approx(slope)
+    monkeypatch.setattr(drift, "CERTAIN", slope / error * 1.0001)
+    assert not list(drift_findings(responses))
 
 
 def test_channels_that_fire_as_no_neurons_do() -> None:

@@ -363,6 +363,20 @@ def test_csv_with_a_header_or_a_bare_column_of_stimuli(tmp_path: Path) -> None:
     assert recording.stimuli.presentation.tolist() == [0, 0, 1]
 
 
+def test_names_with_underscores_are_no_numbers(tmp_path: Path) -> None:
+    spikes, pulses = "time_s,unit\n0.1,1_11\n0.2,11_1\n0.3,2\n", "time_s,pattern\n0.1,1_12\n0.2,11_2\n"
+    recording = read_recording(csv(tmp_path, spikes, pulses))
+    assert recording.channels.label[recording.spike_channels].tolist() == ["1_11", "11_1", "2"]
+    assert recording.stimuli.pattern.tolist() == [1, 0]
+    for stimuli, words in {
+        "time_s\n1_0\n": "line 2: stimulus_time_s: expected a number, got '1_0'",
+        "time_s,electrodes\n1,9 1_2\n": "line 2: stimulus_electrodes: expected whole numbers .*, got '9 1_2'",
+        "time_s,electrodes\n1,-2\n": "stimulus_electrodes: expected electrode numbers, or -1 for none .*, got -2",
+    }.items():
+        with pytest.raises(InvalidFile, match=words):
+            read_recording(csv(tmp_path, spikes, stimuli))
+
+
 def test_csv_may_be_gzipped_and_have_a_byte_order_mark_and_windows_lines(tmp_path: Path) -> None:
     path = tmp_path / "a_spikes.csv.gz"
     path.write_bytes(gzip.compress("\ufefftime_s\tunit\r\n0.5\t3\r\n".encode()))
@@ -616,6 +630,13 @@ def test_messages_say_what_is_missing(name: str, text: str, words: str, tmp_path
     (tmp_path / name).write_text(text)
     with pytest.raises(InvalidFile, match=words):
         read_source(tmp_path / name)
+
+
+def test_pulses_per_trial_that_are_not_stated_are_those_of_the_usual_trial(tmp_path: Path) -> None:
+    times = {"stimulus_time_s": np.arange(11) * 0.1, "presentation_order": np.array("mixed")}
+    trials = {"stimulus_presentation": np.arange(11) // 5}
+    assert read_recording(npz(tmp_path, **SPIKES, **times, **trials)).presentation == Presentation("mixed", 5)
+    assert read_recording(npz(tmp_path, **SPIKES, **times)).presentation == Presentation("mixed", 1)
 
 
 def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path) -> None:

@@ -127,6 +127,11 @@ def test_a_window_that_is_none_is_refused(window_ms: tuple[float, float]) -> Non
         extract_responses(recording([], [1]), window_ms=window_ms)
 
 
+def test_a_window_may_be_a_list_or_an_array() -> None:
+    for window_ms in ([2, 10], np.array([2.0, 10.0])):
+        assert extract_responses(recording([], [1]), window_ms=window_ms).window_ms == (2.0, 10.0)  # type: ignore[arg-type]
+
+
 def test_a_recording_without_channels_is_refused() -> None:
     with pytest.raises(UnusableData, match="channels: expected at least one"):
         extract_responses(recording([], [1], n_channels=0))

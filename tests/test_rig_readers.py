@@ -143,6 +143,16 @@ def test_maxwell_events_of_several_types_are_not_guessed(tmp_path: Path) -> None
     assert (stimuli.frequency_hz.tolist(), stimuli.electrodes.tolist()) == ([20.0], [[909]])
 
 
+def test_numbers_in_the_text_of_events_are_read_whole(tmp_path: Path) -> None:
+    words = ["electrode 909.0 frequency 20.0", "electrode=-1 freq=2e1", "electrodes: 909,23923+7, pattern 3."]
+    events = event_table([0.1, 0.2, 0.3], words)
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5], [9]), events=events, recorded=[9])
+    stimuli = read_recording(path).stimuli
+    np.testing.assert_array_equal(stimuli.frequency_hz, [20, 20, np.nan])
+    assert stimuli.electrodes.tolist() == [[909, -1, -1], [-1, -1, -1], [909, 23923, 7]]
+    assert stimuli.pattern.tolist() == [-1, -1, 3]
+
+
 def test_maxwell_raw_without_the_plugin_spikes_still_read(tmp_path: Path) -> None:
     path = write_maxwell(
         tmp_path / "a.h5",

@@ -91,7 +91,9 @@ class Dealer:
         self, encoder: Encoder, patterns: Int64[np.ndarray, "patterns size"], rng: np.random.Generator
     ) -> None:
         self._encoder, self._rng = encoder, rng
-        targets = [Target(tuple(int(e) for e in row if e != UNKNOWN), number) for number, row in enumerate(patterns)]
+        # In the order of a condition's electrodes, so that the same pattern is the same target.
+        rows = (tuple(sorted(e for e in row if e != UNKNOWN)) for row in patterns.tolist())
+        targets = [Target(row, number) for number, row in enumerate(rows)]
         number_of = {frozenset(target.electrodes): target.pattern for target in targets}
         self._any = _Deck(targets, rng)
         self._decks = [
@@ -127,9 +129,14 @@ class _Deck:
         hand: list[Target] = []
         avoided = list(but)
         while len(hand) < n:
-            if not self._left:
-                self._left = [self._targets[i] for i in self._rng.permutation(len(self._targets))]
-            place = next((i for i, each in enumerate(self._left) if each not in avoided), 0)
-            hand.append(self._left.pop(place))
+            is_used_up = _fresh(self._left, avoided) is None and _fresh(self._targets, avoided) is not None
+            if is_used_up or not self._left:
+                self._left += [self._targets[i] for i in self._rng.permutation(len(self._targets))]
+            hand.append(self._left.pop(_fresh(self._left, avoided) or 0))
             avoided.append(hand[-1])
         return hand
+
+
+def _fresh(targets: Sequence[Target], avoided: Sequence[Target]) -> int | None:
+    """The first of the targets that is not to be avoided; None if there is none."""
+    return next((i for i, each in enumerate(targets) if each not in avoided), None)

@@ -75,7 +75,10 @@ class PlainColumns:
         stop_s = float(event_s.max(initial=start_s))
         presentation = None
         if self.presentation_order is not None:
-            pulses = 1 if self.presentation_pulses is None else self.presentation_pulses
+            pulses = self.presentation_pulses
+            if pulses is None:
+                per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
+                pulses = int(np.median(per_trial)) if len(per_trial) else 1
             presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
         elif self.presentation_pulses is not None:
             raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
@@ -86,7 +89,7 @@ class PlainColumns:
             stimuli=stimuli,
             sampling_rate_hz=float(self.sampling_rate_hz),
             start_s=start_s,
-            duration_s=_duration_s(start_s, stop_s) if self.duration_s is None else float(self.duration_s),
+            duration_s=duration_between(start_s, stop_s) if self.duration_s is None else float(self.duration_s),
             start_min=float(self.start_min),
             presentation=presentation,
             provenance={**provenance, **names},
@@ -164,8 +167,8 @@ class PlainColumns:
             expected = f"shape ({n}, electrodes), padded with {UNKNOWN}"
             raise UnusableData(f"stimulus_electrodes: expected {expected}, got {electrodes.shape}")
         whole = _whole("stimulus_electrodes", electrodes)
-        if whole.min(initial=UNKNOWN) < NOTHING:
-            expected = f"electrode numbers, with {UNKNOWN} for unknown and {NOTHING} for nothing delivered"
+        if whole.min(initial=UNKNOWN) < UNKNOWN:
+            expected = f"electrode numbers, or {UNKNOWN} for none (stimulus_pattern {NOTHING}: nothing was delivered)"
             raise UnusableData(f"stimulus_electrodes: expected {expected}, got {whole.min()}")
         return whole
 
@@ -208,15 +211,15 @@ def with_start(recording: Recording, start_s: float) -> Recording:
     Raises:
         UnusableData: if events come before the new start.
     """
-    duration_s = _duration_s(start_s, max(recording.stop_s, start_s))
-    findings = tuple(finding for finding in recording.findings if finding.name != "start-unknown")
+    duration_s = duration_between(start_s, max(recording.stop_s, start_s))
+    findings = tuple(finding for finding in recording.findings if finding.name not in ("start-unknown", "start-given"))
     if start_s != recording.start_s:
         message = f"the recording starts at {start_s:.12g} s, as given, instead of {recording.start_s:.12g} s"
         findings += (Finding("start-given", "note", message, float(start_s)),)
     return replace(recording, start_s=float(start_s), duration_s=duration_s, findings=findings)
 
 
-def _duration_s(start_s: float, stop_s: float) -> float:
+def duration_between(start_s: float, stop_s: float) -> float:
     """The duration such that start + duration does not round to before the end."""
     duration_s = stop_s - start_s
     while start_s + duration_s < stop_s:

@@ -73,7 +73,8 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
 
     frequency_hz, trial = recording.stimuli.frequency_hz, recording.stimuli.presentation
     # Unknown frequencies (NaN) differ from each other too, and do not count.
-    differs = (np.diff(frequency_hz) != 0) & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
+    same = np.isclose(frequency_hz[1:], frequency_hz[:-1], rtol=1e-6, atol=0.0)
+    differs = ~same & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
     if several := len(np.unique(trial[1:][differs & (np.diff(trial) == 0)])):
         message = (
             f"{several:,} of {np.count_nonzero(last):,} trials have pulses of several frequencies, and the response "

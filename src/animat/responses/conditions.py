@@ -18,6 +18,9 @@ from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
 """The index of a stimulus without a condition."""
+SAME = 1e-6
+"""Frequencies that differ by less, relative to their size, are the same: stored in single precision, or computed from
+intervals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +65,17 @@ class ByFrequency(Conditions):
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Sort pulses by frequency; unknown frequencies (NaN), and those not listed, have no condition."""
-        values_hz = self.values_hz or np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]).tolist()
+        values_hz = list(self.values_hz)
+        if not values_hz:
+            for known_hz in np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]).tolist():
+                if values_hz and math.isclose(values_hz[-1], known_hz, rel_tol=SAME):
+                    # In every recording of a series the same number.
+                    values_hz[-1] = float(f"{values_hz[-1]:.9g}")
+                else:
+                    values_hz.append(known_hz)
         index = np.full(len(stimuli), NO_CONDITION)
         for i, value_hz in enumerate(values_hz):
-            # 1e-6: a frequency stored in single precision is still the same frequency.
-            index[np.isclose(stimuli.frequency_hz, value_hz, rtol=1e-6, atol=0.0)] = i
+            index[np.isclose(stimuli.frequency_hz, value_hz, rtol=SAME, atol=0.0)] = i
         return Assignment(index, tuple(map(_frequency, values_hz)))
 
 

@@ -56,7 +56,7 @@ def extract_responses(
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
         only where it finds two groups).
     """
-    check_window(window_ms)
+    window_ms = check_window(window_ms)
     stimuli, n_channels = source.stimuli, len(source.channels)
     if not n_channels:
         what = "recording" if isinstance(source, Recording) else "table"

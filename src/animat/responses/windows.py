@@ -52,17 +52,18 @@ def read_windows(
     return rate_hz, active / n_channels
 
 
-def check_window(window_ms: tuple[float, float]) -> None:
-    """Raise InvalidArgument for a window that is not a stretch of time after the stimulus: 0 <= start < end."""
+def check_window(window_ms: tuple[float, float]) -> tuple[float, float]:
+    """The window, as a tuple; raises InvalidArgument unless it is a stretch of time after the stimulus."""
     words = "two numbers of milliseconds, start and end"
     several = expect_several("window_ms", window_ms, Real, words)
     if len(several) != 2:
         raise InvalidArgument(f"window_ms: expected {words}, got {shown(window_ms)}")
-    start_ms, end_ms = several
+    start_ms, end_ms = map(float, several)
     if not 0 <= start_ms < end_ms < math.inf:
         raise InvalidArgument(
             f"window_ms: expected 0 <= start < end in milliseconds after the stimulus, got {start_ms:g} to {end_ms:g}"
         )
+    return start_ms, end_ms
 
 
 def count_spikes(

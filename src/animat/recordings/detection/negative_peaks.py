@@ -9,17 +9,26 @@ SAMPLES = 2500
 """Approximate number of samples used per channel."""
 NORMAL = 0.6745
 """Ratio of the median of |x| to the standard deviation of x for a normal distribution."""
+LEAST_SHARE = 0.1
+"""Share of a channel's samples from which its noise can be estimated."""
 
 
 def median_noise_uv(
     voltage_uv: Float32[np.ndarray, "channels samples"], is_blank: Bool[np.ndarray, "channels samples"] | None = None
 ) -> Float32[np.ndarray, " channels"]:
-    """Standard deviation of each channel's noise, in filtered traces: median(|v - median(v)|) / 0.6745."""
+    """Standard deviation of each channel's noise, in filtered traces: median(|v - median(v)|) / 0.6745.
+
+    NaN for a channel of which nearly everything is blanked.
+    """
     if is_blank is not None and is_blank.any():
-        # A sample counts if no channel is blanked, if there are enough; a few long blanks do not shift a median.
-        kept = ~is_blank.any(axis=0)
-        if np.count_nonzero(kept) >= 0.5 * voltage_uv.shape[1]:
-            voltage_uv = voltage_uv[:, kept]
+        # A sample counts if no channel is blanked, if there are enough of these.
+        kept, samples = ~is_blank.any(axis=0), voltage_uv.shape[1]
+        if np.count_nonzero(kept) < 0.5 * samples:
+            rows = [row[~blank] for row, blank in zip(voltage_uv, is_blank, strict=True)]
+            least = LEAST_SHARE * samples
+            each = [median_noise_uv(row[None])[0] if len(row) >= least else np.nan for row in rows]
+            return np.array(each, dtype=np.float32)
+        voltage_uv = voltage_uv[:, kept]
     # Neighbouring samples of a filtered trace are correlated: a subset of them is as informative.
     voltage_uv = voltage_uv[:, :: max(voltage_uv.shape[1] // SAMPLES, 1)]
     return np.asarray(_median(np.abs(voltage_uv - _median(voltage_uv)[:, None])) / NORMAL, dtype=np.float32)

@@ -146,8 +146,10 @@ def _noise_and_level_uv(
         return medians_uv
 
     with ThreadPoolExecutor(workers) as pool:
-        pieces = list(pool.map(of_piece, starts.tolist()))
-    return np.asarray(np.median(pieces, axis=0), dtype=np.float32)
+        pieces = np.array(list(pool.map(of_piece, starts.tolist())))
+    # A channel that is blanked in all pieces is dead.
+    pieces[:, np.isnan(pieces).all(axis=0)] = 0.0
+    return np.asarray(np.nanmedian(pieces, axis=0), dtype=np.float32)
 
 
 class _Found(NamedTuple):

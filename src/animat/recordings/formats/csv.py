@@ -12,7 +12,14 @@ import numpy as np
 from animat.errors import InvalidFile, UnusableData, did_you_mean, some_of
 from animat.recordings.columns import REQUIRED, Column, PlainColumns
 from animat.recordings.findings import Finding
-from animat.recordings.formats.text_table import TextTable, as_numbers, folded, is_number, read_text_table
+from animat.recordings.formats.text_table import (
+    TextTable,
+    as_numbers,
+    folded,
+    is_number,
+    read_text_table,
+    whole_numbers,
+)
 from animat.recordings.recording import Recording
 from animat.tables import padded
 
@@ -160,7 +167,7 @@ def _electrodes(table: TextTable, place: int) -> Column:
     expected = "stimulus_electrodes: expected whole numbers separated by spaces"
     for row, cell in enumerate(cells):
         try:
-            lists.append([int(electrode) for electrode in cell.split()])
+            lists.append(whole_numbers(cell))
         except ValueError as error:
             raise table.wrong(row, f"{expected}, got {cell[:40]!r}") from error
     try:

@@ -36,7 +36,8 @@ def read_foreign_nwb(file: Hdf5File, stimuli: str | None, *, spikes: bool = True
             raise InvalidFile(f"{file.path}: expected spikes in /{UNITS_TABLE}, found {found}")
         columns = _units(file, findings)
     else:
-        columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **_electrodes(file)}
+        channels = _electrodes(file) or {"channel_label": np.empty(0, np.str_)}
+        columns = {"spike_time_s": np.empty(0), "spike_channel": np.empty(0, np.int64), **channels}
     columns |= read_stimuli(file, stimuli, findings)
     provenance = {"source": file.path.name, "format": "NWB of another program", **_origin(file)}
     if spikes:

@@ -13,6 +13,7 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
+from animat.recordings.formats.text_table import whole_numbers
 from animat.tables import padded
 
 FIRST = "stimulus/presentation"
@@ -100,7 +101,7 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     dataset = file.dataset(at)
     if dataset.dtype.kind in "SO" and dataset.shape == (n,):
         try:
-            return padded([[int(word) for word in cell.replace(",", " ").split()] for cell in file.read(at).tolist()])
+            return padded([whole_numbers(cell.replace(",", " ")) for cell in file.read(at).tolist()])
         except (ValueError, OverflowError):
             return None
     if dataset.dtype.kind not in "iu":

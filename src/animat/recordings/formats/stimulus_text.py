@@ -22,7 +22,7 @@ LONGEST = 4096
 NAMES = {name: name for name in ("frequency_hz", "pattern", "presentation", "electrodes", "order", "pulses")}
 NAMES |= {"frequency": "frequency_hz", "freq": "frequency_hz", "electrode": "electrodes"}
 _MOST_ELECTRODES = 1024
-_PAIR = re.compile(r"([A-Za-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:[,+]\d+)*)")
+_PAIR = re.compile(r"([a-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:e[+-]?\d+)?(?:[,+]\d+)*)", re.IGNORECASE)
 
 
 def parse_line(text: str) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def parse_line(text: str) -> dict[str, Any]:
         for key, value in _PAIR.findall(text):
             name = NAMES.get(key.lower())
             if name == "electrodes":
-                parameters[name] = [int(number) for number in re.findall(r"\d{1,9}", value)]
+                parameters[name] = re.split("[,+]", value)
             elif name:
                 parameters[name] = value
     return parameters

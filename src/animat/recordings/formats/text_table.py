@@ -145,8 +145,17 @@ def folded(name: str) -> str:
 
 
 def as_numbers(cells: Sequence[str]) -> Float64[np.ndarray, " cells"]:
-    """Cells as numbers, NaN for an empty one; raises ValueError for any other text."""
+    """Cells as numbers, NaN for an empty one; raises ValueError for any other text, and for 1_2, Python's 12."""
+    if any("_" in cell for cell in cells):
+        raise ValueError("expected numbers, got text")
     return np.array([cell or "nan" for cell in cells], dtype=np.str_).astype(np.float64)
+
+
+def whole_numbers(cell: str) -> list[int]:
+    """The whole numbers in a cell, separated by spaces; raises ValueError as `as_numbers` does."""
+    if "_" in cell:
+        raise ValueError("expected whole numbers, got text")
+    return [int(word) for word in cell.split()]
 
 
 def is_number(cell: str) -> bool:
@@ -155,7 +164,7 @@ def is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    return True
+    return "_" not in cell
 
 
 def _advice(row: list[str], separator: str) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from animat.errors import InvalidFile
+from animat.recordings.columns import duration_between
 from animat.recordings.formats.cl1 import read_cl1
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import (
@@ -55,12 +56,12 @@ def open_traces(
         else:
             base = read_foreign_nwb(file, stimuli, spikes=False)
             traces = _nwb(file, part, base)
-    start_s, rate_hz = min(base.start_s, traces.start_s), traces.sampling_rate_hz
+    # The recording's own start may only be assumed.
+    start_s, rate_hz = float(base.stimuli.time_s.min(initial=traces.start_s)), traces.sampling_rate_hz
     stop_s = max(base.stop_s, traces.start_s + traces.samples / rate_hz)
+    duration_s = duration_between(start_s, stop_s)
     # Replaced together: stimuli lie within the new span, but perhaps not within the new start and the old duration.
-    base = replace(
-        base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s, duration_s=stop_s - start_s
-    )
+    base = replace(base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s, duration_s=duration_s)
     return traces, base
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 
 from animat.errors import InvalidArgument, InvalidFile, first_line
 from animat.extras import install_command
-from animat.recordings.columns import PlainColumns
+from animat.recordings.columns import PlainColumns, recorded_span
 from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Recording
@@ -51,7 +51,6 @@ def open_with_spikeinterface(
         xy_um = np.asarray(recording.get_channel_locations())[:, :2] if recording.has_probe() else None
         samples = int(recording.get_num_samples(segment_index=0))
         rate_hz = float(recording.get_sampling_frequency())
-        duration_s = samples / rate_hz
         segments = int(recording.get_num_segments())
     except Exception as error:
         # The readers of some 40 formats raise all kinds of errors.
@@ -59,14 +58,14 @@ def open_with_spikeinterface(
     if segments != 1:
         raise InvalidFile(f"{path}: expected one segment of traces, got {segments}; export them one by one")
     pulses = Path(stimuli_path) if stimuli_path is not None else stimuli_beside(path.with_name(f"{path.stem}.csv"))
-    columns = {"stimulus_time_s": np.empty(0)} if pulses is None else read_stimuli_csv(pulses)
+    columns: dict[str, Any] = {"stimulus_time_s": np.empty(0)} if pulses is None else read_stimuli_csv(pulses)
+    columns |= recorded_span(samples, rate_hz, columns["stimulus_time_s"])
     base = PlainColumns(
         spike_time_s=np.empty(0),
         spike_channel=np.empty(0, np.int64),
         channel_label=labels,
         channel_xy_um=xy_um,
         sampling_rate_hz=rate_hz,
-        duration_s=max(duration_s, float(np.max(columns["stimulus_time_s"], initial=0.0))),
         **columns,
     ).to_recording({"source": path.name, "format": f"{reader}, by SpikeInterface"})
     get_traces = partial(recording.get_traces, segment_index=0, return_in_uV=recording.has_scaleable_traces())
@@ -74,7 +73,7 @@ def open_with_spikeinterface(
     def read_uv(start: int, stop: int) -> Float32[np.ndarray, "samples channels"]:
         return in_microvolts(get_traces(start_frame=start, end_frame=stop), 1.0)
 
-    # Starts at 0 s, as the times of stimuli count from the start of the traces.
+    # The first sample is at 0 s, as the times of stimuli count from the start of the traces.
     return RawTraces(read_uv, base.channels, samples, rate_hz), base
 
 

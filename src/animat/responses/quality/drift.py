@@ -43,7 +43,9 @@ def drift_findings(responses: Responses) -> Iterator[Finding]:
     if len(t) < FEWEST or spread <= 0:
         return
     slope = float(t @ x) / spread
-    error = math.sqrt(float(np.sum((x - slope * t) ** 2)) / max(len(t) - 2, 1) / spread)
+    # The mean of each condition is estimated too (`times` has one more entry than there are of these).
+    freedom = len(t) - len(times)
+    error = math.sqrt(float(np.sum((x - slope * t) ** 2)) / freedom / spread)
     if abs(slope) <= CERTAIN * error:
         return
     span = "in the order of the rows" if responses.time_s is None else f"recording: {np.ptp(time_s) / 60:.1f} min"

@@ -45,13 +45,14 @@ def compare_passing(
     For each condition in each stretch of the recording, p1 is how often the group's responses pass the stretch's
     median, and p0 how often the others do. The difference is averaged over all of these with the weights
     w = n1 n0 / (n1 + n0), so neither differences between conditions nor drift count. Its standard error is that of
-    independent responses, sqrt(sum w p (1 - p)) / sum w, with p = (n1 p1 + n0 p0) / (n1 + n0).
+    independent responses, sqrt(sum w p (1 - p) n / (n - 1)) / sum w, with n = n1 + n0 and p = (n1 p1 + n0 p0) / n.
 
     Args:
         is_usable: which responses to compare.
         in_group: which of some rows are in the group, given the median of their stretch, Hz.
 
-    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables.
+    Source: Cochran 1954 (doi:10.2307/3001616), differences of proportions in several tables; Mantel and Haenszel 1959
+    (doi:10.1093/jnci/22.4.719), n / (n - 1), as there may be few responses in a table.
     """
     tables = []
     for stretch in np.array_split(np.arange(len(responses)), max(1, len(responses) // STRETCH)):
@@ -68,7 +69,8 @@ def compare_passing(
     if not tables:
         return None
     n1s, n0s, p1, p0 = (np.array(column, np.float64) for column in zip(*tables, strict=True))
-    weights = n1s * n0s / (n1s + n0s)
-    pooled = (n1s * p1 + n0s * p0) / (n1s + n0s)
-    error = math.sqrt(float(np.sum(weights * pooled * (1 - pooled)))) / float(weights.sum())
+    n = n1s + n0s
+    weights, pooled = n1s * n0s / n, (n1s * p1 + n0s * p0) / n
+    variances = pooled * (1 - pooled) * n / (n - 1)
+    error = math.sqrt(float(np.sum(weights * variances))) / float(weights.sum())
     return Passing(float(np.average(p1, weights=weights)), float(np.average(p0, weights=weights)), error)
