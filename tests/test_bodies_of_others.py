@@ -162,6 +162,14 @@ def test_what_was_held_in_an_episode_that_is_not_continued_does_not_count_in_the
     assert not after.exploration.was_held[0, :n].any() and (after.exploration.left[0, :n] <= 0).all()
 
 
+def test_alike_actors_have_the_same_episodes() -> None:
+    environment = WithoutNeurons(named("Levels"), (-2 / 3, 0.0, 2 / 3))
+    for alike in (True, False):
+        ran = roll_out(environment, None, Constant(jnp.array([1, 1, 2])), episodes=5, seed=4, alike=alike)
+        assert np.array_equal(ran.returns[0], ran.returns[1]) == alike
+        assert not np.array_equal(ran.returns[0], ran.returns[2])
+
+
 class Stopping:
     """A progress that ends the training after some chunks, like a kill."""
 
