@@ -151,6 +151,25 @@ def test_dependence_on_earlier_episodes_is_reported() -> None:
     assert "episodes restart at each checkpoint" in caveat and named("Slider").caveats() == ()
 
 
+def test_what_was_held_in_an_episode_that_is_not_continued_does_not_count_in_the_next() -> None:
+    """The first half of the environments never holds an action itself."""
+    on_host = OnHost(training(named("Remembers")).environment(0), SMALL)
+    learners = on_host.begin(jnp.stack([jax.random.fold_in(jax.random.key(1), 0)]))
+    held = learners.exploration
+    held = held._replace(left=jnp.full_like(held.left, 5.0), was_held=jnp.ones_like(held.was_held))
+    after, _ = on_host.train(learners._replace(exploration=held), None, jnp.int32(0), jnp.int32(1))
+    n = SMALL.environments // 2
+    assert not after.exploration.was_held[0, :n].any() and (after.exploration.left[0, :n] <= 0).all()
+
+
+def test_alike_actors_have_the_same_episodes() -> None:
+    environment = WithoutNeurons(named("Levels"), (-2 / 3, 0.0, 2 / 3))
+    for alike in (True, False):
+        ran = roll_out(environment, None, Constant(jnp.array([1, 1, 2])), episodes=5, seed=4, alike=alike)
+        assert np.array_equal(ran.returns[0], ran.returns[1]) == alike
+        assert not np.array_equal(ran.returns[0], ran.returns[2])
+
+
 class Stopping:
     """A progress that ends the training after some chunks, like a kill."""
 

@@ -25,6 +25,7 @@ from animat.neurons.synthetic import synthetic_simulator
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
 from animat.robots import Cartpole, Navigation
 from animat.robots.base import Robot
+from animat.stimulation.protocol import Presentation
 from animat.training.policy import Policy
 from test_optimal_returns import answers
 from test_simulator import responses_of
@@ -404,6 +405,21 @@ def test_mismatches_are_refused() -> None:
         evaluate({"a": policy, "b": policy_of(timeline, Cartpole(pole_mass_kg=0.55))}, timeline)
     with pytest.raises(Mismatch, match="conditions: expected 5 Hz, 10 Hz, 20 Hz"):
         evaluate({"a": policy}, fit_timeline([responses_of([1.0, 2.0], [3.0, 4.0])]))
+    there, elsewhere = (
+        replace(policy, conditions=tuple(replace(c, electrodes=((first, 7),)) for c in policy.conditions))
+        for first in (5, 6)
+    )
+    with pytest.raises(Mismatch, match=r"b: conditions: expected 5 Hz at 5 Hz on the electrodes 5\+7, got .* 6\+7, un"):
+        evaluate({"a": there, "b": elsewhere}, timeline)
+
+
+def test_differences_of_any_policy_are_reported_once() -> None:
+    timeline = timeline_of()
+    alike, other = policy_of(timeline), replace(policy_of(timeline), presentation=Presentation("mixed", 5))
+    run = partial(evaluate, timeline=timeline, episodes=2, controls=())
+    expected = [*run({"a": alike}).findings, *run({"b": other}).findings]
+    assert {finding.name for finding in expected} == {"other-presentation", "other-calibration"}
+    assert list(run({"a": alike, "b": other, "c": other}).findings) == expected
 
 
 @pytest.mark.oracle

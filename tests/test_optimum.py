@@ -117,6 +117,23 @@ def test_noise_of_the_robot_is_averaged_over() -> None:
     assert abs(found.monte_carlo - found.value) < 4 * found.standard_error
 
 
+@dataclass(frozen=True)
+class FromEitherSide(Stairs):
+    """Starts on the step below or above the middle, as likely."""
+
+    name: ClassVar[str] = "from-either-side"
+
+    def reset(self, key: Any) -> StairState:
+        return StairState(jnp.where(jax.random.uniform(key) < 0.5, 1.0, 3.0))
+
+
+def test_random_starts_are_averaged_over() -> None:
+    """With a fair coin the top comes first with probability 1/4 from below the middle, 3/4 from above it."""
+    environment = Animat(FromEitherSide(), Thresholds(1), 2)
+    values = [best_return(environment, coins(5, 5), grid=STEPS, episodes=0, seed=seed).value for seed in range(5)]
+    assert values == pytest.approx([0.5] * 5, abs=0.006)
+
+
 def expectimax(environment: Animat[Any], simulator: Any) -> float:
     """Exhaustive search: every command at every iteration, solved backwards by the best action."""
     robot = environment.robot

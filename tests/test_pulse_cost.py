@@ -178,6 +178,9 @@ def test_cases_with_and_without_a_cost_side_by_side_are_as_alone() -> None:
     values = [each.value for each in best_returns(cases, grid=STEPS, episodes=0)]
     np.testing.assert_allclose(values, [20 * 0.8, 20 * 0.3, -20 * 0.25, 20 * max(-0.8, 0.6 - 1.0)], rtol=1e-5)
     # The same to the last bit where nothing costs anything.
+    inside_others = [NeuralObservation(TrialCosts(plain, (0.0, 0.5))), ShuffledDelivery(TrialCosts(plain, (0.0, 0.5)))]
+    nested = best_returns([(each, coins(1, 9)) for each in inside_others], grid=STEPS, episodes=0)
+    assert [each.value for each in nested] == values[1:3]
     free = best_return(TrialCosts(plain, (0.0, 0.0)), coins(1, 9), grid=STEPS, episodes=500)
     assert free == best_return(plain, coins(1, 9), grid=STEPS, episodes=500)
 

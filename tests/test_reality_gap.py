@@ -39,7 +39,7 @@ from animat.neurons.kinds import Kind
 from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_percentiles, silenced
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
-from animat.reality_gap import Calibration, RealityGap, check_policies, run_policies
+from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
@@ -515,6 +515,18 @@ def test_intervals_of_the_gap_cover_the_truth_as_often_as_they_say(
         covered += row.gap.low <= 0 <= row.gap.high
     # 114 of 120, standard deviation 2.4.
     assert 106 <= covered <= 119
+
+
+@pytest.mark.parametrize("episodes", [2, 5])
+def test_few_episodes_give_intervals_as_wide_as_they_have_to_be(episodes: int) -> None:
+    """Without an error of the prediction."""
+    rng, covered = np.random.default_rng(6), 0
+    row = Row("p", "", np.zeros(9), np.zeros(9), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    for _ in range(200):
+        gap = replace(row, measured=rng.normal(size=episodes)).gap
+        covered += gap.low <= 0 <= gap.high
+    # 190 of 200, standard deviation 3.1; of two episodes a bootstrap knows only three means.
+    assert 175 <= covered <= 199
 
 
 @pytest.mark.long

@@ -88,6 +88,23 @@ def test_exact_p_with_ties_goes_through_all_ways() -> None:
     assert compared.p_exact == pytest.approx(np.mean(ways))
 
 
+@pytest.mark.parametrize("is_alone_first", [True, False])
+def test_exact_p_of_one_sample_against_many_with_ties(is_alone_first: bool) -> None:
+    """Each of the 2,002 samples is equally likely to be the one alone."""
+    many = np.concatenate([[0.0], np.arange(1999) // 2 + 0.0, [1000.0]])
+    pair = [1000.0], many
+    compared = compare(*(pair if is_alone_first else pair[::-1]))
+    ranks = scipy.stats.rankdata(np.append(many, 1000.0))
+    far = np.abs(ranks - ranks.mean()) >= ranks[-1] - ranks.mean()
+    assert compared.ties and compared.p_exact == pytest.approx(far.mean())
+
+
+def test_groups_of_thousands_are_compared_by_the_normal_approximation() -> None:
+    rng = np.random.default_rng(2)
+    compared = compare(rng.integers(0, 50, 1000), rng.integers(5, 55, 1000))
+    assert compared.ties and 0 < compared.p_exact == compared.p_normal < 1e-3
+
+
 def test_equal_samples_show_no_difference() -> None:
     compared = compare([3.0] * 4, [3.0] * 5)
     assert (compared.p_normal, compared.p_exact, compared.effect.value) == (1.0, 1.0, 0.0)

@@ -587,6 +587,19 @@ def test_readouts_are_scored_each(recorded: Path, tmp_path: Path, capsys: pytest
     assert "left, right: " in printed
 
 
+def test_figures_are_in_the_folder_whatever_readouts_are_called(recorded: Path, tmp_path: Path) -> None:
+    file, figures = recorded / "recording_0000_min.nwb", tmp_path / "figures"
+    electrodes = read_recording(file).channels.electrode.tolist()
+    groups = json.dumps({"../front/left": electrodes[:32], "right": electrodes[32:]})
+    assert main(["validate", str(file), "--readouts", groups, "--out", str(figures)]) == 0
+    stem = "recording_0000_min-validation"
+    assert {each.name for each in tmp_path.rglob("*")} == {
+        "figures",
+        f"{stem}-..%2Ffront%2Fleft.png",
+        f"{stem}-right.png",
+    }
+
+
 def test_a_recording_without_stimuli(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(
         tmp_path / "quiet.npz",

@@ -73,7 +73,7 @@ class Validate(ResponseOptions):
                 for validation, readout in zip(validations, responses.readouts.names, strict=True):
                     name, stem = file.name, f"{figure_stem(file.name)}-validation"
                     if has_several:
-                        name, stem = f"{name}, {readout}", f"{stem}-{readout}"
+                        name, stem = f"{name}, {readout}", f"{stem}-{readout.replace('/', '%2F')}"
                     print(validation_text(name, validation), end="\n\n")
                     validated.append({"name": name, **validation.to_dict()})
                     if self.out is not None:

@@ -40,8 +40,13 @@ def roll_out_on_host(
     actors: Any,
     keys: Key[Array, " actors"],
     seed: int,
+    *,
+    alike: bool,
 ) -> Counts:
-    """Run episodes of several actors, at most `AT_ONCE` side by side; `seed` is that of the bodies' episodes."""
+    """Run episodes of several actors, at most `AT_ONCE` side by side.
+
+    `seed` is that of the bodies' episodes; `alike`: whether all actors have the same ones.
+    """
     counts = _zeros(environment, simulator, (len(keys), episodes))
     side_by_side = min(AT_ONCE, episodes)
     actors_at_once = max(1, AT_ONCE // side_by_side)
@@ -51,7 +56,7 @@ def roll_out_on_host(
         acting = jax.tree.map(lambda part, some=some: part[some], actors)
         for first in range(0, episodes, side_by_side):
             # The last wave may run more episodes than requested: the program is compiled for one number.
-            seeds = [(seed, number, first + i) for number in numbers for i in range(side_by_side)]
+            seeds = [(seed, 0 if alike else number, first + i) for number in numbers for i in range(side_by_side)]
             columns = slice(first, min(first + side_by_side, episodes))
             folded = jax.vmap(jax.random.fold_in, (0, None))(keys[some], first)
             wave = _wave(environment, simulator, acting, folded, seeds, columns.stop - first)

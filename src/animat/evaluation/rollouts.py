@@ -191,7 +191,7 @@ def roll_out(
     keys = jax.random.split(jax.random.key(seed), 1 if alike else n_actors)
     keys = jnp.repeat(keys, n_actors, axis=0) if alike else keys
     if isinstance(environment.robot, HostRobot):
-        return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed))
+        return Episodes(*roll_out_on_host(environment, episodes, simulator, actors, keys, seed, alike=alike))
     *counted, terminated, outcome = jax.device_get(_roll_out(environment, episodes, simulator, actors, keys))
     kinds = (np.float64, np.int64, np.int64, np.float64)
     returns, lengths, presented, commanded = (x.astype(kind) for x, kind in zip(counted, kinds, strict=True))

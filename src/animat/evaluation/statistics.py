@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from animat.errors import InvalidArgument
 
 CONFIDENCE = 0.95
+_MOST_PAIRS = 10_000
+"""Pairs of samples up to which p is computed exactly: two groups of 100 take a second, two of 1,000 would take days."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Comparison:
         u_first: number of pairs in which the first group's sample is larger, ties half.
         n_first, n_second: number of samples.
         p_normal: by the normal approximation with corrections for continuity and ties, as in the paper.
-        p_exact: over all ways to divide the samples, including ties.
+        p_exact: over all ways to divide the samples, including ties; with more than 10,000 pairs `p_normal`.
         effect: rank-biserial correlation, share of pairs in which the second is larger less the share in which the
             first is, from -1 to 1, with its interval.
         ties: whether any two samples are equal.
@@ -92,8 +94,11 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     a, b = _samples("first", first), _samples("second", second)
     u_first, p_normal = mann_whitney(a, b)
     ties = len(np.unique(np.concatenate([a, b]))) < len(a) + len(b)
-    p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
     total = len(a) * len(b)
+    if total > _MOST_PAIRS:
+        p_exact = p_normal
+    else:
+        p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
     high, low = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
     effect = Interval(1 - 2 * u_first / total, low, high, CONFIDENCE)
     return Comparison(min(u_first, total - u_first), u_first, len(a), len(b), p_normal, p_exact, effect, ties)
@@ -220,15 +225,15 @@ def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"])
     """
     from scipy.stats import rankdata
 
-    # Ways are counted by the sum of the first group's ranks, doubled, as a tie's may be a half.
+    # Ways are counted by the sum of the smaller group's ranks, doubled, as a tie's may be a half.
+    a, b = sorted((a, b), key=len)
     ranks = np.rint(2 * rankdata(np.concatenate([a, b]))).astype(np.int64)
     n = len(a)
-    ways = np.zeros((n + 1, int(ranks.sum()) + 1))
+    ways = np.zeros((n + 1, int(np.sort(ranks)[-n:].sum()) + 1))
     ways[0, 0] = 1.0
     for seen, rank in enumerate(ranks, start=1):
         for size in range(min(n, seen), 0, -1):
             ways[size, rank:] += ways[size - 1, :-rank]
-        ways /= 2.0  # So that the counts of large groups do not overflow; only their shares are used.
     distance = np.abs(np.arange(ways.shape[1]) - n * (len(ranks) + 1))
     return float(ways[n, distance >= distance[ranks[:n].sum()]].sum() / ways[n].sum())
 

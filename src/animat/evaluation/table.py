@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Self
 
 import numpy as np
@@ -235,7 +236,7 @@ def evaluate(
     if interventions and first.mapping is None:
         raise InvalidArgument("interventions: expected policies that act through neurons, got policies without neurons")
     body, progress = robot or first.robot, progress or Silent()
-    world = _World.of(first, body, timeline, at_min)
+    world = _World.of(tuple(policies.values()), body, timeline, at_min)
     within = world.environment, world.simulator
     networks = networks_of(list(policies.values()), greedy=greedy)
     # Those trained as a control run as one here too: their choices have no effect.
@@ -306,14 +307,21 @@ class _World:
     findings: tuple[Finding, ...] = ()
 
     @classmethod
-    def of(cls, first: Policy, body: Robot[Any], timeline: SimulatorTimeline | None, at_min: float | None) -> Self:
-        """For policies like the first one; arguments and errors as in `evaluate`."""
+    def of(
+        cls, policies: Sequence[Policy], body: Robot[Any], timeline: SimulatorTimeline | None, at_min: float | None
+    ) -> Self:
+        """Arguments and errors as in `evaluate`."""
+        first = policies[0]
         if first.mapping is None:
             return cls(first, WithoutNeurons(body, first.commands))
         if timeline is None:
             raise InvalidArgument("timeline: expected the culture's simulators, as the policies act through neurons")
         minute = float(timeline.start_min[timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)])
-        findings = *transfer.timeline_differences(first, timeline), *transfer.loop_differences(first, timeline, minute)
+        differences = (
+            (*transfer.timeline_differences(each, timeline), *transfer.loop_differences(each, timeline, minute))
+            for each in policies
+        )
+        findings = tuple(dict.fromkeys(chain.from_iterable(differences)))
         fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
         simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
         animat = Animat(body, first.mapping, len(timeline.conditions))

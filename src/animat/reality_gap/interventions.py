@@ -76,7 +76,7 @@ def intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str
 
 
 def _lost(usual: Float64[np.ndarray, " episodes"], changed: Float64[np.ndarray, " others"]) -> Interval:
-    """Difference of means, with its bootstrap percentile interval over episodes; infinite with fewer than two."""
+    """Difference of means, with its interval over episodes (`resampled_means`); infinite with fewer than two."""
     value = float(usual.mean() - changed.mean())
     if min(len(usual), len(changed)) < 2:
         return Interval(value, -np.inf, np.inf, CONFIDENCE)

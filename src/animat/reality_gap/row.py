@@ -119,7 +119,19 @@ def bootstrap_interval(value: float, drawn: Float64[np.ndarray, " draws"]) -> In
 def resampled_means(
     returns: Float64[np.ndarray, " episodes"], rng: np.random.Generator
 ) -> Float64[np.ndarray, " resamples"]:
-    """Means of bootstrap samples of returns."""
-    n = len(returns)
+    """Means of bootstrap samples of returns, spread as far as Student's t is beyond the normal distribution.
+
+    From a few episodes, the usual percentile interval contains the true mean too rarely: from two half of the time.
+
+    Args:
+        returns: at least two.
+
+    Source: the expanded percentile interval of Hesterberg 2015, doi:10.1080/00031305.2015.1089789.
+    """
+    from scipy.stats import norm, t
+
+    n, level = len(returns), (1 + CONFIDENCE) / 2
     often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
-    return np.asarray(often @ returns / n)
+    spread = np.sqrt(n / (n - 1)) * t.ppf(level, n - 1) / norm.ppf(level)
+    mean = returns.mean()
+    return np.asarray(mean + spread * (often @ returns / n - mean))

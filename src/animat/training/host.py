@@ -158,7 +158,9 @@ class OnHost:
             is_restored = self._bodies.restore(Snapshot(*flat))
         episodes = learners.episodes._replace(robot=self._by_policy(self._bodies.observation))
         if not is_restored:
-            learners = learners._replace(returns=jnp.zeros_like(learners.returns))
+            explored = learners.exploration
+            explored = explored._replace(left=jnp.zeros_like(explored.left), was_held=jnp.zeros_like(explored.was_held))
+            learners = learners._replace(returns=jnp.zeros_like(learners.returns), exploration=explored)
             episodes = episodes._replace(
                 iteration=jnp.zeros_like(episodes.iteration),
                 info=jax.tree.map(jnp.zeros_like, episodes.info),

@@ -24,7 +24,7 @@ from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.records import Flag, Number, json_data, read_record
-from animat.responses.condition import Condition, abbreviated
+from animat.responses.condition import Condition, abbreviated, stimulus_mismatch
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.windows import check_window
 from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, Robot
@@ -352,7 +352,10 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
 
 
 def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advice: str) -> Policy:
-    """The first of several policies, which represents all of them; raises a Mismatch if an attribute differs."""
+    """The first of several policies, which represents all of them.
+
+    `attributes` include their conditions. Raises Mismatch if one differs, or the stimuli of a condition do.
+    """
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))
@@ -360,6 +363,8 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
         for attribute in (*attributes, "neural_observation"):
             if getattr(policy, attribute) != getattr(first, attribute):
                 raise Mismatch(f"{name}: expected the same {attribute} as {first_name}, got a different one; {advice}")
+        if others := stimulus_mismatch(first.conditions, policy.conditions):
+            raise Mismatch(f"{name}: conditions: {others}, unlike {first_name}; {advice}")
     return first
 
 
