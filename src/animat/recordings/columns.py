@@ -78,7 +78,7 @@ class PlainColumns:
             pulses = self.presentation_pulses
             if pulses is None:
                 per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
-                pulses = int(np.median(per_trial)) if len(per_trial) else 1
+                pulses = max(1, int(np.bincount(per_trial, minlength=1).argmax()))
             presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
         elif self.presentation_pulses is not None:
             raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
