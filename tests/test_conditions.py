@@ -64,6 +64,9 @@ def test_frequencies_computed_from_intervals_are_one_condition() -> None:
     assert index == [1] * 99 + [0] * 101
     later = stimuli((time_s + 1000).tolist(), (1 / np.diff(time_s + 1000, append=time_s[-1] + 1000.2)).tolist())
     assert ByFrequency().assign(later).conditions == ByFrequency().assign(stimuli([0, 1], [5.0, 20.0])).conditions
+    # So they are in other conditions, which present them equally often.
+    (every,) = All().assign(later).conditions
+    assert every.frequencies_hz == (5.0, 20.0)
 
 
 def test_the_interval_is_the_one_before() -> None:

@@ -378,6 +378,14 @@ def test_a_replay_answers_with_what_was_measured() -> None:
         replay.deliver([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)], 0.01)
 
 
+def test_a_replay_answers_a_frequency_that_its_recordings_state_rounded() -> None:
+    with FakeCulture() as fake:
+        source = fake.record(Protocol((20.0, 40.0), patterns=2, trials=4))
+    rounded_hz = np.nextafter(source.stimuli.frequency_hz, np.inf)
+    with ReplayCulture([replace(source, stimuli=replace(source.stimuli, frequency_hz=rounded_hz))]) as replay:
+        replay.deliver([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)], 0.01)
+
+
 def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
     """A place that is one of the culture's patterns has a number, and one that is not has none."""
     places = ((100, 101), (103, 105, 107))

@@ -541,11 +541,14 @@ def test_traces_that_begin_before_0_keep_stimuli_to_their_end(tmp_path: Path) ->
     assert read_traces(tmp_path / "b.nwb", Detection()).stimuli.time_s.tolist() == [7.768889504673502]
 
 
-def test_traces_that_begin_late_make_a_recording_that_begins_with_them(tmp_path: Path) -> None:
+def test_traces_far_from_0_make_a_recording_of_their_span(tmp_path: Path) -> None:
     voltage, truth = noisy(2, 1.0, step_uv=1.0)
     write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=3600.0)
     recording = read_traces(tmp_path / "a.nwb", Detection())
     assert (recording.start_s, recording.stop_s) == (3600.0, 3601.0)
     assert abs(len(recording.spike_times_s) - sum(map(len, truth))) <= 3
+    write_nwb_traces(tmp_path / "b.nwb", voltage, start_s=-3600.0)
+    before = read_traces(tmp_path / "b.nwb", Detection())
+    assert (before.start_s, before.stop_s) == (-3600.0, -3599.0)
     # Without an electrodes table all channels are known all the same.
     assert "silent-channels-unknown" not in {finding.name for finding in recording.findings}

@@ -178,6 +178,15 @@ def test_the_patterns_of_a_trial_are_different_while_there_are_enough(pulses: in
     assert max(before.values()) - min(before.values()) <= 4
 
 
+def test_a_pattern_that_was_the_last_for_long_is_not_the_first_for_long() -> None:
+    conditions = tuple(Condition(str(i), 0.0, "", (5.0,), (one,), only_last=True) for i, one in enumerate(SETS))
+    dealer = Dealer(Encoder(conditions, 3), PATTERNS, np.random.default_rng(1))
+    for _ in range(200):
+        dealer.targets(0)
+    before = Counter(target.pattern for _ in range(30) for target in dealer.targets(1)[:-1])
+    assert max(before.values()) - min(before[each] for each in (0, 2, 3)) <= 4
+
+
 @pytest.mark.parametrize(
     ("condition", "words"),
     [

@@ -50,6 +50,9 @@ def test_a_clock_that_does_not_start_at_0_causes_a_warning_and_its_start_can_be_
     write_nwb(with_start, tmp_path / "given.nwb")
     again = read_recording(tmp_path / "given.nwb", start_s=from_s - 1)
     assert [finding.name for finding in again.findings].count("start-given") == 1
+    assert (
+        said(read_recording(tmp_path / "given.nwb", start_s=from_s))["start-given"] == said(with_start)["start-given"]
+    )
     inspection = inspect_recording(with_start)
     # 20,000 spikes on 30 channels in 600 s, independent of each other.
     assert inspection.spontaneous_rate_hz == pytest.approx(20_000 / 30 / 600, rel=1e-3)

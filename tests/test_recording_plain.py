@@ -637,6 +637,9 @@ def test_pulses_per_trial_that_are_not_stated_are_those_of_the_usual_trial(tmp_p
     trials = {"stimulus_presentation": np.arange(11) // 5}
     assert read_recording(npz(tmp_path, **SPIKES, **times, **trials)).presentation == Presentation("mixed", 5)
     assert read_recording(npz(tmp_path, **SPIKES, **times)).presentation == Presentation("mixed", 1)
+    # Not a number between those of the trials.
+    unlike = {"stimulus_presentation": np.repeat(np.arange(4), [1, 2, 4, 4])}
+    assert read_recording(npz(tmp_path, **SPIKES, **times, **unlike)).presentation == Presentation("mixed", 4)
 
 
 def test_text_labels_and_a_negative_duration_are_named_in_errors(tmp_path: Path) -> None:

@@ -56,9 +56,9 @@ class Wrapper(Environment[RobotState]):
         return self.inside.advance(uniforms, state, action, simulator)
 
 
-def unwrapped(environment: Environment[RobotState]) -> Environment[RobotState]:
-    """The environment inside all wrappers: an `Animat` or a `WithoutNeurons`."""
-    while isinstance(environment, Wrapper):
+def unwrapped(environment: Environment[RobotState], to: type[Wrapper[Any]] | tuple[()] = ()) -> Environment[RobotState]:
+    """The first wrapper of that kind, or, without one, the environment inside all: `Animat` or `WithoutNeurons`."""
+    while isinstance(environment, Wrapper) and not isinstance(environment, to):
         environment = environment.inside
     return environment
 

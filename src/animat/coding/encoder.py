@@ -131,7 +131,9 @@ class _Deck:
         while len(hand) < n:
             is_used_up = _fresh(self._left, avoided) is None and _fresh(self._targets, avoided) is not None
             if is_used_up or not self._left:
-                self._left += [self._targets[i] for i in self._rng.permutation(len(self._targets))]
+                # Each of those left only once: they would pile up while one condition is repeated.
+                drawn = [self._targets[i] for i in self._rng.permutation(len(self._targets))]
+                self._left = [*dict.fromkeys(self._left), *drawn]
             hand.append(self._left.pop(_fresh(self._left, avoided) or 0))
             avoided.append(hand[-1])
         return hand

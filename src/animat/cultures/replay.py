@@ -13,6 +13,7 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_least, in_min
 from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN
 
@@ -140,14 +141,14 @@ class ReplayCulture(ComputedCulture):
         row = max(0, sum(recording.start_min <= minute for recording in self._recordings) - 1)
         recording = self._recordings[row]
         stimuli, frequency_hz = recording.stimuli, recording.stimuli.frequency_hz
-        same = (frequency_hz == stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
+        same = is_same(frequency_hz, stimulus.frequency_hz) | np.isnan(stimulus.frequency_hz)
         number_of, set_of_pulse = self._sets[row]
         electrodes = number_of.get(frozenset(stimulus.electrodes), UNKNOWN)
         for narrower in (~stimuli.is_rest, stimuli.is_last_of_presentation == is_last, set_of_pulse == electrodes):
             same = same & narrower if np.any(same & narrower) else same
         pool = np.flatnonzero(same)
         if not len(pool):
-            known = ", ".join(f"{f:g}" for f in np.unique(frequency_hz[~np.isnan(frequency_hz)]))
+            known = ", ".join(f"{f:g}" for f in distinct(frequency_hz))
             raise InvalidArgument(
                 f"frequency_hz: expected one that was recorded ({known} Hz), got {stimulus.frequency_hz:g}: a replay "
                 "cannot answer others"

@@ -18,7 +18,7 @@ from animat.environment import Animat, Environment
 from animat.errors import InvalidArgument
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator, Stored, to_jax
-from animat.wrappers import ShuffledDelivery, Wrapper, unwrapped
+from animat.wrappers import ShuffledDelivery, unwrapped
 
 CONTINUOUS_ACTIONS = 21
 """Number of evenly spaced commands that represent a continuous action."""
@@ -169,9 +169,7 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
 
 def is_shuffled(environment: Environment[Any]) -> bool:
     """Whether the delivered condition is drawn at random, whatever is chosen."""
-    if isinstance(environment, ShuffledDelivery):
-        return True
-    return isinstance(environment, Wrapper) and is_shuffled(environment.inside)
+    return isinstance(unwrapped(environment, ShuffledDelivery), ShuffledDelivery)
 
 
 def _recorded(simulator: MemorySimulator) -> Float[np.ndarray, "responses 2"]:

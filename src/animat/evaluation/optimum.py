@@ -25,7 +25,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
 from animat.robots.grid import Grid, grid_for
-from animat.wrappers import TrialCosts, Wrapper, net_reward
+from animat.wrappers import TrialCosts, net_reward, unwrapped
 
 Case = tuple[Environment[Any], NeuronSimulator | None]
 """An environment, and the simulator in it (None without neurons)."""
@@ -207,9 +207,7 @@ def _step(environment: Environment[Any], episodes: int, key: Any, state: Any, ac
 
 def _costs_of(environment: Environment[Any], n_actions: int) -> Float32[np.ndarray, " actions"]:
     """The cost of each action's trial; with shuffled delivery, their mean."""
-    costing = environment
-    while isinstance(costing, Wrapper) and not isinstance(costing, TrialCosts):
-        costing = costing.inside
+    costing = unwrapped(environment, TrialCosts)
     if not isinstance(costing, TrialCosts):
         return np.zeros(n_actions, np.float32)
     costs = np.array(costing.costs, np.float32)

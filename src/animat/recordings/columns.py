@@ -78,7 +78,7 @@ class PlainColumns:
             pulses = self.presentation_pulses
             if pulses is None:
                 per_trial = np.unique(stimuli.presentation, return_counts=True)[1]
-                pulses = int(np.median(per_trial)) if len(per_trial) else 1
+                pulses = max(1, int(np.bincount(per_trial, minlength=1).argmax()))
             presentation = Presentation(self.presentation_order, pulses)  # type: ignore[arg-type]
         elif self.presentation_pulses is not None:
             raise UnusableData("presentation_order: expected 'blocked' or 'mixed' with presentation_pulses, got none")
@@ -212,8 +212,10 @@ def with_start(recording: Recording, start_s: float) -> Recording:
         UnusableData: if events come before the new start.
     """
     duration_s = duration_between(start_s, max(recording.stop_s, start_s))
-    findings = tuple(finding for finding in recording.findings if finding.name not in ("start-unknown", "start-given"))
-    if start_s != recording.start_s:
+    is_same = start_s == recording.start_s
+    outdated = ("start-unknown",) if is_same else ("start-unknown", "start-given")
+    findings = tuple(finding for finding in recording.findings if finding.name not in outdated)
+    if not is_same:
         message = f"the recording starts at {start_s:.12g} s, as given, instead of {recording.start_s:.12g} s"
         findings += (Finding("start-given", "note", message, float(start_s)),)
     return replace(recording, start_s=float(start_s), duration_s=duration_s, findings=findings)

@@ -12,6 +12,7 @@ from animat.recordings.gaps import silences
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.recordings.time_quality import frequency_findings, time_findings
+from animat.stimulation.frequency import is_same
 from animat.tables import UNKNOWN
 
 MANY_STIMULI = 100
@@ -73,8 +74,7 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
 
     frequency_hz, trial = recording.stimuli.frequency_hz, recording.stimuli.presentation
     # Unknown frequencies (NaN) differ from each other too, and do not count.
-    same = np.isclose(frequency_hz[1:], frequency_hz[:-1], rtol=1e-6, atol=0.0)
-    differs = ~same & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
+    differs = ~is_same(frequency_hz[1:], frequency_hz[:-1]) & ~np.isnan(frequency_hz[1:]) & ~np.isnan(frequency_hz[:-1])
     if several := len(np.unique(trial[1:][differs & (np.diff(trial) == 0)])):
         message = (
             f"{several:,} of {np.count_nonzero(last):,} trials have pulses of several frequencies, and the response "

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from animat.errors import InvalidArgument, shown
 from animat.records import Flag, Number, Whole, record
+from animat.stimulation.frequency import is_same
 from animat.stimulation.stimulus import NOTHING
 
 _LARGEST_VALUE = 2.0**63
@@ -101,7 +102,7 @@ def stimulus_mismatch(conditions: Sequence[Condition], others: Sequence[Conditio
         if not (expected.electrodes and got.electrodes and expected.frequencies_hz and got.frequencies_hz):
             continue
         # A recording may hold a pattern at only some of several frequencies, and a file rounds them.
-        in_common = np.isclose(np.array(expected.frequencies_hz)[:, None], np.array(got.frequencies_hz), rtol=1e-6)
+        in_common = is_same(np.array(expected.frequencies_hz)[:, None], np.array(got.frequencies_hz))
         if (expected.electrodes, expected.only_last) != (got.electrodes, got.only_last) or not in_common.any():
             return f"expected {_describe(expected)}, got {_describe(got)}"
     return None

@@ -12,15 +12,13 @@ from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, expect_kind, within
 from animat.responses.condition import RESTING, Condition, abbreviated, listed
+from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
 
 NO_CONDITION = -1
 """The index of a stimulus without a condition."""
-SAME = 1e-6
-"""Frequencies that differ by less, relative to their size, are the same: stored in single precision, or computed from
-intervals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +63,10 @@ class ByFrequency(Conditions):
 
     def assign(self, stimuli: Stimuli) -> Assignment:
         """Sort pulses by frequency; unknown frequencies (NaN), and those not listed, have no condition."""
-        values_hz = list(self.values_hz)
-        if not values_hz:
-            for known_hz in np.unique(stimuli.frequency_hz[~np.isnan(stimuli.frequency_hz)]).tolist():
-                if values_hz and math.isclose(values_hz[-1], known_hz, rel_tol=SAME):
-                    # In every recording of a series the same number.
-                    values_hz[-1] = float(f"{values_hz[-1]:.9g}")
-                else:
-                    values_hz.append(known_hz)
+        values_hz = self.values_hz or distinct(stimuli.frequency_hz)
         index = np.full(len(stimuli), NO_CONDITION)
         for i, value_hz in enumerate(values_hz):
-            index[np.isclose(stimuli.frequency_hz, value_hz, rtol=SAME, atol=0.0)] = i
+            index[is_same(stimuli.frequency_hz, value_hz)] = i
         return Assignment(index, tuple(map(_frequency, values_hz)))
 
 
@@ -270,7 +261,7 @@ def _with_stimuli(
         rows = last[of == i]
         known_hz, electrodes = condition.frequencies_hz, condition.electrodes
         if not known_hz and len(rows) and not np.any(np.isnan(stimuli.frequency_hz[rows])):
-            known_hz = tuple(np.unique(stimuli.frequency_hz[rows]).tolist())
+            known_hz = tuple(distinct(stimuli.frequency_hz[rows]))
         if electrodes == ():
             sets = {frozenset(row) - {UNKNOWN} for row in stimuli.electrodes[rows].tolist()}
             electrodes = () if frozenset() in sets else tuple(sorted(tuple(sorted(one)) for one in sets))

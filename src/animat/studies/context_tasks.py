@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, final
-
-from pydantic import Field
+from typing import final
 
 from animat.coding.mapping import mapping_named
 from animat.cultures.series import SELECTION_FILE, STATE_FILE, record_series
@@ -22,7 +20,7 @@ from animat.neurons.timeline import fit_timeline
 from animat.progress import EqualPhases, Progress
 from animat.reality_gap import Calibration, run_policies
 from animat.recordings.reading import read_sources
-from animat.records import Positive, Seed, Whole, record, write_json
+from animat.records import Positive, Seed, record, write_json
 from animat.responses.readouts import DEFAULT_READOUTS
 from animat.responses.responses import Responses
 from animat.responses.series import extract_series
@@ -33,7 +31,7 @@ from animat.studies.specification import Episodes, Resolution
 from animat.studies.task import draw_seed
 from animat.studies.training import work_on
 from animat.training.policy import load_policies
-from animat.training.settings import MOST_POLICIES
+from animat.training.settings import Policies
 from animat.training.specification import Training
 
 RECORDINGS, POLICIES, SESSION = "recordings", "policies", "session"
@@ -59,7 +57,7 @@ class ContextStudy:
 
     cultures: tuple[Seed, ...] = (1, 2, 3, 4, 5)
     robots: tuple[str, ...] = ("cartpole", "navigation", "swing-up", "shuttle")
-    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 4
+    policies: Policies = 4
     iterations_share: Positive = 0.5
     episodes: Episodes = 400
     episodes_measured: Episodes = 5

@@ -21,7 +21,7 @@ from animat.robots.base import MOST_AT_ONCE, Robot
 from animat.robots.registry import REGISTRY, robot_named
 from animat.studies.source import LISTED, Source
 from animat.training.lessons import Lesson, expect_lessons
-from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC
+from animat.training.settings import MOST_ITERATIONS, SAC, Policies
 
 MOST_TRAINED = 20_000
 """Policies of all arms on all robots: each is a file, and five are a job."""
@@ -251,7 +251,7 @@ class Study:
     robots: Annotated[tuple[RobotSpec, ...], LISTED] = (RobotSpec("cartpole"), RobotSpec("navigation"))
     arms: Annotated[tuple[Arm, ...], LISTED] = (Arm("1 threshold"),)
     comparisons: Annotated[tuple[Compared, ...], LISTED] = ()
-    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
+    policies: Policies = 10
     seed: Seed = 1
     training_min: Positive = 60.0
     episodes: Episodes = 100

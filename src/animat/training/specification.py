@@ -23,7 +23,7 @@ from animat.robots.base import Robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named
 from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
-from animat.training.settings import MOST_ITERATIONS, MOST_POLICIES, SAC, PulseCost
+from animat.training.settings import MOST_ITERATIONS, SAC, Policies, PulseCost
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
 Percentiles = Literal["moving", "first"]
@@ -109,7 +109,7 @@ class Training:
 
     robot: _Named[Robot[Any]] = _Named(robot_named)
     mapping: _Named[Mapping | None] = _Named(_mapping_named)
-    policies: Annotated[Whole, Field(ge=1, le=MOST_POLICIES)] = 10
+    policies: Policies = 10
     iterations: Annotated[Whole, Field(ge=1, le=MOST_ITERATIONS)] = 800_000
     seed: Seed = 1
     shadowing: Annotated[Shadowing, PlainValidator(_expect_shadowing)] = True

@@ -56,9 +56,10 @@ def open_traces(
         else:
             base = read_foreign_nwb(file, stimuli, spikes=False)
             traces = _nwb(file, part, base)
-    # The recording's own start may only be assumed.
-    start_s, rate_hz = float(base.stimuli.time_s.min(initial=traces.start_s)), traces.sampling_rate_hz
-    stop_s = max(base.stop_s, traces.start_s + traces.samples / rate_hz)
+    rate_hz, pulses_s = traces.sampling_rate_hz, base.stimuli.time_s
+    # The recording's own start and stop may only be assumed.
+    start_s = float(pulses_s.min(initial=traces.start_s))
+    stop_s = float(pulses_s.max(initial=traces.start_s + traces.samples / rate_hz))
     duration_s = duration_between(start_s, stop_s)
     # Replaced together: stimuli lie within the new span, but perhaps not within the new start and the old duration.
     base = replace(base, channels=traces.channels, sampling_rate_hz=rate_hz, start_s=start_s, duration_s=duration_s)
