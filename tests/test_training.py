@@ -22,10 +22,10 @@ from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
-from animat.progress import Silent
+from animat.progress import Progress, Silent
 from animat.robots import Cartpole, Navigation
 from animat.training.folder import describe
-from animat.training.group import Group, programs, split_groups, train_group
+from animat.training.group import Group, programs, split_groups, train_groups
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
@@ -49,6 +49,10 @@ def trained(training: Training, timeline: SimulatorTimeline | None, folder: Path
     """Trained into the folder in this process: for tests of what comes out, not of who does it."""
     with ThreadPoolExecutor(1) as executor:
         return train(training, timeline, folder, executor=executor, **more)
+
+
+def train_group(group: Group, checkpoint: Path | None, progress: Progress, **more: Any) -> list[Policy]:
+    return train_groups([group], checkpoint, progress, add_chunks=[None], **more)[0]
 
 
 def bits(folder: Path) -> dict[str, bytes]:

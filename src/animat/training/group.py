@@ -60,18 +60,6 @@ class Group:
     provenance: dict[str, Any]
 
 
-def train_group(
-    group: Group,
-    checkpoint: Path | None,
-    progress: Progress,
-    *,
-    checkpoint_s: float = CHECKPOINT_S,
-    add_chunk: AddChunk | None = None,
-) -> list[Policy]:
-    """Train a group of policies: `train_groups` for a single one."""
-    return train_groups([group], checkpoint, progress, checkpoint_s=checkpoint_s, add_chunks=[add_chunk])[0]
-
-
 def train_groups(
     groups: Sequence[Group],
     checkpoint: Path | None,
