@@ -111,11 +111,10 @@ def train_groups(
 
 def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
     """The simulator of a group in each chunk, by its number; all simulators where each episode draws one."""
-    training, timeline = group.training, group.timeline
-    if timeline is None:
+    training = group.training
+    if group.timeline is None:
         return lambda _: None
-    if training.percentiles == "first":
-        timeline = timeline.with_first_percentiles()
+    timeline = group.timeline.with_percentiles(training.percentiles)
     if training.shadowing == "drawn":
         return lambda _: timeline.simulators
     return lambda index: timeline.at(float(timeline.start_min[0]) + training.minute(index))
