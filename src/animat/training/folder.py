@@ -15,7 +15,7 @@ import numpy as np
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
-from animat.differences import fingerprint_of, first_difference, folder_mismatch, read_description
+from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.errors import InvalidArgument, Mismatch
 from animat.folder_kinds import expect_no_other
 from animat.goals.robot import without_goal
@@ -84,18 +84,16 @@ def describe(
         versions |= training.robot.versions
     if device is not None:
         versions["device"] = device
-    manifest: dict[str, Any] = {
+    decisive = {
         "training": training.to_dict(),
         "simulators": None if timeline is None else _describe_simulators(timeline),
         "versions": {**versions, "learner": f"revision {LEARNER}"},
     }
-    # Through JSON, in which a tuple and a list are the same.
-    manifest = json.loads(json.dumps(manifest))
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    fingerprint = fingerprint_of(manifest, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    manifest = with_fingerprint(decisive, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # File names do not count: the same recordings in another place are the same.
     informative = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
-    return manifest | informative | {"fingerprint": fingerprint}
+    return manifest | informative
 
 
 def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:
