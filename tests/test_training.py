@@ -147,8 +147,13 @@ def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path: Path)
     ]
     for leftover in leftovers:
         leftover.write_bytes(b"half of it")
+    # Another training may be writing this one just now.
+    of_another = tmp_path / "another" / leftovers[0].name
+    of_another.parent.mkdir()
+    of_another.write_bytes(b"half of it")
     trained(replace(SHORT, policies=1, iterations=500), timeline_of(), tmp_path)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["p0.safetensors", "training.json"]
+    assert of_another.exists()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["another", "p0.safetensors", "training.json"]
 
 
 WATCHED = """

@@ -129,8 +129,10 @@ def train(
                     (folder / MANIFEST).unlink()
                 raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
-            clear_away(leftover)
+        # In other subfolders another training may be writing.
+        for place, name in ((folder, "p*.safetensors"), (folder / BEST, "p*.safetensors"), (folder, MANIFEST)):
+            for leftover in place.glob(f".{name}.*.partial*"):
+                clear_away(leftover)
         policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
         for name, policy in policies.items():
             if len(policy.assessments):
