@@ -35,12 +35,12 @@ from animat.robots.host import Bodies, Snapshot
 from animat.robots.registry import REGISTRY
 from animat.studies.paths import record_paths
 from animat.training.folder import describe, expect_trainable
-from animat.training.group import Group, train_group
+from animat.training.group import Group
 from animat.training.host import OnHost
 from animat.training.policy import Policy
 from animat.training.settings import LEARNER, SAC
 from animat.training.specification import CHUNKS, Training
-from test_training import bits, timeline_of, trained
+from test_training import bits, timeline_of, train_group, trained
 
 SMALL = SAC(environments=4, gradient_steps=1, batch=16, replay=1024, hidden=8)
 TOY = "gymnasium:bodies_of_others:"

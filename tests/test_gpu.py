@@ -37,12 +37,12 @@ from animat.studies.source import Source
 from animat.studies.toml import read_study
 from animat.studies.training import TrainGroup as TrainArm
 from animat.training.folder import describe
-from animat.training.group import Group, SideBySide, train_group, train_groups
+from animat.training.group import Group, SideBySide, train_groups
 from animat.training.lessons import Lesson
 from animat.training.policy import Policy
 from animat.training.replay import remember
 from animat.training.specification import CHUNKS, Training
-from test_training import SHORT, SMALL, Kept, bits, timeline_of
+from test_training import SHORT, SMALL, Kept, bits, timeline_of, train_group
 from worker_tasks import Join
 
 TINY = Path(__file__).parent / "tiny_study.toml"

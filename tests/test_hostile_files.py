@@ -13,8 +13,8 @@ from animat.errors import InvalidFile
 from animat.progress import Silent
 from animat.stimulation.protocol import read_protocol
 from animat.stimulation.selection import Selection
-from animat.training.group import Group, train_group
-from test_training import SHORT, timeline_of
+from animat.training.group import Group
+from test_training import SHORT, timeline_of, train_group
 
 SELECTION: dict[str, Any] = {
     "format": "animat electrode selection 1",

@@ -28,13 +28,13 @@ from animat.robots import ROBOTS, Cartpole, SwingUp, robot_named
 from animat.robots.base import Quantity, Robot
 from animat.training.course import Course, assess, programs_with_ranges, rows_of
 from animat.training.folder import describe, expect_trainable
-from animat.training.group import Group, train_group
+from animat.training.group import Group
 from animat.training.lessons import Lesson, expect_lessons, read_lessons
 from animat.training.networks import Layer
 from animat.training.policy import Policy, load_policies
 from animat.training.specification import CHUNKS, Training
 from animat.training.varied import Ranges, Varied, expect_varied, ranges_of, varying_in
-from test_training import SHORT, SMALL, Kept, bits, timeline_of, trained
+from test_training import SHORT, SMALL, Kept, bits, timeline_of, train_group, trained
 
 LONG_POLES = Lesson(parameters={"pole_length_m": (0.3, 0.6), "force_n": (0.5, 1.5)}, starts={"angle_rad": (-0.1, 0.05)})
 TAUGHT = replace(

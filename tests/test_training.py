@@ -22,10 +22,10 @@ from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.execution.training import train
 from animat.neurons.timeline import SimulatorTimeline, fit_timeline
-from animat.progress import Silent
+from animat.progress import Progress, Silent
 from animat.robots import Cartpole, Navigation
 from animat.training.folder import describe
-from animat.training.group import Group, programs, split_groups, train_group
+from animat.training.group import Group, programs, split_groups, train_groups
 from animat.training.policy import Policy
 from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
@@ -49,6 +49,10 @@ def trained(training: Training, timeline: SimulatorTimeline | None, folder: Path
     """Trained into the folder in this process: for tests of what comes out, not of who does it."""
     with ThreadPoolExecutor(1) as executor:
         return train(training, timeline, folder, executor=executor, **more)
+
+
+def train_group(group: Group, checkpoint: Path | None, progress: Progress, **more: Any) -> list[Policy]:
+    return train_groups([group], checkpoint, progress, add_chunks=[None], **more)[0]
 
 
 def bits(folder: Path) -> dict[str, bytes]:
@@ -143,8 +147,13 @@ def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path: Path)
     ]
     for leftover in leftovers:
         leftover.write_bytes(b"half of it")
+    # Another training may be writing this one just now.
+    of_another = tmp_path / "another" / leftovers[0].name
+    of_another.parent.mkdir()
+    of_another.write_bytes(b"half of it")
     trained(replace(SHORT, policies=1, iterations=500), timeline_of(), tmp_path)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["p0.safetensors", "training.json"]
+    assert of_another.exists()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["another", "p0.safetensors", "training.json"]
 
 
 WATCHED = """

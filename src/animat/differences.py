@@ -55,18 +55,13 @@ def first_difference(
     return next(filter(None, (first_difference(*pair, **keys) for pair in pairs)), "")
 
 
-def fingerprint_of(description: dict[str, Any], *more: bytes) -> str:
-    """SHA-256 over plain data and further bytes."""
-    digest = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
+def with_fingerprint(description: dict[str, Any], *more: bytes) -> dict[str, Any]:
+    """Plain data, by way of JSON, which has no tuples, with a fingerprint: SHA-256 over all of it and further bytes."""
+    data: dict[str, Any] = json.loads(json.dumps(description))
+    digest = hashlib.sha256(json.dumps(data, sort_keys=True).encode())
     for part in more:
         digest.update(part)
-    return digest.hexdigest()
-
-
-def with_fingerprint(description: dict[str, Any]) -> dict[str, Any]:
-    """Plain data with a fingerprint over all of it, converted by way of JSON, which has no tuples."""
-    data: dict[str, Any] = json.loads(json.dumps(description))
-    return data | {"fingerprint": fingerprint_of(data)}
+    return data | {"fingerprint": digest.hexdigest()}
 
 
 def read_description(path: Path, what: str) -> dict[str, Any] | None:

@@ -45,20 +45,20 @@ class WellSampled:
     fit: Callable[[Responses], NeuronSimulator]
 
     @classmethod
-    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, *, are_fixed: bool) -> Self:
+    def of(cls, environment: Animat[Any], timeline: SimulatorTimeline, minute: float, percentiles: str) -> Self:
         """Select the conditions of one recording of a timeline; UnusableData if none has enough responses.
 
-        `are_fixed`: whether the mapping's percentiles are those of the first recording.
+        `percentiles`: those of the mapping, as in `SimulatorTimeline.with_percentiles`.
         """
         responses, left_out = with_enough_samples(timeline.responses[timeline.row_at(minute)])
-        simulator = (timeline.with_first_percentiles() if are_fixed else timeline).at(minute)
+        simulator = timeline.with_percentiles(percentiles).at(minute)
         # The mapping's thresholds are those of all responses, even if some of them are left out.
-        percentiles, kind = simulator.percentiles, timeline.fitted["kind"]
+        of_all, kind = simulator.percentiles, timeline.fitted["kind"]
         fitted = {name: timeline.fitted[name] for name in ("bins", "range_hz") if timeline.fitted.get(name) is not None}
 
         def fit(these: Responses, kind: str) -> NeuronSimulator:
             made = fit_simulator(these, kind=kind, **(fitted if kind == "histogram" else {}))
-            return replace(made, percentiles=percentiles) if are_fixed or left_out else made  # type: ignore[type-var]
+            return replace(made, percentiles=of_all) if percentiles == "first" or left_out else made  # type: ignore[type-var]
 
         if left_out:
             environment, simulator = replace(environment, n_conditions=len(responses.conditions)), fit(responses, kind)

@@ -323,7 +323,7 @@ class _World:
         )
         findings = tuple(dict.fromkeys(chain.from_iterable(differences)))
         fixed_from_min = float(timeline.start_min[0]) if first.percentiles == "first" else None
-        simulator = (timeline if fixed_from_min is None else timeline.with_first_percentiles()).at(minute)
+        simulator = timeline.with_percentiles(first.percentiles).at(minute)
         animat = Animat(body, first.mapping, len(timeline.conditions))
         environment: Environment[Any] = NeuralObservation(animat) if first.neural_observation else animat
         return cls(first, environment, simulator, timeline, minute, fixed_from_min, findings)
@@ -341,7 +341,7 @@ class _World:
         if not isinstance(environment, Animat) or minute is None or timeline is None or not timeline.responses:
             whole = Part(progress, 0, 1, 1, "optimal return")
             return best_return(environment, self.simulator, resolution=resolution, seed=seed, progress=whole)
-        case = WellSampled.of(environment, timeline, minute, are_fixed=self.fixed_from_min is not None)
+        case = WellSampled.of(environment, timeline, minute, self.first.percentiles)
         alone, resampled = (Part(progress, i, 1, 2, note) for i, note in enumerate(("optimal return", "its interval")))
         best = best_return(case.environment, case.simulator, resolution=resolution, seed=seed, progress=alone)
         return case.with_interval(best, resolution=resolution, seed=seed, progress=resampled)

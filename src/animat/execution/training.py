@@ -33,7 +33,7 @@ from animat.training.folder import (
     write_assessments,
     write_description,
 )
-from animat.training.group import BEST, CHECKPOINT_S, Group, train_group
+from animat.training.group import BEST, CHECKPOINT_S, Group, train_groups
 from animat.training.policy import Policy
 from animat.training.specification import CHUNKS, Training
 from animat.writing import clear_away, exclusive_lock
@@ -129,8 +129,10 @@ def train(
                     (folder / MANIFEST).unlink()
                 raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        for leftover in (*folder.rglob(".p*.safetensors.*.partial*"), *folder.glob(f".{MANIFEST}.*.partial*")):
-            clear_away(leftover)
+        # In other subfolders another training may be writing.
+        for place, name in ((folder, "p*.safetensors"), (folder / BEST, "p*.safetensors"), (folder, MANIFEST)):
+            for leftover in place.glob(f".{name}.*.partial*"):
+                clear_away(leftover)
         policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}
         for name, policy in policies.items():
             if len(policy.assessments):
@@ -190,6 +192,7 @@ def _train_in_memory(
     curves = Curves(None, [group.members for group in groups], callbacks, progress)
     for number, group in enumerate(groups):
         part = Part(progress, number * CHUNKS, CHUNKS, len(groups) * CHUNKS)
-        policies = train_group(group, None, part, add_chunk=partial(curves.add, group.members) if callbacks else None)
+        add_chunk = partial(curves.add, group.members) if callbacks else None
+        (policies,) = train_groups([group], None, part, add_chunks=[add_chunk])
         trained |= {f"p{member}": policy for member, policy in zip(group.members, policies, strict=True)}
     return trained

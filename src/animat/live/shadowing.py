@@ -283,9 +283,7 @@ class _Run:
         try:
             series = [*self.used, *extract_series([recording])]
             # Fit all of them again, so that their shapes agree.
-            timeline = fit_timeline(series, kind=self.kind)
-            if self.training.percentiles == "first":
-                timeline = timeline.with_first_percentiles()
+            timeline = fit_timeline(series, kind=self.kind).with_percentiles(self.training.percentiles)
         except (UnusableData, Mismatch) as error:
             self.write("unusable", file=file.name, message=str(error))
             return None

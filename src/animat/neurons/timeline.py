@@ -112,6 +112,10 @@ class SimulatorTimeline:
         held = to_jax(np.broadcast_to(percentiles[:1], percentiles.shape), None)
         return replace(self, simulators=replace(self.simulators, percentiles=held))  # type: ignore[type-var]
 
+    def with_percentiles(self, which: str) -> SimulatorTimeline:
+        """These simulators, each with its own percentiles (`"moving"`) or with the first recording's (`"first"`)."""
+        return self.with_first_percentiles() if which == "first" else self
+
 
 def room_for(series: Sequence[Responses]) -> int:
     """The largest number of non-burst responses to a condition in any recording.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 from concurrent.futures import Executor
@@ -22,7 +21,7 @@ from animat.studies.folder import MANIFEST, claim_folder
 from animat.studies.places import RECEIPTS
 from animat.studies.results import write_records
 from animat.studies.run import run_jobs
-from animat.training.settings import LEARNER
+from animat.training.folder import versions_of
 
 TABLE, WHOSE_WORK = "context.csv", "whose-work.csv"
 _PACKAGES = ("animat", "jax", "jaxlib", "numpy", "scipy", "optax", "numba")
@@ -56,8 +55,7 @@ def run_context_study(
     """
     expect_workers(workers, executor)
     folder = Path(folder).absolute()
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    versions |= {"learner": f"revision {LEARNER}", "virtual tissue": f"revision {REVISION}"}
+    versions = versions_of(_PACKAGES) | {"virtual tissue": f"revision {REVISION}"}
     manifest = with_fingerprint({"context study": asdict(study), "versions": versions})
     cultures = [f"culture-{culture}" for culture in study.cultures]
     rows: list[ContextRow] = []

@@ -129,10 +129,8 @@ def setting_of(study: Study, spec: RobotSpec, arm: Arm, timeline: SimulatorTimel
     if not arm.through_neurons or timeline is None:
         labels = tuple(f"{command:+g}" for command in training.commands or ())
         return Setting(training.environment(0), None, labels)
-    if arm.percentiles == "first":
-        timeline = timeline.with_first_percentiles()
     labels = tuple(each.label for each in timeline.conditions)
-    return Setting(training.environment(len(timeline.conditions)), timeline, labels)
+    return Setting(training.environment(len(labels)), timeline.with_percentiles(arm.percentiles), labels)
 
 
 def as_recorded(study: Study, folder: Path) -> tuple[Study, SimulatorTimeline | None, float, float]:

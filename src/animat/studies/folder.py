@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import platform
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,10 +18,9 @@ from animat.goals.robot import without_goal
 from animat.plain_file import expect_no_file, expect_plain_file
 from animat.recordings.formats.csv import stimuli_beside
 from animat.recordings.reading import list_recordings
-from animat.robots.host import HostRobot
 from animat.studies.places import OWN_FOLDERS
 from animat.studies.specification import Study
-from animat.training.settings import LEARNER
+from animat.training.folder import versions_of
 from animat.writing import clear_away, exclusive_lock, is_unfinished, write_whole
 
 MANIFEST = "study.json"
@@ -37,23 +35,19 @@ def describe_study(study: Study, sources: dict[str, str], device: str | None = N
 
     `device` is the kind of GPU that trains, as GPUs round differently; None for CPU cores, which are not recorded.
     """
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    robots = [without_goal(spec.robot()) for spec in study.robots]
+    versions = {"python": platform.python_version(), **versions_of(_PACKAGES, robots, device)}
     if study.culture.kind == "virtual":
         from animat.cultures.tissue.parameters import REVISION
 
         # Another revision gives other spikes, even within one version of animat.
         versions["virtual tissue"] = f"revision {REVISION}"
-    for spec in study.robots:
-        if isinstance(robot := without_goal(spec.robot()), HostRobot):
-            versions |= robot.versions
-    if device is not None:
-        versions["device"] = device
     return with_fingerprint(
         {
             "study": asdict(study),
             "sources": sources,
             # Another version may round differently, or draw other figures.
-            "versions": {"python": platform.python_version(), "learner": f"revision {LEARNER}", **versions},
+            "versions": versions,
             "seeds": {"culture": study.culture.seed, "training and evaluation": study.seed},
         }
     )

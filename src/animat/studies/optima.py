@@ -135,7 +135,7 @@ class FindOptima(StudyTask):
         few = undersampled(responses)
         if len(few) == len(responses.conditions):
             return _Request(kind, at_min, left_out=few)
-        of = WellSampled.of(environment, timeline, at_min, are_fixed=kind.percentiles == "first")
+        of = WellSampled.of(environment, timeline, at_min, kind.percentiles)
         return _Request(kind, at_min, case=(of.environment, of.simulator), counted=of, left_out=few)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,13 @@ import numpy as np
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import REGISTRY as MAPPINGS
-from animat.differences import fingerprint_of, first_difference, folder_mismatch, read_description
+from animat.differences import first_difference, folder_mismatch, read_description, with_fingerprint
 from animat.errors import InvalidArgument, Mismatch
 from animat.folder_kinds import expect_no_other
 from animat.goals.robot import without_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.plain_file import expect_no_file
+from animat.robots.base import Robot
 from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import REGISTRY as ROBOTS
@@ -79,23 +80,27 @@ def describe(
     `sources`, the names of the recordings, and the mean return of random actions are informative only. `device` is the
     kind of GPU used, which affects rounding; None for cores, which are not recorded.
     """
-    versions = {name: importlib.metadata.version(name) for name in ("animat", "jax", "jaxlib", "numpy", "optax")}
-    if isinstance(training.robot, HostRobot):
-        versions |= training.robot.versions
-    if device is not None:
-        versions["device"] = device
-    manifest: dict[str, Any] = {
+    decisive = {
         "training": training.to_dict(),
         "simulators": None if timeline is None else _describe_simulators(timeline),
-        "versions": {**versions, "learner": f"revision {LEARNER}"},
+        "versions": versions_of(("animat", "jax", "jaxlib", "numpy", "optax"), [training.robot], device),
     }
-    # Through JSON, in which a tuple and a list are the same.
-    manifest = json.loads(json.dumps(manifest))
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
-    fingerprint = fingerprint_of(manifest, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    manifest = with_fingerprint(decisive, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
     # File names do not count: the same recordings in another place are the same.
     informative = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
-    return manifest | informative | {"fingerprint": fingerprint}
+    return manifest | informative
+
+
+def versions_of(names: Iterable[str], robots: Iterable[Robot[Any]] = (), device: str | None = None) -> dict[str, str]:
+    """Versions of what may round or draw differently: packages by `names`, those of robots, the GPU and the learner."""
+    versions = {name: importlib.metadata.version(name) for name in names}
+    for robot in robots:
+        if isinstance(robot, HostRobot):
+            versions |= robot.versions
+    if device is not None:
+        versions["device"] = device
+    return versions | {"learner": f"revision {LEARNER}"}
 
 
 def _describe_simulators(timeline: SimulatorTimeline) -> dict[str, Any]:

@@ -60,18 +60,6 @@ class Group:
     provenance: dict[str, Any]
 
 
-def train_group(
-    group: Group,
-    checkpoint: Path | None,
-    progress: Progress,
-    *,
-    checkpoint_s: float = CHECKPOINT_S,
-    add_chunk: AddChunk | None = None,
-) -> list[Policy]:
-    """Train a group of policies: `train_groups` for a single one."""
-    return train_groups([group], checkpoint, progress, checkpoint_s=checkpoint_s, add_chunks=[add_chunk])[0]
-
-
 def train_groups(
     groups: Sequence[Group],
     checkpoint: Path | None,
@@ -123,11 +111,10 @@ def train_groups(
 
 def _simulators_of(group: Group) -> Callable[[int], NeuronSimulator | None]:
     """The simulator of a group in each chunk, by its number; all simulators where each episode draws one."""
-    training, timeline = group.training, group.timeline
-    if timeline is None:
+    training = group.training
+    if group.timeline is None:
         return lambda _: None
-    if training.percentiles == "first":
-        timeline = timeline.with_first_percentiles()
+    timeline = group.timeline.with_percentiles(training.percentiles)
     if training.shadowing == "drawn":
         return lambda _: timeline.simulators
     return lambda index: timeline.at(float(timeline.start_min[0]) + training.minute(index))

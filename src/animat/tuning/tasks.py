@@ -153,8 +153,7 @@ def _judge(own: Study, trial: Study) -> Study:
 def _timeline(folder: Path, study: Study) -> SimulatorTimeline | None:
     if not study.arms[0].through_neurons:
         return None
-    timeline = load_timeline(folder / timeline_file(study))
-    return timeline.with_first_percentiles() if study.arms[0].percentiles == "first" else timeline
+    return load_timeline(folder / timeline_file(study)).with_percentiles(study.arms[0].percentiles)
 
 
 def _at(timeline: SimulatorTimeline | None, minute: float) -> Any:

@@ -56,8 +56,7 @@ def scene_of_policies(
         if timeline.conditions != first.conditions:
             raise InvalidArgument("recordings: expected the conditions that the policies choose from, got others")
         row = timeline.requested_row(timeline.start_min[-1] if at_min is None else at_min)
-        fixed = timeline.with_first_percentiles() if first.percentiles == "first" else timeline
-        simulator = fixed.at(float(timeline.start_min[row]))
+        simulator = timeline.with_percentiles(first.percentiles).at(float(timeline.start_min[row]))
         environment = Animat(robot, first.mapping, len(first.conditions))
         environment = ShuffledDelivery(environment) if first.delivery == "shuffled" else environment
     respond = jax.jit(environment.respond)
