@@ -808,6 +808,16 @@ def test_usage_errors_come_in_one_line(
     assert all(word in lines[0] for word in words)
 
 
+def test_without_stimuli_nothing_is_said_about_allowing_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # No simulator could be fitted anyway.
+    (tmp_path / "a_spikes.csv").write_text("time_s,channel\n0.1,1\n")
+    assert main(["train", "cartpole", "--recordings", str(tmp_path), "--out", str(tmp_path / "policies")]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "no stimuli" in line and "--allow" not in line
+
+
 @pytest.mark.oracle
 def test_a_dead_window_is_refused_unless_allowed(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
