@@ -389,7 +389,11 @@ BAD = {
         [*TRAIN, "{folder}/bad.npz"],
         ["bad.npz", "frequency", "-10"],
     ),
-    "one condition": (nothing, [*TRAIN, "{recordings}", "--conditions", "all"], ["--conditions", "one-condition"]),
+    "one condition": (
+        nothing,
+        [*TRAIN, "{recordings}", "--conditions", "all"],
+        ["--conditions", "sort the stimuli by frequency, interval:5,10,", "one-condition"],
+    ),
     "unknown conditions": (nothing, [*TRAIN, "{recordings}", "--conditions", "colour"], ["conditions", "colour"]),
     "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["--window-ms: expected"]),
     "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
