@@ -389,7 +389,11 @@ BAD = {
         [*TRAIN, "{folder}/bad.npz"],
         ["bad.npz", "frequency", "-10"],
     ),
-    "one condition": (nothing, [*TRAIN, "{recordings}", "--conditions", "all"], ["--conditions", "one-condition"]),
+    "one condition": (
+        nothing,
+        [*TRAIN, "{recordings}", "--conditions", "all"],
+        ["--conditions", "sort the stimuli by frequency, interval:5,10,", "one-condition"],
+    ),
     "unknown conditions": (nothing, [*TRAIN, "{recordings}", "--conditions", "colour"], ["conditions", "colour"]),
     "window backwards": (nothing, [*TRAIN, "{recordings}", "--window-ms", "10", "2"], ["--window-ms: expected"]),
     "zero policies": (nothing, ["train", "cartpole", "--recordings", "{recordings}", "--policies", "0"], ["policies"]),
@@ -806,6 +810,16 @@ def test_usage_errors_come_in_one_line(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert all(word in lines[0] for word in words)
+
+
+def test_without_stimuli_nothing_is_said_about_allowing_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # No simulator could be fitted anyway.
+    (tmp_path / "a_spikes.csv").write_text("time_s,channel\n0.1,1\n")
+    assert main(["train", "cartpole", "--recordings", str(tmp_path), "--out", str(tmp_path / "policies")]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "no stimuli" in line and "--allow" not in line
 
 
 @pytest.mark.oracle

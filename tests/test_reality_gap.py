@@ -831,7 +831,7 @@ class TestCommand:
             (["--culture-seed", "-1"], "--culture-seed: expected 0 or more, got -1"),
             (["--pulses", "0"], "--pulses: expected at least 1"),
             (["--pulses", "1000000"], "--pulses: expected trials of 1000 s at most, got 1000000 pulses per trial"),
-            (["--pause-s", "-1"], "--pause-s: expected a finite number from 0"),
+            (["--pause-s", "-1e+09"], "--pause-s: expected a finite number from 0, got -1e+09"),
             (["--warm-up", "-1"], "--warm-up: expected a whole number from 0 to 100, got -1"),
             (["--warm-up", "101"], "--warm-up: expected a whole number from 0 to 100, got 101"),
             (["--settling", "-1"], "--settling: expected a whole number from 0 to 100, got -1"),

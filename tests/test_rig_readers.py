@@ -285,6 +285,22 @@ def test_other_nwb_units_with_electrodes_and_intervals(tmp_path: Path) -> None:
     assert recording.provenance["recorded_at"] == "2024-01-01T00:00:00+00:00"
 
 
+def test_other_nwb_columns_that_are_not_read_are_named(tmp_path: Path) -> None:
+    import pynwb
+
+    path = other_nwb(tmp_path / "a.nwb")
+    assert "columns-left-out" not in found(read_recording(path))
+    with pynwb.NWBHDF5IO(str(path), "a") as nwb_io:
+        table = pynwb.epoch.TimeIntervals(name="more", description="x")
+        table.add_column(name="stim_freq", description="Hz")
+        table.add_row(start_time=0.25, stop_time=0.26, stim_freq=20.0)
+        nwb = nwb_io.read()
+        nwb.add_stimulus(table)
+        nwb_io.write(nwb)
+    left = next(f for f in read_recording(path, stimuli="more").findings if f.name == "columns-left-out")
+    assert left.message.startswith("unknown columns of /stimulus/presentation/more were left out: stim_freq (did you")
+
+
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
     assert len(recording.channels) == 3
@@ -317,6 +333,14 @@ def test_a_choice_that_a_format_does_not_offer_is_refused(tmp_path: Path) -> Non
     np.savez(tmp_path / "a.npz", spike_time_s=np.zeros(1))
     with pytest.raises(InvalidArgument, match="only for HDF5 files"):
         read_recording(tmp_path / "a.npz", stimuli="x")
+    with pytest.raises(InvalidArgument, match=r"^part: expected only for HDF5 files, got 'well000' for .*a\.npz$"):
+        read_recording(tmp_path / "a.npz", part="well000")
+    (tmp_path / "a_spikes.csv").write_text("time_s,channel\n0.1,1\n")
+    with pytest.raises(InvalidArgument, match=r"^stimuli: .*got 'p.csv'.*name the file of stimuli NAME_stimuli\.csv"):
+        read_recording(tmp_path / "a_spikes.csv", stimuli="p.csv")
+    # The file need not hold stimuli.
+    with pytest.raises(InvalidArgument, match=r"^stimuli_path: expected only with CSV spikes, got .*a\.npz; put"):
+        read_recording(tmp_path / "a.npz", stimuli_path=tmp_path / "p.csv")
 
 
 # --- what every reader refuses ---------------------------------------------------------------------------------------

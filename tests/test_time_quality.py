@@ -17,6 +17,7 @@ from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.recordings.time_quality import frequency_findings
 from animat.responses.series import extract_series
 from animat.stimulation.protocol import Order, Protocol
 from synthetic_recordings import synthetic_recording
@@ -203,5 +204,10 @@ def test_frequencies_that_contradict_the_times_cause_a_warning() -> None:
     # Periods in place of frequencies.
     periods_s = str(contradicted(1 / true_hz))
     assert periods_s.endswith(": these are periods in seconds: write 1 divided by each, here 80")
+    # Mixed frequencies, where only the interval before a pulse is that of its frequency.
+    mixed_s = 1 / np.random.default_rng(0).choice([5.0, 10.0, 20.0, 40.0], len(true_hz))
+    stimuli = synthetic_recording(1, start_min=0.0, patterns=25, channels=16).stimuli
+    (mixed,) = frequency_findings(dataclasses.replace(stimuli, time_s=np.cumsum(mixed_s), frequency_hz=mixed_s))
+    assert mixed.message.endswith(": these are periods in seconds: write 1 divided by each, here 40")
     # Pauses between stimuli are none of a frequency's business.
     assert contradicted(np.full(len(true_hz), 80.0)) is None

@@ -176,7 +176,7 @@ class Train(SimulatorOptions, JobOptions):
         if len(timeline.conditions) < 2 and "one-condition" not in self.allow:
             raise UnusableData(
                 "--conditions: expected two or more for an agent to choose from, got one "
-                f"({timeline.conditions[0].label}); sort the stimuli by interval:5,10, electrode or pattern "
+                f"({timeline.conditions[0].label}); sort the stimuli by frequency, interval:5,10, electrode or pattern "
                 "(to allow it: --allow one-condition)"
             )
         return timeline

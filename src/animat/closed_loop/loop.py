@@ -123,7 +123,7 @@ class Loop:
                 raise InvalidArgument(f"{name}: expected a whole number from 0 to {MOST_WARM_UP}, got {number!r}")
         for name in ("burst_threshold", "pause_s", "patience_s", "most_repeats"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name)}")
+                raise InvalidArgument(f"{name}: expected a finite number from 0, got {getattr(self, name):g}")
         if self.patience_s == 0:
             raise InvalidArgument("patience_s: expected above 0 s, got 0: no answer is immediate")
         expect_at_least("patterns", self.patterns, 1)

@@ -103,9 +103,12 @@ def read_source(
     path = Path(path)
     begin = first_bytes(path)
     if begin.startswith((HDF5, ZIP)) and stimuli_path is not None:
-        raise InvalidArgument(f"stimuli_path: expected only with CSV spikes; {path} holds its own stimuli")
-    if (stimuli is not None or part is not None) and not begin.startswith(HDF5):
-        raise InvalidArgument(f"stimuli, part: expected only for HDF5 files, got {stimuli or part!r} for {path}")
+        raise InvalidArgument(f"stimuli_path: expected only with CSV spikes, got {path}; put the stimuli into it")
+    for name, value in (("stimuli", stimuli), ("part", part)):
+        if value is not None and not begin.startswith(HDF5):
+            beside = name == "stimuli" and not begin.startswith(ZIP)
+            remedy = "; name the file of stimuli NAME_stimuli.csv and that of spikes NAME_spikes.csv" if beside else ""
+            raise InvalidArgument(f"{name}: expected only for HDF5 files, got {value!r} for {path}{remedy}")
     try:
         # Errors in the data name the column but not the file.
         with in_file(path):

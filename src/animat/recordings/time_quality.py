@@ -104,11 +104,12 @@ def _sooner_than_stated(stimuli: Stimuli) -> Iterator[Finding]:
     least, stated_hz = max(sooner)
     if least > 1 / APART:
         return
+    periods = [(multiple, hz) for multiple, hz in sooner if abs(multiple - hz**2) < AGREE * hz**2]
+    least, stated_hz = periods[0] if periods else (least, stated_hz)
     interval_s = least / stated_hz
-    is_period = abs(interval_s / stated_hz - 1) < AGREE
     remedy = (
         f"these are periods in seconds: write 1 divided by each, here {1 / stated_hz:g}"
-        if is_period
+        if periods
         else "correct the frequencies, or group the stimuli by their times (--conditions interval:5,10)"
     )
     message = (

@@ -27,7 +27,7 @@ REFUSING = (
     "several-cultures",
 )
 """Names of the findings that make training pointless; a user may allow them."""
-_NOTHING_TO_FIT = ("no-condition", "empty-condition")
+_NOTHING_TO_FIT = ("no-stimuli", "no-condition", "empty-condition")
 """Those after which no simulator can be fitted, even if they are allowed."""
 
 

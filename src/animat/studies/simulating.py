@@ -33,7 +33,7 @@ class Fit(StudyTask):
         timeline = fit_simulators(study, series)
         if len(timeline.conditions) < 2 and "one-condition" not in study.simulators.allow:
             raise UnusableData(
-                f"{one_condition(timeline)}; sort the stimuli by interval:5,10, electrode or pattern "
+                f"{one_condition(timeline)}; sort the stimuli by frequency, interval:5,10, electrode or pattern "
                 '(to allow it: simulators.allow = ["one-condition"])'
             )
         timeline = replace(timeline, findings=(*timeline.findings, *_moved(study, timeline.start_min.tolist())))

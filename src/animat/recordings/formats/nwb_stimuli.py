@@ -11,7 +11,7 @@ import numpy as np
 
 from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
-from animat.recordings.findings import Finding
+from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
 from animat.recordings.formats.text_table import whole_numbers
 from animat.tables import padded
@@ -25,6 +25,8 @@ COLUMNS = {
     "stimulus_presentation": ("presentation",),
 }
 ELECTRODES = ("electrode_ids", "electrode_id", "electrodes", "electrode")
+NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "tags_index", "timeseries", "timeseries_index")
+"""Columns that any table of intervals may have."""
 APART_S = 0.001
 _BLOCK = 2**20
 
@@ -37,7 +39,8 @@ def read_stimuli(file: Hdf5File, asked: str | None, findings: list[Finding]) -> 
     at = _place(file, asked, findings)
     if at is None:
         return {"stimulus_time_s": np.empty(0)}
-    columns = _of_intervals(file, at) if file.has(f"{at}/start_time") else {"stimulus_time_s": _of_series(file, at)}
+    is_table = file.has(f"{at}/start_time")
+    columns = _of_intervals(file, at, findings) if is_table else {"stimulus_time_s": _of_series(file, at)}
     n = len(columns["stimulus_time_s"])
     findings.append(Finding("stimuli-from", "note", f"{n:,} stimuli are taken from /{at}", float(n)))
     return columns
@@ -73,9 +76,10 @@ def _can_be_stimuli(file: Hdf5File, at: str) -> bool:
     return any(file.has(f"{at}/{name}") for name in ("start_time", "timestamps", "starting_time"))
 
 
-def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
+def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str, Any]:
     time_s = file.read(f"{at}/start_time").reshape(-1)
     columns: dict[str, Any] = {"stimulus_time_s": time_s}
+    used = set(NO_STIMULUS_COLUMNS)
     for column, names in COLUMNS.items():
         for name in names:
             node = file.node(f"{at}/{name}")
@@ -83,11 +87,15 @@ def _of_intervals(file: Hdf5File, at: str) -> dict[str, Any]:
                 values = file.read(f"{at}/{name}")
                 if (values.dtype.kind == "U") <= (column == "stimulus_pattern"):
                     columns[column] = values
+                    used.add(name)
                     break
     for name in ELECTRODES:
         if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
             columns["stimulus_electrodes"] = electrodes
+            used |= {name, f"{name}_index"}
             break
+    missing = [name for column, names in COLUMNS.items() if column not in columns for name in names]
+    findings += left_out_findings("columns", [n for n in file.names(at) if n not in used], f"/{at}", missing)
     if "stimulus_frequency_hz" in columns:
         frequency = columns["stimulus_frequency_hz"].astype(np.float64)
         columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
