@@ -43,7 +43,7 @@ def draw_array(recording: Recording) -> Figure:
     place = {int(e): i for i, e in enumerate(channels.electrode.tolist()) if e != UNKNOWN and known[i]}
     rows = [place[e] for e in stimulated.tolist() if e in place]
     _ring(axes, channels.x_um[rows], channels.y_um[rows], counted(len(rows), "stimulated electrode"))
-    title = f"{counted(np.count_nonzero(known), 'recording site')} at {recording.start_min:g} min"
+    title = f"{counted(int(np.count_nonzero(known)), 'recording site')} at {recording.start_min:g} min"
     if np.any(~known):
         title += f"\n{np.count_nonzero(~known):,} channels at unknown positions are not drawn"
     if unplaced := len(stimulated) - len(rows):
