@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,18 @@ def test_a_film_says_which_responses_are_above_its_axis_and_counts_as_ticks_do(m
     for scene in (usual, beyond):
         Frames(scene, lambda _: None).at(1.0)
     assert len(triangles) == 1
+
+
+def test_before_its_first_moment_a_film_draws_nothing_of_it() -> None:
+    later = scene_of([5.0] * 10)
+    moments = tuple(replace(moment, time_s=moment.time_s + 2.0) for moment in later.moments)
+    empty, frame = (
+        np.asarray(Frames(replace(later, moments=shown), lambda _: None).at(1.0))
+        for shown in ((replace(later.moments[0], time_s=9.0),), moments)
+    )
+    # Right of the panels, up to the edge of the picture.
+    assert np.unique(frame[30:400, -12:].reshape(-1, 3), axis=0).tolist() == [[250, 250, 248]]
+    np.testing.assert_array_equal(frame[200:, 480:-16][:60], empty[200:, 480:-16][:60])
 
 
 def test_a_film_without_neurons_has_no_panel_of_responses(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.simulator import fit_empirical
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
+from animat.report.array import draw_array
 from animat.report.burst_separation import draw_burst_separation
 from animat.report.inspection import draw_inspection, inspection_text
 from animat.report.psth import draw_psth
@@ -330,6 +331,26 @@ def test_figures_name_units_and_conditions() -> None:
             assert axes.get_label() == "<colorbar>" or axes.get_xlabel().endswith(UNITS), axes.get_xlabel()
             assert axes.get_ylabel().endswith(UNITS), axes.get_ylabel()
     assert histograms.get_supxlabel().endswith(UNITS)
+
+
+def test_titles_of_figures_say_one_in_the_singular() -> None:
+    source = SyntheticCulture(seed=1, patterns=1, channels=1, frequencies_hz=(5.0,), means_hz=(30.0,)).record(0.0)
+    responses = extract_responses(source)
+    figures = (
+        draw_raster(source, responses),
+        draw_psth(post_stimulus_histogram(source), responses.window_ms),
+        draw_burst_separation(responses),
+        draw_array(source),
+    )
+    titles = [figure.get_suptitle() or figure.axes[0].get_title(loc="left") for figure in figures]
+    assert titles == [
+        "1 stimulus in the middle of the recording, each spike a dot",
+        "1 stimulus, 1 channel, bins of 1 ms",
+        "1 response",
+        titles[3],
+    ]
+    assert titles[3].startswith("1 recording site at") and len(axes_of(figures[0])) == 2
+    assert axes_of(figures[0])[1].get_title(loc="left") == "1 stimulus, one row each; each spike a dot"
 
 
 def test_a_raster_of_many_spikes_shades_rates_and_names_only_conditions_with_rows() -> None:

@@ -477,6 +477,8 @@ def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> 
     colours = {line.get_color() for line in figure.axes[0].lines if str(line.get_label()).startswith("c")}
     (dashed,) = [line for line in figure.axes[0].lines if "coarse" in str(line.get_label())]
     assert len(colours) == 6 and dashed.get_color() not in colours
+    arms = [line for axes in figure.axes for line in axes.lines if str(line.get_label()) in {*returns, "linear"}]
+    assert len({(line.get_color(), line.get_marker()) for line in arms}) == len(arms) == 7
 
 
 def test_the_legend_of_a_single_panel_is_whole() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from animat.report.drift import draw_drift
 from animat.report.inspection import draw_series
 from animat.report.response_histograms import draw_response_histograms
 from animat.report.responses_over_time import draw_responses_over_time
-from animat.report.style import MEDIAN
+from animat.report.style import MEDIAN, condition_colours
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
@@ -115,6 +116,25 @@ def test_responses_over_time_mark_each_median(series: list[Responses]) -> None:
     assert [text.get_text() for text in panels[0].get_yticklabels()] == ["0", "30", "60"]
     many = [replace(series[0], start_min=float(m)) for m in range(50)]
     assert draw_responses_over_time(many).get_suptitle() == "20 of 50 recordings"
+
+
+@pytest.mark.parametrize("draw", [draw_response_histograms, lambda each: draw_responses_over_time([each] * 2)])
+def test_titles_of_many_electrodes_are_whole_and_do_not_overlap(draw: Any) -> None:
+    labels = conditions_named("electrode")
+    figure = draw(extract_responses(synthetic_recording(1, patterns=20, channels=64), labels))
+    figure.draw_without_rendering()
+    titles = [axes.title if axes.title.get_text() else axes._left_title for axes in figure.axes if axes.get_visible()]  # type: ignore[attr-defined]
+    assert all("electrodes" in title.get_text() for title in titles)
+    boxes = [title.get_window_extent() for title in titles]
+    assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
+    assert max(box.x1 for box in boxes) <= figure.bbox.x1
+
+
+def test_the_drawn_conditions_of_a_drift_have_all_of_the_colours() -> None:
+    responses = extract_responses(synthetic_recording(1, patterns=60, channels=64), conditions_named("pattern"))
+    assert len(responses.conditions) == 60
+    colours = [to_hex(line.get_color()) for line in draw_drift([responses] * 2).axes[1].lines[:12]]
+    assert colours == condition_colours([""] * 12)
 
 
 def test_a_few_bursts_that_were_kept_do_not_squeeze_the_other_responses(series: list[Responses]) -> None:

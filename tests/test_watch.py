@@ -105,6 +105,14 @@ def test_a_span_in_the_past_has_the_ticks_of_that_time(folder: Path) -> None:
         assert all(each <= to_s for each in found["ticks"]["time_s"])
 
 
+def test_no_time_before_the_session_counts_in_its_rates(folder: Path) -> None:
+    found = SessionView(folder).view(0.5, 8.0)
+    assert (found["from_s"], found["to_s"]) == (0.0, 0.5)
+    spikes = np.concatenate([record.spike_times_s for record in read_session(folder).log])
+    assert sum(found["counts"]) == np.count_nonzero(spikes <= 0.5) > 0
+    assert SessionView(folder).view(-3.0, 8.0)["to_s"] == 0.0
+
+
 def test_a_log_is_followed_while_it_grows(folder: Path, tmp_path: Path) -> None:
     log = read_log(folder / LOG_FILE)
     view = SessionView(tmp_path)

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import os
 import struct
+import subprocess
 import sys
 import zlib
 from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from safetensors.numpy import save
 
 from animat.closed_loop.log import read_log
 from animat.closed_loop.session_data import LOG_FILE
 from animat.errors import AnimatError
+from animat.training.policy import CURVE
 from animat.watch.session import SessionView
 from animat.watch.study import StudyView
 from animat.watch.training import TrainingView
@@ -208,6 +214,44 @@ def test_a_strange_file_costs_no_more_than_its_own_panel(
             found = kind(tmp_path).view(None, 8.0)
             json.dumps(found, allow_nan=False).encode()
             assert found["blocks"][0]["title"] == first["title"] and len(found["blocks"]) > 2
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link"])
+def test_a_pipe_or_a_link_in_place_of_a_file_is_left_out(kind: str, tmp_path: Path) -> None:
+    files = ("p0.safetensors", ".unfinished/from-p0.npz", "evaluation.json", "journal.jsonl")
+    (folder := tmp_path / "watched").mkdir()
+    (folder / ".unfinished").mkdir()
+    for file in files:
+        if kind == "pipe":
+            os.mkfifo(folder / file)
+        else:
+            (elsewhere := tmp_path / Path(file).name).write_bytes(_content(file))
+            (folder / file).symlink_to(elsewhere)
+    # A process of its own: a reader that waits for a pipe may hold the whole interpreter, and no test would end it.
+    words = {"training.json": json.dumps(TRAINING), "tune.json": json.dumps(TUNING)}
+    for name, description in words.items():
+        (folder / name).write_text(description)
+    code = (
+        "import json, sys, pathlib, animat.watch.training as a, animat.watch.tuning as b\n"
+        "folder = pathlib.Path(sys.argv[1])\n"
+        "print(json.dumps([view(folder).view(None, 8.0) for view in (a.TrainingView, b.TuningView)]))"
+    )
+    shown = subprocess.run([sys.executable, "-c", code, folder], capture_output=True, text=True, timeout=60, check=True)
+    training, tuning = json.loads(shown.stdout)
+    facts = dict(training["blocks"][0]["rows"])
+    assert "0 are done" in facts["policies"] and facts["done"] == "0 % of all"
+    assert "61.5" not in shown.stdout and dict(tuning["blocks"][0]["rows"])["trials done"] == "0 of 5"
+
+
+def _content(file: str) -> bytes:
+    """What each file would show."""
+    curve, content = np.full((60, len(CURVE)), 61.5, np.float32), io.BytesIO()
+    if file.endswith(".safetensors"):
+        return bytes(save({"learning_curve": curve}))
+    if file.endswith(".npz"):
+        np.savez(content, curve=curve[:, None], members=np.array([0]))
+        return content.getvalue()
+    return json.dumps(TRIAL if file.endswith("l") else EVALUATION | {"optimum": {"value": 61.5}}).encode()
 
 
 def test_a_study_that_names_code_imports_none_of_it(tmp_path: Path) -> None:

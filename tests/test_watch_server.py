@@ -104,10 +104,14 @@ def test_a_session_is_shown(app: Any) -> None:
     ids=str,
 )
 def test_requests_from_elsewhere_are_refused(app: Any, folder: Path, wrong: dict[str, Any]) -> None:
+    app.state.asked_s = 0.0
     for path, method in (("", "GET"), ("things", "GET"), ("stop?in=session", "POST")):
         answer = asked(app, path, method=method, **{"origin": OWN if method == "POST" else None, **wrong})
         assert answer.status == 403
         assert b"animat" not in answer.body
+    # Nor do they keep the page's server up.
+    assert app.state.asked_s == 0.0
+    assert asked(app, "things").status == 200 and app.state.asked_s > 0.0
     assert not (folder / "in" / "session" / STOP_FILE).exists()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from animat.errors import counted
 from animat.recordings.recording import Recording
 from animat.report.style import GREY, RED, Axes, Figure, add_legend, new_figure, style_axes
 from animat.stimulation.selection import Selection
@@ -41,8 +42,8 @@ def draw_array(recording: Recording) -> Figure:
     stimulated = np.unique(stimuli.electrodes[stimuli.electrodes != UNKNOWN])
     place = {int(e): i for i, e in enumerate(channels.electrode.tolist()) if e != UNKNOWN and known[i]}
     rows = [place[e] for e in stimulated.tolist() if e in place]
-    _ring(axes, channels.x_um[rows], channels.y_um[rows], f"{len(rows)} stimulated electrodes")
-    title = f"{np.count_nonzero(known):,} recording sites at {recording.start_min:g} min"
+    _ring(axes, channels.x_um[rows], channels.y_um[rows], counted(len(rows), "stimulated electrode"))
+    title = f"{counted(int(np.count_nonzero(known)), 'recording site')} at {recording.start_min:g} min"
     if np.any(~known):
         title += f"\n{np.count_nonzero(~known):,} channels at unknown positions are not drawn"
     if unplaced := len(stimulated) - len(rows):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from animat.errors import counted
 from animat.report.response_histograms import even_edges, rate_edges
 from animat.report.style import BLACK, BLUE, BURST, NON_BURST, Axes, Figure, add_legend, new_figure, style_axes
 from animat.responses.responses import Responses
@@ -22,7 +23,7 @@ def draw_burst_separation(responses: Responses) -> Figure:
     figure = new_figure(9.0, 6.8) if n_bursts else new_figure(12.0, 3.6)
     all_x, plain, ratios, *more = figure.subplots(2, 2).flat if n_bursts else figure.subplots(1, 3)
     all_x.hist(responses.rate_hz, bins=rate_edges(responses, responses.rate_hz, 40).tolist(), color=BLUE)
-    style_axes(all_x, f"{len(responses):,} responses", _RATE, "responses (count)")
+    style_axes(all_x, counted(len(responses), "response"), _RATE, "responses (count)")
     _scatter(plain, responses, slice(None), BLUE, None)
     style_axes(plain, "response against active channels", _RATIO, _RATE)
     # One bar for every possible ratio, k/N, up to 40 bars.

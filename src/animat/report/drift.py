@@ -65,7 +65,7 @@ def draw_drift(series: Sequence[Responses]) -> Figure:
     add_legend(upper, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
     conditions = series[0].conditions[:_MOST_CONDITIONS]
-    colours = condition_colours([condition.unit for condition in series[0].conditions])
+    colours = condition_colours([condition.unit for condition in conditions])
     for i, condition in enumerate(conditions):
         line = {"color": colours[i], "marker": "o", "markersize": 3, "clip_on": False}
         middle.plot(minutes, drift.shares[:, i], label=condition.label, **line)

@@ -157,16 +157,16 @@ def _data_url(png: Path) -> str:
 
 
 def cell(value: Any) -> str:
-    """A cell as text: integers in full, other numbers with three digits, a dash for None and NaN."""
+    """A cell as text: integers in full, other numbers with at least three digits, a dash for None and NaN."""
     if value is None or value != value:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return with_minus(str(value))
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
-    whole = value == int(value) and abs(value) < 1e6
+    whole = abs(value) < 1e6 and (value == int(value) or abs(value) >= 999.5)
     # Trailing zeros stay: 23.0 next to 22.4.
-    return (f"{int(value):,}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
+    return (f"{value + 0:,.0f}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
 
 
 def with_error(value: float, error: float | None) -> str:

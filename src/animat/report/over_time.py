@@ -50,10 +50,12 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
     for axes, of in zip(panels, panels_of, strict=True):
         minutes = of.minutes
         for name, returns in list(of.returns.items())[:_MOST]:
-            colour = PALETTE[names.index(name) % _MOST]
+            # With more arms than colours over all panels, those of one colour have different markers.
+            before, place = divmod(names.index(name), _MOST)
+            colour, marker = PALETTE[place], "os^Dv"[before % 5]
             low, middle, high = quartiles(returns)
             axes.fill_between(minutes, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.plot(minutes, middle, color=colour, marker="o", markersize=3, label=name)
+            axes.plot(minutes, middle, color=colour, marker=marker, markersize=3, label=name)
         if of.optimum is not None:
             label = "optimal return, coarse grid"
             axes.plot(minutes, of.optimum, color=OPTIMUM, linestyle="--", linewidth=1.3, label=label)

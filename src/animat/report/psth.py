@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from animat.errors import counted
 from animat.report.style import BLUE, GREY, RED, WINDOW, Figure, add_legend, new_figure, style_axes
 from animat.responses.psth import PostStimulusHistogram
 
@@ -29,7 +30,8 @@ def draw_psth(
         axes.axhline(spontaneous_hz, color=GREY, linewidth=1, linestyle="--", label="spontaneous rate")
     axes.set_xlim(histogram.edges_ms[0], histogram.edges_ms[-1])
     width_ms = histogram.edges_ms[1] - histogram.edges_ms[0]
-    title = f"{histogram.n_stimuli:,} stimuli, {histogram.n_channels:,} channels, bins of {width_ms:g} ms"
+    of = f"{counted(histogram.n_stimuli, 'stimulus', 'stimuli')}, {counted(histogram.n_channels, 'channel')}"
+    title = f"{of}, bins of {width_ms:g} ms"
     centres_ms = 0.5 * (histogram.edges_ms[1:] + histogram.edges_ms[:-1])
     # Bins inside the response window always count, however close to the stimulus they are.
     inside = (histogram.edges_ms[:-1] >= window_ms[0] - 1e-9) & (histogram.edges_ms[1:] <= window_ms[1] + 1e-9)

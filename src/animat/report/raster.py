@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.errors import counted
 from animat.recordings.recording import Recording
 from animat.report.style import (
     BLACK,
@@ -59,7 +60,7 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
     _draw_spikes(upper, recording, shown, 4.0 if n < 10_000 else 1.0)
     upper.set_xlim(recording.start_s, max(recording.stop_s, recording.start_s + 1e-3))
     thinned = f"{len(shown):,} of " if len(shown) < n else ""
-    style_axes(upper, f"{thinned}{n:,} spikes, no stimuli", "", "channel (row)")
+    style_axes(upper, f"{thinned}{counted(n, 'spike')}, no stimuli", "", "channel (row)")
     # No more bins than can be told apart; each shows its highest rate, so that a short burst keeps its height.
     together = max(1, -(-len(bursts.count) // _MOST_POINTS))
     rows = np.arange(0, len(bursts.count), together)
@@ -69,7 +70,7 @@ def draw_spontaneous(recording: Recording, bursts: NetworkBursts) -> Figure:
     threshold_hz = bursts.threshold / (width_s * len(recording.channels))
     lower.axhline(threshold_hz, color=WINDOW, linewidth=1, label="threshold of network bursts")
     lower.set_ylim(bottom=0)
-    style_axes(lower, f"{len(bursts):,} network bursts", "time (s)", "rate (Hz per channel)")
+    style_axes(lower, counted(len(bursts), "network burst"), "time (s)", "rate (Hz per channel)")
     add_legend(lower, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0)
     return figure
 
@@ -97,7 +98,9 @@ def _draw_stretch(axes: Axes, recording: Recording) -> None:
     for time_s in inside:
         axes.axvline(time_s, color=RED, linewidth=1)
     axes.set_xlim(from_s, to_s)
-    title = f"{len(inside)} stimuli in the middle of the recording, each spike a dot" if len(inside) else "every spike"
+    title = "every spike"
+    if len(inside):
+        title = f"{counted(len(inside), 'stimulus', 'stimuli')} in the middle of the recording, each spike a dot"
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
     style_axes(axes, title, "time (s)", "channel (row)")
 
@@ -137,7 +140,7 @@ def _draw_stimuli(axes: Axes, recording: Recording, responses: Responses, from_m
     axes.set_xlim(from_ms, to_ms)
     axes.set_ylim(-0.5, max(len(chosen), 1) - 0.5)
     thinned = "" if len(chosen) == len(times_s) else f"{len(chosen)} of "
-    title = f"{thinned}{len(times_s):,} stimuli, one row each; {each}"
+    title = f"{thinned}{counted(len(times_s), 'stimulus', 'stimuli')}, one row each; {each}"
     style_axes(axes, title, "time from stimulus (ms)", "stimulus (row)")
 
 

@@ -7,11 +7,13 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLACK, MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes
+from animat.report.style import BLACK, MEDIAN, Figure, add_legend, condition_colours, new_figure, style_axes, wrapped
 from animat.responses.responses import Responses
 
 _MOST_PANELS = 16
 _BINS = 30
+_WIDE_IN = 4.3
+"""Width of a panel."""
 
 
 def draw_response_histograms(responses: Responses, last: Responses | None = None) -> Figure:
@@ -24,18 +26,24 @@ def draw_response_histograms(responses: Responses, last: Responses | None = None
     drawn = sorted(sorted(range(len(n)), key=lambda i: -n[i])[:_MOST_PANELS])
     columns = 1 if len(drawn) <= 5 else 2
     rows = max(1, math.ceil(len(drawn) / columns))
-    figure = new_figure(5.0 * columns, 0.9 + 1.25 * rows if rows > 1 else 3.2)
+    shares, titles = responses.shares_above_median(), {}
+    for i in drawn:
+        label, numbers = responses.conditions[i].label, f"n = {n[i]:,}"
+        numbers += f", P(x ≥ P50) = {shares[i]:.2f}" if n[i] else ""
+        titles[i] = wrapped(f"{label}: {numbers}", _WIDE_IN)
+        if "\n" in titles[i]:
+            titles[i] = f"{wrapped(label, _WIDE_IN)}:\n{numbers}"
+    more_lines = max([title.count("\n") for title in titles.values()], default=0)
+    figure = new_figure(5.0 * columns, 0.9 + (1.25 + 0.17 * more_lines) * rows if rows > 1 else 3.2)
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False).T.reshape(-1)
     colours = condition_colours([condition.unit for condition in responses.conditions])
     rates_hz = [each.non_burst_rate_hz for each in (responses, last) if each is not None]
     edges_hz = rate_edges(responses, np.concatenate(rates_hz), _BINS)
-    shares = responses.shares_above_median()
     for axes, i in zip(panels, drawn, strict=False):
         x = responses.rates_of(i)
         weights, alpha = np.full(len(x), 1 / max(len(x), 1)), None if last is None else 0.7
         axes.hist(x, bins=edges_hz.tolist(), weights=weights, color=colours[i], alpha=alpha)
-        share = f", P(x ≥ P50) = {shares[i]:.2f}" if len(x) else ""
-        style_axes(axes, f"{responses.conditions[i].label}: n = {len(x):,}{share}", "", "fraction")
+        style_axes(axes, titles[i], "", "fraction")
         if math.isfinite(responses.median_rate_hz):
             label = f"P50 = {responses.median_rate_hz:.3g} Hz"
             axes.axvline(responses.median_rate_hz, color=MEDIAN, linewidth=1.2, linestyle="--", label=label)

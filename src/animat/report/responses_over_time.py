@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from animat.report.response_histograms import rate_edges
-from animat.report.style import MEDIAN, Figure, condition_colours, new_figure, style_axes
+from animat.report.style import MEDIAN, Figure, condition_colours, new_figure, style_axes, wrapped
 from animat.responses.responses import Responses
 from animat.tables import evenly
 
@@ -32,10 +32,13 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
     beyond = int(np.count_nonzero(all_hz > edges_hz[-1]))
     columns = len(conditions) if len(conditions) <= 5 else 4
     down = -(-len(conditions) // columns)
-    figure = new_figure(1.0 + (2.2 if columns <= 4 else 1.9) * columns, 0.6 + down * (0.7 + 0.3 * len(shown)))
+    wide_in = 2.2 if columns <= 4 else 1.9
+    titles = [wrapped(condition.label, wide_in) for condition in conditions]
+    more_lines = max([title.count("\n") for title in titles], default=0)
+    figure = new_figure(1.0 + wide_in * columns, 0.6 + down * (0.7 + 0.17 * more_lines + 0.3 * len(shown)))
     panels = figure.subplots(down, columns, sharex=True, squeeze=False).reshape(-1)
     colours = condition_colours([condition.unit for condition in shown[0].conditions])
-    for i, (axes, condition, of) in enumerate(zip(panels, conditions, rates, strict=False)):
+    for i, (axes, title, of) in enumerate(zip(panels, titles, rates, strict=False)):
         shares = [np.histogram(x, edges_hz)[0] / max(len(x), 1) for x in of]
         # All recordings of a condition have the same scale.
         height = 0.92 / max(max(share.max() for share in shares), 1e-9)
@@ -49,7 +52,7 @@ def draw_responses_over_time(series: Sequence[Responses]) -> Figure:
         axes.set_xlim(0, edges_hz[-1])
         axes.set_ylim(-len(shown) + 0.9, 1.0)
         axes.tick_params(labelbottom=True)
-        style_axes(axes, condition.label, "", "start (min)" if i % columns == 0 else "")
+        style_axes(axes, title, "", "start (min)" if i % columns == 0 else "")
     for axes in panels[len(conditions) :]:
         axes.set_visible(False)
     left_out = []

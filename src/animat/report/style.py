@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,11 @@ def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def wrapped(title: str, width_in: float) -> str:
+    """A title of a panel of this width, on as many lines as it needs; sets of electrodes break between electrodes."""
+    return fill(title.replace("+", "+ "), max(8, int(width_in / 0.082))).replace("+ ", "+")
 
 
 def add_legend(axes: Axes, **place: Any) -> None:

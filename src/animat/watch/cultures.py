@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.plain_file import read_plain_text
 from animat.watch.blocks import Width, facts, table, time_left
-from animat.watch.files import json_of
+from animat.watch.files import json_of, text_of
 from animat.watch.plain import listed, mapped, text
 from animat.watch.state import is_locked, state_of
 from animat.watch.study import share_of
@@ -107,7 +106,7 @@ def _means_of(path: Path) -> _Means | None:
     try:
         means = {
             (text(row["comparison"]), text(row["robot"])): (float(row["mean_first"]), float(row["mean_second"]))
-            for row in csv.DictReader(io.StringIO(read_plain_text(path, _MOST_BYTES)))
+            for row in csv.DictReader(io.StringIO(text_of(path, _MOST_BYTES)))
         }
     except (InvalidFile, csv.Error, KeyError, TypeError, ValueError):
         return None

@@ -30,7 +30,7 @@ class Item:
 
 
 def find(folder: Path) -> list[Item]:
-    """The items in a folder and its subfolders, newest first, without links that lead out of it.
+    """The items in a folder and its subfolders, newest first, without links.
 
     A folder that does not exist yet holds none.
     """
@@ -69,7 +69,7 @@ def _in_folder(root: Path, folder: Path) -> Iterator[Item]:
     for kind, name in _MARKS.items():
         file = folder / name
         try:
-            if file.is_file() and file.resolve().is_relative_to(root.resolve()):
+            if file.is_file() and not file.is_symlink():
                 yield Item(kind, place, max(file.stat().st_mtime, folder.stat().st_mtime))
         except OSError:
             continue

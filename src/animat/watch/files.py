@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from animat.errors import InvalidFile
 from animat.execution.task import NOTICES, UNFINISHED
-from animat.plain_file import read_plain_text
+from animat.plain_file import expect_plain_file, read_plain_text
 from animat.training.policy import CURVE, whole_curve
 from animat.watch.plain import listed, mapped, number, text
 
@@ -30,9 +30,25 @@ def json_of(path: Path) -> dict[str, Any]:
 
 def _json_of(path: Path) -> Any:
     try:
-        return json.loads(read_plain_text(path, _MOST_BYTES))
+        return json.loads(text_of(path, _MOST_BYTES))
     except (InvalidFile, ValueError, RecursionError):
         return None
+
+
+def text_of(path: Path, most_bytes: int) -> str:
+    """The text of a file; raises InvalidFile as `expect_own` and `read_plain_text` do."""
+    return read_plain_text(expect_own(path), most_bytes)
+
+
+def expect_own(path: Path) -> Path:
+    """Refuse a link, which may lead anywhere, and what would block its reader for ever, such as a pipe.
+
+    Raises:
+        InvalidFile: naming the file and what it is.
+    """
+    if path.is_symlink():
+        raise InvalidFile(f"{path}: expected a file, got a link")
+    return expect_plain_file(path)
 
 
 def job_progress(folder: Path) -> JobProgress:
@@ -61,9 +77,9 @@ def curve_of_policy(path: Path) -> Float64[np.ndarray, "chunks columns"] | None:
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, framework="numpy") as file:
+        with safe_open(expect_own(path), framework="numpy") as file:
             return _complete(file.get_tensor("learning_curve"), 2)
-    except (OSError, SafetensorError, ValueError, TypeError):
+    except (InvalidFile, OSError, SafetensorError, ValueError, TypeError):
         return None
 
 
@@ -91,7 +107,7 @@ def mean_of_episodes(path: Path) -> tuple[float, int, int] | None:
 def _arrays_in(path: Path, names: tuple[str, ...], most_bytes: int) -> list[np.ndarray] | None:
     """Arrays of a numpy archive; None if it cannot be read or they are too large."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(expect_own(path), allow_pickle=False) as file:
             sizes = [file.zip.getinfo(f"{name}.npy").file_size for name in names]
             return [file[name] for name in names] if sum(sizes) <= most_bytes else None
     except Exception:  # zipfile, zlib and numpy have a dozen kinds of errors for a damaged archive

@@ -30,7 +30,8 @@ def guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint],
     """Middleware that answers 403 to any request that is not from the page or its address, and passes on the rest.
 
     A foreign name that resolves to this machine (DNS rebinding) appears in `Host`, a foreign page in `Origin`. Neither
-    knows the token that begins every path. The time of the last request is kept in the application's `state.asked_s`.
+    knows the token that begins every path. The time of the last request that was passed on is kept in
+    the application's `state.asked_s`.
     """
     hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
     origins = {f"http://{host}" for host in hosts}
@@ -50,9 +51,11 @@ def guard(token: str, port: int) -> Callable[[Request, RequestResponseEndpoint],
         return ""
 
     async def guarded(request: Request, answer: RequestResponseEndpoint) -> Response:
-        request.app.state.asked_s = time.monotonic()
-        reason = refusal(request)
-        response = PlainTextResponse(reason, 403) if reason else await answer(request)
+        if reason := refusal(request):
+            response: Response = PlainTextResponse(reason, 403)
+        else:
+            request.app.state.asked_s = time.monotonic()
+            response = await answer(request)
         response.headers.update(HEADERS)
         return response
 

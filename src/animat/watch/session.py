@@ -114,8 +114,8 @@ class SessionView(View):
         self._sums.go_on(_COUNT_S)
         last = self._span_before(len(self.tail) - 1)
         end_s = 0.0 if last is None else last[1]
-        to_s = end_s if to_s is None else min(to_s, end_s)
-        from_s = to_s - span_s
+        to_s = end_s if to_s is None else min(max(to_s, 0.0), end_s)
+        from_s = max(0.0, to_s - span_s)
         shown = self._between(from_s, to_s)
         ticks = [self._tick(at, record) for at, record in shown if record.fields.get("tick")]
         ticks = [tick for tick in ticks if tick["time_s"] <= to_s]

@@ -8,9 +8,8 @@ from statistics import fmean
 from typing import Any
 
 from animat.errors import InvalidFile
-from animat.plain_file import read_plain_text
 from animat.watch.blocks import chart, curve, facts, table, time_left
-from animat.watch.files import json_of
+from animat.watch.files import json_of, text_of
 from animat.watch.plain import listed, mapped, number, settings, short, text
 from animat.watch.state import state_of
 from animat.watch.study import running_jobs, running_table
@@ -57,7 +56,7 @@ class TuningView(View):
     def _trials(self) -> list[dict[str, Any]]:
         """The readable trials in the journal, each with its last mean return."""
         try:
-            lines = read_plain_text(self.folder / "journal.jsonl", 2**26).splitlines()
+            lines = text_of(self.folder / "journal.jsonl", 2**26).splitlines()
         except InvalidFile:
             return []
         return [trial for line in lines if (trial := _trial(line)) is not None]

@@ -47,7 +47,9 @@ class Frames:
     def at(self, time_s: float) -> Image.Image:
         """The frame at a time."""
         scene = self._scene
-        now = max(0, int(np.searchsorted(self._times_s, time_s, "right")) - 1)
+        n_begun = int(np.searchsorted(self._times_s, time_s, "right"))
+        # Before the first moment its robot is shown, but nothing of it has happened yet.
+        now = max(0, n_begun - 1)
         moment = scene.moments[now]
         image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), _PAPER)
         draw = ImageDraw.Draw(image)
@@ -55,7 +57,7 @@ class Frames:
         self._draw_robot(image, draw, now)
         self._draw_captions(draw, moment)
         first = int(np.searchsorted(self._times_s, time_s - SHOWN_S))
-        past = scene.moments[max(0, first - 1) : now + 1]
+        past = scene.moments[max(0, first - 1) : n_begun]
         top = 18
         if scene.n_channels:
             spikes = _Strip(draw, (top, 150), time_s, (-1, scene.n_channels), "spikes by channel", has_scale=False)

@@ -154,7 +154,8 @@ export class SessionPage {
       this.array.canvas.hidden = true;
       return;
     }
-    const seconds = this.span[1] - this.span[0];
+    // Nothing has happened yet at the start of a session.
+    const seconds = Math.max(this.span[1] - this.span[0], 1e-9);
     const rates = view.counts.map((each) => each / seconds);
     const sorted = [...rates].sort((a, b) => a - b);
     const most = Math.max(sorted[Math.floor(0.98 * (sorted.length - 1))] ?? 0, 1e-9);
