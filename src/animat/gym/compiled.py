@@ -113,7 +113,7 @@ def _compiled(environment: Environment[Any]) -> tuple[Callable[..., Any], ...]:
         return state, environment.observe(state)
 
     template = with_observation(environment.reset(jax.random.key(0)))
-    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, template))
+    leaves, structure = jax.tree.flatten(jax.device_get(jax.tree.map(jnp.asarray, template)))
     ends = np.cumsum([leaf.size for leaf in leaves])
     # A bool or a number of fewer bits is held as a float32, which is exact.
     held = [leaf.dtype if leaf.dtype.itemsize == 4 else np.dtype(np.float32) for leaf in leaves]
@@ -126,8 +126,9 @@ def _compiled(environment: Environment[Any]) -> tuple[Callable[..., Any], ...]:
         return jnp.concatenate([jax.lax.bitcast_convert_type(part, jnp.uint32) for part in parts])
 
     def unpack(rows: Any, as_kind: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+        whole = {kind: as_kind(rows, kind) for kind in set(held)}
         parts = [
-            as_kind(rows[..., end - leaf.size : end], kind).reshape(*rows.shape[:-1], *leaf.shape).astype(leaf.dtype)
+            whole[kind][..., end - leaf.size : end].reshape(*rows.shape[:-1], *leaf.shape).astype(leaf.dtype)
             for end, leaf, kind in zip(ends, leaves, held, strict=True)
         ]
         return jax.tree.unflatten(structure, parts)  # type: ignore[no-any-return]
