@@ -6,7 +6,9 @@ import copy
 import pickle
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import jax
@@ -27,6 +29,7 @@ from animat.neurons.synthetic import LABELS, synthetic_simulator
 from animat.recordings.formats.nwb import write_nwb
 from animat.responses.extraction import extract_responses
 from animat.robots import Cartpole, robot_named
+from animat.robots.registry import REGISTRY
 from animat.wrappers import EpisodeLimit, NeuralObservation
 from synthetic_recordings import synthetic_recording, write_synthetic_series
 
@@ -279,6 +282,62 @@ def test_a_vector_is_of_a_whole_number_and_starts_as_one() -> None:
     envs = gymnasium.make_vec("Animat/Cartpole-v0", num_envs=np.int64(2))
     with pytest.raises(InvalidArgument, match="options: expected no 'reset_mask': all episodes are started together"):
         envs.reset(options={"reset_mask": np.array([True, False])})
+
+
+class Drawn(NamedTuple):
+    """Where a drifter is, and the data of the random key of its episode."""
+
+    x_m: Any
+    key: Any
+
+
+@dataclass(frozen=True)
+class Drifter(animat.Robot[Drawn]):
+    """Is moved by a wind that its episode draws."""
+
+    episode_limit: int = 20
+    name: ClassVar[str] = "drifter"
+
+    @property
+    def observation_spec(self) -> tuple[animat.Quantity, ...]:
+        return (animat.Quantity("x", "m", 1.0),)
+
+    def reset(self, key: Any) -> Drawn:
+        return Drawn(jnp.float32(0.0), jax.random.key_data(key))
+
+    def advance(self, uniforms: Any, state: Drawn, u: Any) -> tuple[Drawn, Any, Any]:
+        x_m = state.x_m + jax.random.normal(jax.random.wrap_key_data(state.key))
+        return state._replace(x_m=x_m), -jnp.abs(x_m), jnp.bool_(False)
+
+    def observe(self, state: Drawn) -> Any:
+        return jnp.stack([state.x_m])
+
+
+@dataclass(frozen=True)
+class Listing(Drifter):
+    """Observes a list, where the contract is an array."""
+
+    name: ClassVar[str] = "listing"
+
+    def observe(self, state: Drawn) -> Any:
+        return [state.x_m]
+
+
+def test_a_robot_of_your_own_keeps_every_bit_of_its_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(REGISTRY, "_registered", {**REGISTRY.kinds, "drifter": Drifter})
+    env = gymnasium.make("Animat/Robot-v0", robot="drifter")
+    env.reset(seed=0)
+    # The generator of the environment draws the seed of the episode's key.
+    seed = gymnasium.utils.seeding.np_random(0)[0].integers(0, 2**32, 1, dtype=np.uint32)[0]
+    wind = float(jax.random.normal(jax.random.key(seed)))
+    assert [float(env.step(0)[0][0]) for _ in range(3)] == pytest.approx([wind, 2 * wind, 3 * wind])
+
+
+def test_a_robot_of_your_own_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(REGISTRY, "_registered", {**REGISTRY.kinds, "listing": Listing})
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(InvalidArgument, match=r"Listing.observe: expected an array, as from jnp.stack, got a list"):
+            make("Animat/Robot-v0", robot="listing")
 
 
 def test_what_the_neurons_remember_is_observed_too() -> None:

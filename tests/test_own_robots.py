@@ -160,6 +160,10 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
         ({"observe": lambda self, state: jnp.stack([state.x_m / 0])}, "NaN or infinite ones in an observation"),
         ({"observe": lambda self, state: jnp.stack([state.y])}, "observe: expected it to run .* AttributeError"),
         ({"reset": lambda self, key: At(jnp.float32(jnp.nan))}, "NaN or infinite ones in a state"),
+        (
+            {"reset": lambda self, key: At(key)},
+            "reset: expected a state of numbers, got a key: store jax.random.key_data",
+        ),
         ({"reset": lambda self: At(0.0)}, "reset: expected it to run under jax.jit, got TypeError"),
         ({"reset": lambda self, key: At(0)}, "advance: expected the state's structure from reset"),
         ({"advance": lambda self, uniforms, state, u: (state, u)}, r"advance: expected \(state, reward, whether"),

@@ -1,7 +1,8 @@
 """What one Gymnasium environment and a vector share: Animats stepped together in compiled code, and their pictures.
 
 The cost of a call into compiled code depends more on the number of arrays passed than on what is computed. So an
-iteration takes and returns one row of float32 per environment, which packs the state and the observation.
+iteration takes and returns one row of 32-bit words per environment, which packs the state and the observation bit by
+bit: float32 would round the large integers of a state, such as the data of a random key.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float32, Int64, UInt8
+from jaxtyping import Array, Bool, Float32, Int64, UInt8, UInt32
 
 from animat.environment import Environment, State
 from animat.errors import InvalidArgument
@@ -23,7 +23,8 @@ from animat.gym.setup import set_up
 from animat.robots.base import capability
 from animat.robots.drawing import draw_robot
 
-Rows = Float32[np.ndarray, "environments numbers"]
+Rows = UInt32[np.ndarray, "environments words"]
+Observations = Float32[np.ndarray, "environments observations"]
 
 
 class CompiledAnimats:
@@ -76,7 +77,7 @@ class CompiledAnimats:
         inputs[:, 1:] = rng.random((n, noise_size), np.float32)
         return np.asarray(step(inputs, rows, self.setup.simulator))
 
-    def _go_on_from(self, rows: Rows, begun: Bool[np.ndarray, " environments"]) -> tuple[Any, Rows]:
+    def _go_on_from(self, rows: Rows, begun: Bool[np.ndarray, " environments"]) -> tuple[Any, Observations]:
         """Returns the `State` and the observations in the rows, as numpy copies, shape (environments, ...)."""
         _, _, read = self._functions
         self._rows, (state, observations) = rows, read(rows)
@@ -112,25 +113,34 @@ def _compiled(environment: Environment[Any]) -> tuple[Callable[..., Any], ...]:
         return state, environment.observe(state)
 
     template = with_observation(environment.reset(jax.random.key(0)))
-    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, template))
+    leaves, structure = jax.tree.flatten(jax.device_get(jax.tree.map(jnp.asarray, template)))
     ends = np.cumsum([leaf.size for leaf in leaves])
-    _, unpack = ravel_pytree(template)
+    # A bool or a number of fewer bits is held as a float32, which is exact.
+    held = [leaf.dtype if leaf.dtype.itemsize == 4 else np.dtype(np.float32) for leaf in leaves]
 
     def pack(state: State) -> Array:
-        return ravel_pytree(with_observation(state))[0].astype(jnp.float32)
+        parts = [
+            jnp.ravel(leaf).astype(kind)
+            for leaf, kind in zip(jax.tree.leaves(with_observation(state)), held, strict=True)
+        ]
+        return jnp.concatenate([jax.lax.bitcast_convert_type(part, jnp.uint32) for part in parts])
+
+    def unpack(rows: Any, as_kind: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+        whole = {kind: as_kind(rows, kind) for kind in set(held)}
+        parts = [
+            whole[kind][..., end - leaf.size : end].reshape(*rows.shape[:-1], *leaf.shape).astype(leaf.dtype)
+            for end, leaf, kind in zip(ends, leaves, held, strict=True)
+        ]
+        return jax.tree.unflatten(structure, parts)  # type: ignore[no-any-return]
 
     def start(seed: Array) -> Array:
         return pack(environment.reset(jax.random.key(seed)))
 
     def step(inputs: Array, row: Array, simulator: Any) -> Array:
-        return pack(environment.advance(inputs[1:], unpack(row)[0], inputs[0].astype(jnp.int32), simulator))
+        state, _ = unpack(row, jax.lax.bitcast_convert_type)
+        return pack(environment.advance(inputs[1:], state, inputs[0].astype(jnp.int32), simulator))
 
-    def read(rows: Rows) -> tuple[Any, Rows]:
-        parts = [
-            rows[:, end - leaf.size : end].reshape(-1, *leaf.shape).astype(leaf.dtype)
-            for end, leaf in zip(ends, leaves, strict=True)
-        ]
-        state, observations = jax.tree.unflatten(structure, parts)
-        return state, observations
+    def read(rows: Rows) -> tuple[Any, Observations]:
+        return unpack(rows, np.ndarray.view)
 
     return jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step, (0, 0, None))), read

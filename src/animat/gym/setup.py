@@ -27,6 +27,7 @@ from animat.responses.conditions import conditions_named
 from animat.responses.readouts import DEFAULT_READOUTS, Readouts
 from animat.responses.series import extract_series
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
+from animat.robots.checking import check_robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import robot_named
 from animat.wrappers import Delivery, EpisodeLimit, NeuralObservation, ShuffledDelivery
@@ -91,7 +92,8 @@ def set_up(
         parameters: of the robot, `pole_mass_kg=0.55`.
 
     Raises:
-        InvalidArgument: for options that are unknown or incompatible.
+        InvalidArgument: for options that are unknown or incompatible, and for a robot or a mapping of your own that
+            breaks its contract.
         InvalidFile: for recordings that cannot be read.
         UnusableData: for recordings that no controller can learn from.
     """
@@ -100,6 +102,8 @@ def set_up(
         raise InvalidArgument(
             f"robot: expected one stepped in JAX, got {body.name}, which Gymnasium steps: use it with animat train"
         )
+    if not is_ours(body):
+        check_robot(body)
     for caveat in body.caveats():
         warnings.warn(caveat, stacklevel=2)
     expect_kind("simulator", simulator, NeuronSimulator | None, "a simulator; `kind` takes the name of one")

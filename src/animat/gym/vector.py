@@ -10,14 +10,14 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from animat.errors import InvalidArgument, expect_at_least, expect_kind
-from animat.gym.compiled import CompiledAnimats, Rows
+from animat.gym.compiled import CompiledAnimats, Observations
 
 Actions = Int64[np.ndarray, " environments"]
 Rewards = Float32[np.ndarray, " environments"]
 Flags = Bool[np.ndarray, " environments"]
 
 
-class AnimatVectorEnv(CompiledAnimats, VectorEnv[Rows, Actions, Rewards]):
+class AnimatVectorEnv(CompiledAnimats, VectorEnv[Observations, Actions, Rewards]):
     """`num_envs` independent Animats in one compiled call; each behaves as an `AnimatEnv`.
 
     An environment whose episode ended starts a new one in the next step (Gymnasium's `NEXT_STEP`): that step ignores
@@ -49,7 +49,9 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Rows, Actions, Rewards]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended: Flags = np.zeros(num_envs, bool)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Rows, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
         """Start all episodes from one seed; `options` are not used.
 
         Raises:
@@ -62,7 +64,7 @@ class AnimatVectorEnv(CompiledAnimats, VectorEnv[Rows, Actions, Rewards]):
         self._ended = np.zeros(self.num_envs, bool)
         return observations, {}
 
-    def step(self, actions: Actions) -> tuple[Rows, Rewards, Flags, Flags, dict[str, Any]]:
+    def step(self, actions: Actions) -> tuple[Observations, Rewards, Flags, Flags, dict[str, Any]]:
         """One iteration of each environment, or the start of a new episode where the last one ended."""
         rows, actions = self._expect_started("step"), np.asarray(actions)
         n_conditions = len(self.setup.condition_labels)

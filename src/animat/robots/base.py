@@ -17,7 +17,7 @@ from animat.lazy import Array, jax
 from animat.records import Number, Whole
 
 State = TypeVar("State")
-"""A robot's state: a NamedTuple of float32 scalars; `jax.vmap` makes batches of robots."""
+"""A robot's state: a NamedTuple of numbers or arrays; `jax.vmap` makes batches of robots."""
 
 Uniforms: TypeAlias = "Float[Array, ' noise_size']"
 Transition: TypeAlias = tuple[State, "Float[Array, '']", "Bool[Array, '']"]

@@ -233,7 +233,7 @@ class Study:
         policies: of each arm on each robot.
         seed: decides every draw of training and evaluation.
         training_min: duration of training on the culture's clock.
-        episodes: of each policy where no comparison says otherwise, and of controls.
+        episodes: of each policy of an arm that no comparison evaluates on that recording, and of controls.
         episodes_over_time: of each policy at every recording.
         actions: how policies act in evaluation: the most probable action, or drawn as in training.
         optimum_resolution: steps of the grid of the optimal return, as a multiple; 0.6 is fast and coarse.
