@@ -260,7 +260,8 @@ def test_a_task_at_work_elsewhere_is_waited_for_unless_it_is_frozen(
     log, thawed = tmp_path / "log", tmp_path / "thawed"
     task = Join("a", log=log, until=thawed) if freezes else Join("a", log=log, takes_s=0.5)
     elsewhere = ours.submit(carry_out_alone, task, tmp_path, notice)
-    while not log.exists():
+    # The file is there before its first line.
+    while not (log.exists() and log.read_text()):
         time.sleep(0.01)
     (at_work,) = [pid for pid in children() if str(notice.with_suffix(".lock")) in open_files(pid)]
     if freezes:
