@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -247,3 +249,12 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
 def test_what_does_not_fit_is_refused_by_name(call: object, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         call()  # type: ignore[operator]
+
+
+def test_recordings_with_different_numbers_of_channels_are_reported() -> None:
+    first, second = (responses_of([1.0, 2.0], start_min=minute) for minute in (0.0, 10.0))
+    assert "other-channels" not in {finding.name for finding in fit_timeline([first, second]).findings}
+    timeline = fit_timeline([first, replace(second, n_channels=1 + first.n_channels)])
+    (found,) = (finding for finding in timeline.findings if finding.name == "other-channels")
+    assert (found.severity, found.value) == ("warning", 1.0)
+    assert f"have {first.n_channels} to {1 + first.n_channels} channels" in found.message

@@ -179,6 +179,13 @@ def fit_timeline(
     )
     if kind == "memory" and first.is_blocked:
         findings += (_MEMORY_OF_BLOCKS,)
+    n_channels = [responses.n_channels for responses in ordered]
+    if (fewest := min(n_channels)) < (most := max(n_channels)):
+        message = (
+            f"the recordings have {fewest:,} to {most:,} channels: a response is the mean over all channels, so use "
+            "recordings of one culture with the same channels"
+        )
+        findings += (Finding("other-channels", "warning", message, float(most - fewest)),)
     how = {
         "kind": kind,
         "bins": bins if kind == "histogram" else None,
