@@ -254,13 +254,13 @@ def test_the_verdict_says_which_controls_are_not_outperformed_and_what_a_gap_may
     assert verdict(0.02, 0.6, high).startswith("the policies do not outperform these controls: random (p = 0.02; ")
     at = float(policies.predicted.mean())
     assert verdict(0.001, 0.9, at).endswith("larger in at least 90 % of the pairs of episodes)")
-    looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, mean"
+    looked = "a different presentation, few responses, late pulses, bursts, a trend over the session, memory, "
     for measured, less in ((at - 1e3, "less"), (at + 1e3, "more")):
         unexplained = (
             f"; their measured return is 1000.0 {less} than predicted, and nothing in the session's data explains it "
             "(looked for: "
         )
-        assert f"{unexplained}{looked} commands)" in verdict(0.001, 0.9, measured)
+        assert f"{unexplained}{looked}repetition, mean commands)" in verdict(0.001, 0.9, measured)
     uncertain = replace(gap, rows=(replace(policies, measured=np.tile([at - 60, at + 20], 5)), *gap.rows[1:]))
     assert uncertain.verdict().endswith(
         "; their measured return is 20.0 less than predicted, within the uncertainty due to the number of responses in "
