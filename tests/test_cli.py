@@ -40,6 +40,7 @@ from animat.training.settings import SAC
 from animat.watch.training import TrainingView
 from rig_files import event_table, mapping_table, spike_table, write_maxwell
 from synthetic_recordings import write_synthetic_series
+from test_evaluation import WITHOUT_NEURONS
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -618,6 +619,11 @@ BAD = {
         lambda folder, *_: (folder / "training.json").write_text('{"training": [1], "fingerprint": "x"}'),
         ["train", "cartpole", "--mapping", "none", "--iterations", "6000", "--out", "{folder}"],
         ["expected a folder of this training, got one of another (training: [1] there, {{'"],
+    ),
+    "recordings for policies without neurons": (
+        lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
+        ["evaluate", "{folder}", "--recordings", "{recordings}"],
+        ["--recordings: expected none for policies without neurons, got {recordings}"],
     ),
     "zero sessions": (
         nothing,

@@ -82,7 +82,11 @@ class SimulatorOptions(ResponseOptions):
     def timeline_for(self, policies: Mapping[str, Policy], recordings: Sequence[Path]) -> SimulatorTimeline | None:
         """Simulators as in the training of the first policy with a mapping; None if no policy has one."""
         trained = next((policy for policy in policies.values() if policy.mapping is not None), None)
-        return None if trained is None else self.timeline(recordings, trained)
+        if trained is not None:
+            return self.timeline(recordings, trained)
+        if recordings:
+            raise InvalidArgument(f"--recordings: expected none for policies without neurons, got {recordings[0]}")
+        return None
 
 
 def simulator_settings(
