@@ -60,7 +60,7 @@ class AdjustedRanks:
         return np.asarray(_ranks(self.sorted_hz, read_hz[None])[0] - np.array([came.trace, came.load]) @ self.slopes)
 
     def of_responses(self, responses: Responses) -> Float64[np.ndarray, "responses readouts"]:
-        """y of other responses, with the times of all their trials."""
+        """y of other responses; raises UnusableData if the times of their trials are not known."""
         presented, place = responses.presentations
         if presented.time_s is None:
             raise UnusableData("responses.presented.time_s: expected the times of all trials, got none")
