@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.recordings.formats.nwb import recording_name, write_nwb
-from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.array import MAXONE
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli

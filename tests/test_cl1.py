@@ -21,7 +21,7 @@ from animat.cultures.same_culture import other_culture
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.recordings.formats.stimulus_text import parse_line
-from animat.recordings.recording import RecordedCulture
+from animat.recordings.recorded_culture import RecordedCulture, names_in
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import BALANCED_PULSE, Phase, Pulse
 from animat.stimulation.stimulus import Stimulus
@@ -83,8 +83,9 @@ def test_another_chip_rig_or_kind_of_culture_is_reported(monkeypatch: pytest.Mon
     def message(kind: RecordedCulture | None = recording.culture, **words: str) -> str | None:
         monkeypatch.setattr(sys.modules["cl"], "get_system_attributes", lambda: names)
         with CL1Culture() as culture:
-            changed = replace(recording, provenance={**recording.provenance, **words}, culture=kind)
-            found = other_culture(changed, culture)
+            provenance = {**recording.provenance, **words}
+            known = None if kind is None else replace(kind, names=names_in(provenance))
+            found = other_culture(replace(recording, provenance=provenance, culture=known), culture)
         return None if found is None else found.message
 
     assert message() is message(cell_batch_id="7") is None

@@ -45,7 +45,8 @@ from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
 from animat.recordings.findings import Finding, warnings_once
 from animat.recordings.formats.nwb import write_nwb
-from animat.recordings.recording import RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Recording
 from animat.responses.condition import Condition
 from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
@@ -412,7 +413,11 @@ def test_a_prediction_without_the_cultures_memory_is_reported(tmp_path: Path, se
         assert len(warnings) == warned
         assert all("66 %" in message and "--simulator memory" in message for message in warnings)
         assert not any(f.name == "other-simulator" for f in gap.findings)
-    trained = {"simulators": {"kind": "empirical", "bins": None, "range_hz": None}}
+    trained = {
+        "simulators": {"kind": "empirical", "bins": None, "range_hz": None},
+        "culture": {"kind": "virtual", "seed": 1},
+    }
+    found = [replace(each, culture=RecordedCulture("virtual", 2)) for each in found]
     with FakeCulture() as culture:
         policy = policy_of(0, series, provenance=trained)
         gap = run_policies(
@@ -420,6 +425,8 @@ def test_a_prediction_without_the_cultures_memory_is_reported(tmp_path: Path, se
         )
     (other,) = (f.message for f in gap.findings if f.name == "other-simulator")
     assert "kind empirical, here memory" in other
+    (other,) = (f.message for f in gap.findings if f.name == "other-culture")
+    assert "trained on recordings of virtual culture 1, but these are of virtual culture 2" in other
     with pytest.raises(Mismatch, match="the same fitted as p"):
         check_policies({"p": policy, "q": policy_of(0, series)})
     for name, other in (("percentiles", "first"), ("delivery", "shuffled")):

@@ -12,7 +12,8 @@ from animat.errors import InvalidArgument, UnusableData
 from animat.recordings.findings import Finding, merged
 from animat.recordings.metadata import from_metadata, to_metadata
 from animat.recordings.quality import recording_findings
-from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import PAPER, Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN

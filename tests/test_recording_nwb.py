@@ -19,7 +19,8 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.hdf5_formats import read_hdf5
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
 from animat.tables import UNKNOWN

@@ -135,7 +135,8 @@ def _run(arguments: list[str]) -> int:
 
         print(json.dumps(as_json(results)))
     # Some of several files could not be read or used; messages have already named them.
-    return 1 if results.get("unreadable") or results.get("unusable") else 0
+    is_refused = any(finding["severity"] == "refuse" for finding in results.get("together", ()))
+    return 1 if results.get("unreadable") or results.get("unusable") or is_refused else 0
 
 
 def _message(command: Command, error: BaseException) -> str | None:

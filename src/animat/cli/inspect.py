@@ -39,10 +39,11 @@ class Inspect(ResponseOptions):
 
     def run(self) -> dict[str, Any]:
         from animat.recordings.reading import list_recordings, read_source
-        from animat.report.inspection import draw_inspection, expect_unique_stems, inspection_text
+        from animat.report.inspection import draw_inspection, expect_unique_stems, finding_lines, inspection_text
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.inspection import inspect_recording
+        from animat.responses.quality.one_culture import series_findings
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
         from animat.robots.registry import robot_named
 
@@ -91,9 +92,13 @@ class Inspect(ResponseOptions):
                     figures = [str(figure) for figure in draw_inspection(source, inspection, self.out, self.format)]
                     print(f"figures: {', '.join(figures)}\n")
                     inspected[-1]["figures"] = figures
-                    series.append((file, inspection.responses))
+                series.append((file, inspection.responses))
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
+            together = list(series_findings([responses for _, responses in series]))
+            if together:
+                print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")
+            results["together"] = [finding.to_dict() for finding in together]
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")
                 results |= self._draw_series(series, self.out)

@@ -20,7 +20,8 @@ from animat.cultures.request import Request, plain_duration
 from animat.cultures.safety import SIMULATED_LIMITS, Admitted, Limits
 from animat.errors import AnimatError, InvalidArgument, expect_kind, some_of
 from animat.progress import Progress, Silent
-from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.places import electrodes_of
 from animat.stimulation.plain import number, seconds
 from animat.stimulation.protocol import Protocol

@@ -12,7 +12,8 @@ from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_at_least, in_min
-from animat.recordings.recording import Channels, RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels, Recording
 from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.stimulus import Stimulus, is_last_of
 from animat.tables import UNKNOWN

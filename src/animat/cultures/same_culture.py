@@ -8,9 +8,6 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.tables import UNKNOWN
 
-_NAMES = ("system_id", "chip_id", "cell_batch_id")
-"""Keys in the provenance by which a device identifies itself and what is on it."""
-
 
 def other_culture(recording: Recording, culture: Culture) -> Finding | None:
     """A warning where an open culture is not the recorded one; None where it is, or where that cannot be known.
@@ -25,10 +22,10 @@ def other_culture(recording: Recording, culture: Culture) -> Finding | None:
         return None
     if isinstance(culture, VirtualCulture):
         message = _other_virtual(recording, culture)
-    elif here and there and (there.kind, there.is_simulated) != (here.kind, here.is_simulated):
-        message = _another(f"of a {there}", f"a {here}")
+    elif here and there and (difference := there.difference(here)):
+        message = _another(f"of {difference[0]}", difference[1])
     else:
-        message = _other_device(recording, culture)
+        message = _restarted(recording, culture)
     before_min = recording.start_min + recording.duration_s / 60 - culture.now_s / 60
     return Finding("other-culture", "warning", message, before_min if before_min > 0 else None) if message else None
 
@@ -55,11 +52,7 @@ def _other_virtual(recording: Recording, culture: VirtualCulture) -> str:
     return ""
 
 
-def _other_device(recording: Recording, culture: Culture) -> str:
-    here, there = culture.provenance, recording.provenance
-    for name in _NAMES:
-        if name in there and name in here and there[name] != here[name]:
-            return _another(f"of {name} {there[name]}", f"{name} {here[name]}")
+def _restarted(recording: Recording, culture: Culture) -> str:
     now_min, start_min = culture.now_s / 60, recording.start_min
     if culture.name == "cl1" and now_min < start_min + recording.duration_s / 60:
         return (

@@ -18,7 +18,8 @@ from animat.cultures.visibility import Visibility
 from animat.errors import InvalidArgument, Mismatch, expect_at_least
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
-from animat.recordings.recording import Channels, RecordedCulture
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels
 from animat.stimulation.array import MAXONE
 from animat.stimulation.plain import whole_number
 from animat.stimulation.pulse import PUBLISHED_PULSE

@@ -8,6 +8,7 @@ from typing import Any
 from animat.errors import Mismatch, in_min, some_of
 from animat.neurons.timeline import SimulatorTimeline
 from animat.recordings.findings import Finding
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.readouts import Readouts
 from animat.stimulation.protocol import Presentation
@@ -77,6 +78,16 @@ def _or_default(value: Any) -> Any:
 _LABELS = {"by": "conditions", "burst_threshold": "burst threshold", "range_hz": "range (Hz)"}
 
 
+def other_culture(trained: RecordedCulture | None, given: RecordedCulture | None) -> Iterator[Finding]:
+    """A warning if recordings are not of the culture that was recorded for the policies' training."""
+    if trained and given and (difference := trained.difference(given)):
+        message = (
+            f"the policies were trained on recordings of {difference[0]}, but these are of {difference[1]}: another "
+            "culture responds differently"
+        )
+        yield Finding("other-culture", "warning", message)
+
+
 def old_calibration(recorded_at_min: float, culture_min: float) -> Iterator[Finding]:
     """A warning if the predicting recording is old at the time of the culture or its newest recording."""
     age_min = culture_min - recorded_at_min
@@ -129,6 +140,7 @@ def timeline_differences(policy: Policy, timeline: SimulatorTimeline) -> tuple[F
         message = f"the policies were trained on responses {trained}, but these are {these}"
         findings.append(Finding("other-window", "warning", message))
     findings += other_simulator(policy.fitted, timeline.fitted)
+    findings += other_culture(policy.culture, timeline.culture)
     first_min = next(iter(policy.recorded_at_min), None)
     if policy.percentiles == "first" and first_min not in (None, float(timeline.start_min[0])):
         message = (

@@ -21,7 +21,10 @@ from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, stacked, to_jax
 from animat.recordings.findings import Finding
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.records import read_record
 from animat.responses.condition import Condition, stimulus_mismatch
+from animat.responses.quality.one_culture import series_findings
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
@@ -59,6 +62,7 @@ class SimulatorTimeline:
         findings: on the recordings and the fits, each beginning with the minute.
         responses: to which the simulators were fitted; empty if they come from elsewhere.
         readouts: that they answer for, the same in every recording.
+        culture: that was recorded; None if it is not known.
     """
 
     __repr__ = briefly
@@ -73,6 +77,7 @@ class SimulatorTimeline:
     fitted: dict[str, Any] = field(default_factory=dict)
     responses: tuple[Responses, ...] = ()
     readouts: Readouts = ALL
+    culture: RecordedCulture | None = None
 
     def __len__(self) -> int:
         return len(self.start_min)
@@ -179,13 +184,7 @@ def fit_timeline(
     )
     if kind == "memory" and first.is_blocked:
         findings += (_MEMORY_OF_BLOCKS,)
-    n_channels = [responses.n_channels for responses in ordered]
-    if (fewest := min(n_channels)) < (most := max(n_channels)):
-        message = (
-            f"the recordings have {fewest:,} to {most:,} channels: a response is the mean over all channels, so use "
-            "recordings of one culture with the same channels"
-        )
-        findings += (Finding("other-channels", "warning", message, float(most - fewest)),)
+    findings += tuple(series_findings(ordered))
     how = {
         "kind": kind,
         "bins": bins if kind == "histogram" else None,
@@ -196,7 +195,10 @@ def fit_timeline(
     }
     simulators = jax.tree.map(lambda *leaves: stacked(leaves), *fitted)
     same = first.conditions, first.window_ms, first.presentation
-    return SimulatorTimeline(simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts)
+    culture = next((responses.culture for responses in ordered if responses.culture), None)
+    return SimulatorTimeline(
+        simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts, culture
+    )
 
 
 def _words(value: object) -> str:
@@ -219,6 +221,7 @@ def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:
         "n_above_range": [kept.n_above_range for kept in timeline.fidelities],
         "findings": [asdict(finding) for finding in timeline.findings],
         "fitted": timeline.fitted,
+        "culture": None if timeline.culture is None else asdict(timeline.culture),
         **({} if timeline.readouts.are_all else {"readouts": timeline.readouts.to_dict()}),
     }
     return write_whole(path, save(arrays, metadata={"animat": json.dumps(metadata, sort_keys=True)}))
@@ -245,6 +248,8 @@ def load_timeline(path: Path) -> SimulatorTimeline:
             findings=tuple(Finding.from_dict(each) for each in metadata["findings"]),
             fitted=metadata["fitted"],
             readouts=readouts,
+            # Older files do not state it.
+            culture=read_record(RecordedCulture, stated, "culture") if (stated := metadata.get("culture")) else None,
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError, AnimatError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else error

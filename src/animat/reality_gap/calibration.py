@@ -18,6 +18,7 @@ from animat.neurons.simulator import NeuronSimulator
 from animat.neurons.timeline import fit_timeline, room_for
 from animat.reality_gap.rereading import reread
 from animat.recordings.findings import Finding
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
 from animat.responses.median_drift import MedianDrift, median_drift
 from animat.responses.readouts import ALL, Readouts
@@ -44,6 +45,7 @@ class Calibration:
         start_min: of the recording on the culture's clock.
         fitted: how the simulators were fitted, as in `Policy.fitted`.
         adjusted: its responses, from which adaptive thresholds start.
+        culture: that was recorded; None if it is not known.
     """
 
     adaptive: bool
@@ -60,6 +62,7 @@ class Calibration:
     fitted: dict[str, Any]
     adjusted: AdjustedRanks
     readouts: Readouts = ALL
+    culture: RecordedCulture | None = None
 
     @property
     def responses_hz(self) -> tuple[Float64[np.ndarray, "responses *readouts"], ...]:
@@ -135,6 +138,7 @@ class Calibration:
             fitted={name: timeline.fitted[name] for name in FITTED},
             readouts=timeline.readouts,
             adjusted=adjusted,
+            culture=timeline.culture,
         )
         if adaptive or policy is None or policy.percentiles != "first":
             return calibration

@@ -30,6 +30,7 @@ from animat.evaluation.transfer import (
     no_memory,
     old_calibration,
     other_calibration,
+    other_culture,
     other_simulator,
 )
 from animat.evaluation.verdict import compare_episodes
@@ -245,6 +246,7 @@ def _warnings(first: Policy, loop: Loop, calibration: Calibration, now_min: floa
         )
         yield Finding("moving-percentiles", "warning", message)
     yield from other_simulator(first.fitted, calibration.fitted)
+    yield from other_culture(first.culture, calibration.culture)
     yield from old_calibration(calibration.start_min, now_min)
     yield from no_memory(calibration.findings, calibration.presentation, has_memory=calibration.simulator.has_memory)
     if isinstance(loop.robot, HostRobot):

@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding, merged
 from animat.recordings.gaps import late_start
+from animat.recordings.metadata import culture_of
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -93,6 +94,7 @@ class PlainColumns:
             start_min=float(self.start_min),
             presentation=presentation,
             provenance={**provenance, **names},
+            culture=culture_of(provenance),
             findings=merged(noted),
         )
 

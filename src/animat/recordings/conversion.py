@@ -19,6 +19,7 @@ from animat.recordings.findings import Finding, merged
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.formats.with_spikeinterface import open_with_spikeinterface
+from animat.recordings.metadata import culture_of
 from animat.recordings.raw import RawTraces
 from animat.recordings.reading import HDF5, TEXT_NAMES, ZIP, first_bytes, read_recording
 from animat.recordings.recording import Recording
@@ -145,7 +146,8 @@ def convert_recording(
     # The sex of a subject is unknown unless stated.
     default = {"sex": "U"} if "subject_id" in given else {}
     start_min = recording.start_min if start_min is None else start_min
-    recording = replace(recording, provenance={**default, **recording.provenance, **given}, start_min=float(start_min))
+    provenance = {**default, **recording.provenance, **given}
+    recording = replace(recording, provenance=provenance, culture=culture_of(provenance), start_min=float(start_min))
     recording = replace(recording, findings=(*recording.findings, *_without_zone(recording)))
     write_nwb(recording, out)
     return recording

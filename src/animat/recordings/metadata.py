@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, get_args
 
 from animat.errors import InvalidArgument
 from animat.recordings.findings import Finding, Severity
-from animat.recordings.recording import RecordedCulture, Recording
+from animat.recordings.recorded_culture import RecordedCulture, names_in
+from animat.recordings.recording import Recording
 from animat.records import json_data, read_record
 from animat.stimulation.protocol import Protocol
 
@@ -25,7 +27,7 @@ def to_metadata(recording: Recording) -> dict[str, str]:
     metadata = dict(recording.provenance)
     if reserved := [key for key in metadata if key in ("protocol", _VALUES) or _is_finding(key)]:
         raise InvalidArgument(f"provenance: expected no key of a file's protocol or findings, got {reserved[0]!r}")
-    if (culture := _culture_of(metadata)) != recording.culture:
+    if _nameless(culture := culture_of(metadata)) != _nameless(recording.culture):
         raise InvalidArgument(f"culture: expected {culture!r} by the provenance's source, got {recording.culture!r}")
     if recording.protocol is not None:
         metadata["protocol"] = recording.protocol.to_json()
@@ -51,8 +53,13 @@ def from_metadata(metadata: Mapping[str, str]) -> dict[str, Any]:
             findings.append(Finding(name, severity, text, values.get(key)))  # type: ignore[arg-type]
         elif key != _VALUES:
             provenance[key] = text
-    culture = _culture_of(metadata)
+    culture = culture_of(metadata)
     return {"provenance": provenance, "protocol": protocol, "culture": culture, "findings": tuple(findings)}
+
+
+def _nameless(culture: RecordedCulture | None) -> RecordedCulture | None:
+    """A culture without its names, which may have been added to the provenance since it was read."""
+    return None if culture is None or culture.kind is None else replace(culture, names=())
 
 
 def _is_finding(key: str) -> bool:
@@ -74,12 +81,13 @@ _OURS = " by animat.cultures."
 """In the source of animat's own recordings; the source of any other is the name of its file, which may begin alike."""
 
 
-def _culture_of(metadata: Mapping[str, str]) -> RecordedCulture | None:
-    source = metadata.get("source", "")
+def culture_of(metadata: Mapping[str, str]) -> RecordedCulture | None:
+    """The culture that a file's provenance states; None if it states nothing."""
+    source, names = metadata.get("source", ""), names_in(metadata)
     for beginning, (kind, key) in _KINDS.items():
         if source.startswith(beginning):
             seed = metadata.get(key, "")
             known = int(seed) if seed.isdecimal() and len(seed) <= 20 else None
             if known is not None or _OURS in source:
-                return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source)
-    return None
+                return RecordedCulture(kind, known, kind == "cl1" and "simulator" in source, names)
+    return RecordedCulture(names=names) if names else None

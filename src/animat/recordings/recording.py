@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.protocol import Presentation, Protocol
 from animat.stimulation.stimulus import Stimuli
@@ -62,35 +63,6 @@ class Channels:
     def has_positions(self) -> bool:
         """Whether every channel's position is known."""
         return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
-
-
-_CULTURES = {
-    "virtual": "virtual culture",
-    "replay": "replay of recordings",
-    "cl1": "CL1",
-    "maxone": "MaxOne",
-    "synthetic": "synthetic culture",
-}
-
-
-@dataclass(frozen=True)
-class RecordedCulture:
-    """The culture that was recorded.
-
-    Attributes:
-        kind: as `animat.cultures.kinds` names it.
-        seed: of a virtual culture, or of a CL1's patterns; None if there is none, or it is not known.
-        is_simulated: whether a simulator stands in for the device, as the CL1's SDK has one.
-    """
-
-    kind: str
-    seed: int | None = None
-    is_simulated: bool = False
-
-    def __str__(self) -> str:
-        """As messages name its kind."""
-        name = _CULTURES.get(self.kind, self.kind)
-        return f"{name} (the SDK's simulator)" if self.is_simulated else name
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,7 @@ class ResponseTable:
         presentation: how stimuli were presented, None if not known.
         provenance: where the table came from, as text by keyword, for people.
         findings: made when it was read.
-        protocol: None, as files do not state it.
+        protocol, culture: None, as files do not state them.
 
     Raises:
         UnusableData: for values that are negative or not finite, counts that are not whole, or tables of the wrong
@@ -54,6 +54,7 @@ class ResponseTable:
     provenance: Mapping[str, str] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     protocol: ClassVar[None] = None
+    culture: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))

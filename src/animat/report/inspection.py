@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from animat.errors import InvalidArgument, Mismatch, counted
+from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.report.array import draw_array
@@ -58,8 +59,13 @@ def inspection_text(inspection: Inspection) -> str:
         )
         lines += ["", *_table(inspection)]
     if inspection.findings:
-        lines += ["", *(f"  {_MARK[finding.severity]} {finding.message}" for finding in inspection.findings)]
+        lines += ["", *finding_lines(inspection.findings)]
     return "\n".join(lines)
+
+
+def finding_lines(findings: Sequence[Finding]) -> list[str]:
+    """A line for each finding, with a mark for its severity."""
+    return [f"  {_MARK[finding.severity]} {finding.message}" for finding in findings]
 
 
 def _spontaneous(inspection: Inspection, bursts: NetworkBursts) -> list[str]:

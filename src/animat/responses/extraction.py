@@ -111,6 +111,8 @@ def extract_responses(
         place=np.flatnonzero(chosen),
         by=str(by),
         burst_threshold=burst_threshold,
+        culture=source.culture,
+        channels=source.channels,
         readouts=readouts,
         readout_hz=readout_hz,
     )

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from animat.errors import Mismatch
 from animat.recordings.findings import Finding
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels
 from animat.responses.condition import Condition
 from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
@@ -65,6 +67,8 @@ class Responses:
         place: the index of each response among them, shape (responses,).
         by: the rule that sorted stimuli into conditions, as `conditions_named` reads it; None if it is not known.
         burst_threshold: the given threshold; None: it is Otsu's.
+        culture: that was recorded; None if it is not known.
+        channels: those over which x is a mean; None if they are not known.
         readouts: the groups of channels read; by default all channels as one.
         readout_hz: x of each readout, shape (responses, readouts), or (responses,) for one; None for all channels as
             one, whose x is `rate_hz`.
@@ -92,6 +96,8 @@ class Responses:
     place: Int64[np.ndarray, " responses"] | None = None
     by: str | None = None
     burst_threshold: float | None = None
+    culture: RecordedCulture | None = None
+    channels: Channels | None = None
     readouts: Readouts = ALL
     readout_hz: Float64[np.ndarray, "responses *readouts"] | None = None
 

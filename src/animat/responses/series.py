@@ -10,6 +10,7 @@ from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.conditions import Conditions, conditions_named
 from animat.responses.extraction import extract_responses
+from animat.responses.quality.one_culture import series_findings
 from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses
 from animat.responses.windows import DEFAULT_WINDOW_MS
@@ -53,8 +54,8 @@ def extract_series(
             first one.
 
     Raises:
-        UnusableData: if a finding refuses a recording, or simulated recordings have different seeds, unless `allow`
-            names it.
+        UnusableData: if a finding refuses a recording, or recordings are of different cultures, unless `allow` names
+            it.
         InvalidArgument: for conditions that cannot be read, a name in `allow` that is not a refusing finding, or
             channels that do not form readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
@@ -64,13 +65,6 @@ def extract_series(
     check_allowed(allow)
     by = by if by is None or isinstance(by, Conditions) else conditions_named(by)
     window_ms = DEFAULT_WINDOW_MS if window_ms is None else window_ms
-    cultures = [each.culture for each in recordings if isinstance(each, Recording)]
-    seeds = {str(culture.seed) for culture in cultures if culture and culture.kind in ("virtual", "synthetic")}
-    if len(seeds) > 1 and "several-cultures" not in allow:
-        raise UnusableData(
-            f"recordings: expected those of one culture, got simulated ones with seeds {', '.join(sorted(seeds))}; "
-            "leave out all but one culture's (to allow it: --allow several-cultures)"
-        )
     series = []
     for recording in recordings:
         try:
@@ -86,6 +80,9 @@ def extract_series(
                     remedy = ""
                 raise UnusableData(f"the recording at {in_min(recording.start_min)}: {finding.message}{remedy}")
         series.append(responses)
+    for finding in series_findings(series):
+        if finding.severity == "refuse" and finding.name not in allow:
+            raise UnusableData(f"recordings: {finding.message} (to allow it: --allow {finding.name})")
     return series
 
 

@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ MANIFEST = "training.json"
 TABLE = "assessments.csv"
 _INFORMATIVE = ("sources", "random_return")
 """Entries of a description that do not determine the policies."""
-_NOT_REPORTED = ("fingerprint", *_INFORMATIVE, "burst_thresholds")
+_NOT_REPORTED = ("fingerprint", "culture", *_INFORMATIVE, "burst_thresholds")
 """Entries not reported as the difference between two trainings: they differ with the responses."""
 _FIRST = ("training", "robot")
 """Entries reported first: what follows from the robot, such as the default iterations, is not the cause."""
@@ -87,9 +87,10 @@ def describe(
     }
     leaves = jax.tree.leaves(timeline.simulators if timeline else ())
     manifest = with_fingerprint(decisive, *(np.ascontiguousarray(leaf).tobytes() for leaf in leaves))
+    culture = {} if timeline is None or timeline.culture is None else {"culture": asdict(timeline.culture)}
     # File names do not count: the same recordings in another place are the same.
     informative = {"sources": list(sources), **({} if random_return is None else {"random_return": random_return})}
-    return manifest | informative
+    return manifest | culture | informative
 
 
 def versions_of(names: Iterable[str], robots: Iterable[Robot[Any]] = (), device: str | None = None) -> dict[str, str]:
@@ -118,7 +119,7 @@ def expect_folder_for(training: Training, folder: Path) -> None:
     """Refuse a folder of another training by its settings, as `train` does, before any recording is read."""
     if (stored := _stored_description(folder)) is not None:
         as_long_as_recordings = training.duration_min is None and training.mapping is not None
-        unknown = ("simulators", *_INFORMATIVE, "fingerprint", "device", *["duration_min"] * as_long_as_recordings)
+        unknown = ("simulators", *_NOT_REPORTED, "device", *["duration_min"] * as_long_as_recordings)
         if difference := first_difference(stored, describe(training, None), ignoring=unknown, first=_FIRST):
             raise folder_mismatch(folder, "training", difference)
 

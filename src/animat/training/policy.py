@@ -23,6 +23,7 @@ from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, i
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.records import Flag, Number, json_data, read_record
 from animat.responses.condition import Condition, abbreviated, stimulus_mismatch
 from animat.responses.readouts import ALL, Readouts
@@ -174,6 +175,12 @@ class Policy:
     def recorded_at_min(self) -> tuple[float, ...]:
         """The minutes of the recordings from which those simulators were made; empty if unknown."""
         return tuple((self.provenance.get("simulators") or {}).get("recorded_at_min", ()))
+
+    @property
+    def culture(self) -> RecordedCulture | None:
+        """The culture that was recorded for its training; None if it is not known."""
+        stated = self.provenance.get("culture")
+        return None if stated is None else read_record(RecordedCulture, stated, "provenance.culture")
 
     @property
     def _trained(self) -> Dict[str, Any]:

@@ -8,6 +8,7 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from animat.errors import InvalidArgument
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.records import Flag, Number, Positive, Share, Whole, read_record
 
 Count = Annotated[Whole, Field(ge=1, le=10**9)]
@@ -39,6 +40,7 @@ class Provenance(TypedDict, total=False):
 
     training: TrainingProvenance | None
     simulators: SimulatorProvenance | None
+    culture: RecordedCulture | None
 
 
 def expect_provenance(provenance: Any) -> None:

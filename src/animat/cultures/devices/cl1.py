@@ -21,8 +21,9 @@ from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Guard, Limits
 from animat.errors import AnimatError, DeviceFailed, InvalidArgument
 from animat.extras import install_command
-from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
-from animat.recordings.recording import Channels, RecordedCulture
+from animat.recordings.formats.cl1_layout import CHANNELS, IDENTIFIERS, NO_STIMULATION, SITES, STIMULUS_STREAM
+from animat.recordings.recorded_culture import RecordedCulture, names_in
+from animat.recordings.recording import Channels
 from animat.stimulation.array import ElectrodeArray
 from animat.stimulation.patterns import draw_patterns
 from animat.stimulation.pulse import Phase, Pulse
@@ -149,24 +150,27 @@ class CL1Culture(Culture):
 
     @property
     def recorded_as(self) -> RecordedCulture:
-        """The kind, with the seed of its patterns if they were drawn."""
+        """The kind, with the seed of its patterns if they were drawn, and the device's own identifiers."""
         with as_device_failure("CL1", "report what it is"):
-            return RecordedCulture("cl1", self._seed, bool(while_open(self._session).cl.is_simulator()))
+            is_simulated = bool(while_open(self._session).cl.is_simulator())
+        return RecordedCulture("cl1", self._seed, is_simulated, names_in(self._identifiers()))
 
     @property
     def provenance(self) -> dict[str, str]:
         """The device's own identifiers, and whether it is a simulator."""
-        with as_device_failure("CL1", "identify itself"):
-            attributes = while_open(self._session).cl.get_system_attributes()
         kind = "the SDK's simulator" if self.recorded_as.is_simulated else "device"
-        names = ("system_id", "chip_id", "cell_batch_id", "project_id")
         return {
             # As in existing recordings, though the module has moved: a series continues only if this text stays.
             "source": f"CL1 ({kind}) by animat.cultures.cl1",
             "ticks_per_s": str(self._ticks_per_s),
             "pattern_seed": "none: they were given" if self._seed is None else str(self._seed),
-            **{name: str(attributes[name]) for name in names if name in attributes},
+            **self._identifiers(),
         }
+
+    def _identifiers(self) -> dict[str, str]:
+        with as_device_failure("CL1", "identify itself"):
+            attributes = while_open(self._session).cl.get_system_attributes()
+        return {name: str(attributes[name]) for name in IDENTIFIERS if name in attributes}
 
     @property
     def left_out(self) -> dict[str, int]:

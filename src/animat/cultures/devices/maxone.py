@@ -24,7 +24,8 @@ from animat.cultures.holding import of_the_machine
 from animat.cultures.observed import Observed, observed_in_frames
 from animat.cultures.safety import Admitted, Guard, Limits
 from animat.errors import DeviceFailed, InvalidArgument
-from animat.recordings.recording import Channels, RecordedCulture
+from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recording import Channels
 from animat.stimulation.selection import Selection
 from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN

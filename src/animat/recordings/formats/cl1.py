@@ -9,7 +9,7 @@ import numpy as np
 from animat.errors import InvalidFile
 from animat.recordings.columns import Column, PlainColumns, recorded_span
 from animat.recordings.findings import Finding
-from animat.recordings.formats.cl1_layout import CHANNELS, NO_STIMULATION, SITES, STIMULUS_STREAM
+from animat.recordings.formats.cl1_layout import CHANNELS, IDENTIFIERS, NO_STIMULATION, SITES, STAND_IN, STIMULUS_STREAM
 from animat.recordings.formats.hdf5 import Hdf5File, is_positive
 from animat.recordings.formats.stimulus_text import LONGEST, stimulus_columns
 from animat.recordings.recording import Recording
@@ -63,9 +63,10 @@ def read_cl1(file: Hdf5File, *, spikes: bool = True) -> Recording:
     if isinstance(frames, int) and frames > 0:
         columns |= recorded_span(frames, rate_hz, spike_time_s, stimulus_time_s)
     provenance = {"source": file.path.name, "format": "CL1"}
-    created = file.attribute("/", "created_utc")
-    if isinstance(created, str) and created and created.isprintable():
-        provenance["recorded_at"] = created
+    for name, key in {"created_utc": "recorded_at", **{name: name for name in IDENTIFIERS}}.items():
+        text = file.attribute("/", name)
+        if isinstance(text, str) and text and text.isprintable() and text != STAND_IN:
+            provenance[key] = text
     return PlainColumns(
         spike_time_s=spike_time_s,
         spike_channel=channel[on_electrode],

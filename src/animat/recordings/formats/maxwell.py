@@ -133,6 +133,12 @@ def _new(file: Hdf5File, part: str | None) -> _Layout:
             layout.findings.append(Finding("frames-lost", severity, message, float(lost)))
     if len(recordings) > 1:
         layout.provenance["part"] = name
+    # Only the number of a well tells the cultures of one plate apart.
+    if (well := name.partition("/")[0]).startswith("well"):
+        layout.provenance["well"] = well
+    chip = file.first("wellplate/id")
+    if isinstance(chip, str) and chip and chip.isprintable():
+        layout.provenance["chip_id"] = chip
     started_ms = file.first(f"{at}/start_time")
     if is_positive(started_ms) and started_ms < 4e12:
         date = datetime.fromtimestamp(started_ms / 1e3, UTC)

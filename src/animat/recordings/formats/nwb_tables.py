@@ -19,6 +19,7 @@ from pynwb.misc import Units
 from animat.errors import InvalidArgument
 from animat.recordings.formats.nwb_layout import FORMAT_VERSION, SUBJECT
 from animat.recordings.metadata import to_metadata
+from animat.recordings.recorded_culture import UNKNOWN_SUBJECT_ID
 from animat.recordings.recording import Channels, Recording
 from animat.stimulation.stimulus import NOTHING, Stimuli
 from animat.tables import UNKNOWN
@@ -27,7 +28,7 @@ UNKNOWN_DATE = "1970-01-01T00:00:00+00:00"
 """NWB requires a date; a recording without `recorded_at` gets this one, which readers recognise as unknown."""
 
 UNKNOWN_SUBJECT = {
-    "subject_id": "unknown",
+    "subject_id": UNKNOWN_SUBJECT_ID,
     "sex": "U",
     "age": "P0D/",
     "description": "neuronal culture; nothing else is known",
