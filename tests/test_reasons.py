@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from animat.neurons.history_tracker import HistoryTracker
 from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.reasons import CHECKS, LEVEL, Evidence, reasons
 from animat.reality_gap.session_responses import CommandSums, SessionResponses
+from animat.recordings.findings import Finding
 from animat.responses.condition import Condition
 from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses, Trials
@@ -237,6 +239,29 @@ def test_commands_of_nine_thresholds_show_what_the_median_alone_does_not() -> No
         # Of the four thresholds above the median, which are P20 to P80 of 80 Hz, lower by 1.5 standard deviations.
         of_each = norm.sf(norm.ppf([0.2, 0.4, 0.6, 0.8]) + 1.5) - [0.8, 0.6, 0.4, 0.2]
         assert of_nine["answers"].value == pytest.approx(2 * of_each.sum() / 9, abs=0.15)
+
+
+def test_commands_that_all_differ_by_little_are_a_reason_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each condition by less than is reported of one alone: thresholds that are too low, or too high."""
+    here = sys.modules[__name__]
+    for name, value in {"RECORDED": 4000, "EPISODES": 100, "EVERY": np.arange(100 * ACTIONS)}.items():
+        monkeypatch.setattr(here, name, value)
+
+    def named(hz: float) -> list[Finding]:
+        """By sessions in which every response is larger."""
+        found = [reasons(session(seed, thresholds=9, rate_hz=lambda _, rate_hz: rate_hz + hz)) for seed in range(20)]
+        # Now and then one condition differs by enough to be named itself.
+        return [finding for of_one in found for finding in of_one if finding.message.startswith("commands are ")]
+
+    # A normal density of the responses to a condition, averaged over one of all responses, whose variance is 4^2 + 2^2.
+    shift = 2 * 0.4 / np.sqrt(2 * np.pi * (4.0**2 + 4.0**2 + 2.0**2))
+    for hz, words in ((0.4, "higher"), (-0.4, "lower")):
+        found = named(hz)
+        assert len(found) >= 16
+        assert all(f"commands are {words} than predicted for the same conditions, by 0.0" in f.message for f in found)
+        assert np.mean([finding.value for finding in found]) == pytest.approx(np.sign(hz) * shift, abs=0.01)
+    # A quarter is not worth a mention, and where there is nothing hardly anything is named.
+    assert len(named(0.1)) <= 3 and len(named(0.0)) <= binom.isf(1e-4, 20, LEVEL)
 
 
 def test_of_two_readouts_the_one_that_differs_is_named() -> None:

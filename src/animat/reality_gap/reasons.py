@@ -30,8 +30,8 @@ LEAST_LATE = 0.05
 LEAST_BURSTS, _FEWEST_BURSTS = 0.05, 5
 LEAST_TREND = 0.1
 """Least change over the session, as a share of a condition's mean response."""
-LEAST_COMMAND = 0.1
-"""Least difference in a condition's mean command."""
+LEAST_COMMAND, LEAST_OFFSET = 0.1, 0.03
+"""Least difference in a condition's mean command, and least mean difference over all conditions."""
 LEAST_REPETITION, _LEAST_SHARE = 0.05, 0.1
 """Least difference in mean rank, and least share of the responses, of a group with alike repetitions."""
 _REPETITIONS = {"after another condition": (0, 0), "after 1 to 4 of the same": (1, 4), "after more": (5, np.inf)}
@@ -156,6 +156,9 @@ def answers(evidence: Evidence) -> Finding | None:
     t = (u - v) / sqrt(s^2 + r^2), with episodes - 1 degrees of freedom; u: the mean command in the session, s its error
     from differences between episodes; v: that on the simulator, r its error from bootstrap simulators. Neither error is
     smaller than that of equally many independent responses, if each were -1 or +1 (Agresti and Coull 1998).
+
+    If no condition differs by itself, the same test is made of all commands together, each less v of its condition: a
+    task that is hard to control can be lost by thresholds that are too low or too high by little.
     """
     from scipy.stats import t as student
 
@@ -166,6 +169,7 @@ def answers(evidence: Evidence) -> Finding | None:
     conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
     responses, names = evidence.session.responses, evidence.session.responses.readouts.names
     tested = [(i, d) for i in conditions.tolist() for d in range(len(names))]
+    level = LEVEL / (len(tested) + len(names)) if tested else LEVEL
     differences, most = [], 0.0
     for i, d in tested:
         n, expected = measured.presented[:, i], float(predicted.commanded.mean[i, d])
@@ -175,7 +179,7 @@ def answers(evidence: Evidence) -> Finding | None:
         expected_error = max(bootstrapped, _variance(expected, len(recorded_hz[i]))) ** 0.5
         difference = mean - expected
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
-        if p < LEVEL / len(tested) and abs(difference) >= LEAST_COMMAND:
+        if p < level and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
             each_hz = responses.read_hz[responses.condition == i], recorded_hz[i]
             measured_hz, usual_hz = (x_hz.reshape(len(x_hz), -1)[:, d].mean() for x_hz in each_hz)
@@ -184,10 +188,37 @@ def answers(evidence: Evidence) -> Finding | None:
                 f"{responses.conditions[i].label}{on} to {mean:+.2f} +- {error:.2f} ({expected:+.2f} +- "
                 f"{expected_error:.2f}; mean {measured_hz:.3g} Hz, {usual_hz:.3g} in the recording)"
             )
-    if not differences:
-        return None
-    message = f"conditions lead to different mean commands than predicted: {', '.join(differences)}"
-    return Finding("answers", "note", message, most)
+    if differences:
+        message = f"conditions lead to different mean commands than predicted: {', '.join(differences)}"
+        return Finding("answers", "note", message, most)
+    return _offset(evidence, conditions, level) if len(conditions) else None
+
+
+def _offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], level: float) -> Finding | None:
+    """The mean difference of all commands from the mean that is predicted for their conditions, on each readout."""
+    from scipy.stats import t as student
+
+    measured, predicted = evidence.session.commanded, evidence.predicted
+    responses, names = evidence.session.responses, evidence.session.responses.readouts.names
+    commands = evidence.session.command.reshape(len(responses), -1)
+    n, episodes = measured.presented[:, conditions], len(measured.presented)
+    shares, recorded = n.sum(axis=0) / n.sum(), [len(evidence.calibration.responses_hz[i]) for i in conditions]
+    of_each = [np.flatnonzero((responses.condition == i) & evidence.session.moved) for i in conditions]
+    message, most = "", 0.0
+    for d, name in enumerate(names):
+        v, bootstrapped = (of.mean[..., conditions, d] for of in (predicted.commanded, predicted.commanded_bootstraps))
+        offset, between = _mean_over((measured.total[:, conditions, d] - n * v).sum(axis=1), n.sum(axis=1))
+        # Bootstrap simulators have percentiles of their own, which keep the mean of all commands in place.
+        independent = np.array([commands[rows, d].var() for rows in of_each]) / recorded
+        error = math.sqrt(between**2 + max(float(np.nanvar(bootstrapped @ shares)), float(shares**2 @ independent)))
+        p = 2 * student.sf(abs(offset) / error, episodes - 1)
+        if p < level and abs(offset) >= max(LEAST_OFFSET, abs(most)):
+            most = offset
+            message = (
+                f"commands{f' on {name}' if len(names) > 1 else ''} are {'higher' if offset > 0 else 'lower'} than "
+                f"predicted for the same conditions, by {abs(offset):.3f} +- {error:.3f} on average"
+            )
+    return Finding("answers", "note", message, most) if message else None
 
 
 def repetition(evidence: Evidence) -> Finding | None:
