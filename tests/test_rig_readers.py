@@ -507,6 +507,38 @@ def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list
     assert recording.stimuli.electrodes.tolist() == read
 
 
+@pytest.mark.parametrize("of_another_table", [False, True])
+def test_electrodes_by_row_of_the_electrodes_table_have_its_numbers(tmp_path: Path, of_another_table: bool) -> None:
+    import pynwb
+    from hdmf.common import DynamicTable
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    device = nwb.create_device(name="d")
+    group = nwb.create_electrode_group(name="g", description="g", location="in vitro", device=device)
+    for electrode in (10, 20, 30):
+        nwb.add_electrode(id=electrode, location="in vitro", group=group, rel_x=0.0, rel_y=0.0)
+    nwb.add_unit(spike_times=[0.5], electrodes=[1])
+    to: DynamicTable = nwb.electrodes
+    if of_another_table:
+        to = DynamicTable(name="sites", description="not on the array", id=[7, 8, 9])
+        nwb.add_scratch(to)
+    table = pynwb.epoch.TimeIntervals(name="stimuli", description="x")
+    table.add_column("electrodes", "pulsed together", index=True, table=to)
+    for i, rows in enumerate(([0], [1, 2], [])):
+        table.add_row(start_time=0.2 * i, stop_time=0.2 * i + 0.1, electrodes=rows)
+    nwb.add_stimulus(table)
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "w") as nwb_io:
+        nwb_io.write(nwb)
+    recording = read_recording(tmp_path / "a.nwb")
+    assert recording.channels.electrode.tolist() == [20]
+    if of_another_table:
+        assert np.all(recording.stimuli.electrodes == UNKNOWN)
+        assert "electrodes" in found(recording)["columns-left-out"]
+    else:
+        assert recording.stimuli.electrodes.tolist() == [[10, UNKNOWN], [20, 30], [UNKNOWN, UNKNOWN]]
+
+
 def test_the_advice_to_choose_names_the_commands_that_can(tmp_path: Path) -> None:
     path = other_nwb(tmp_path / "a.nwb", stimuli=("pulses", "events"))
     with pytest.raises(InvalidFile, match="choose with --stimuli NAME in animat inspect or animat convert"):

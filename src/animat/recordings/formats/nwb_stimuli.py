@@ -13,8 +13,9 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
+from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE
 from animat.recordings.formats.text_table import whole_numbers
-from animat.tables import padded
+from animat.tables import UNKNOWN, padded
 
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")
@@ -115,6 +116,10 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     if dataset.dtype.kind not in "iu":
         return None
     values = file.read(at).astype(np.int64)
+    if file.attribute(at, "neurodata_type") == "DynamicTableRegion":
+        if (numbers := _electrodes_in_rows(file, at, values)) is None:
+            return None
+        values = numbers
     if file.has(f"{at}_index"):
         ends = [0, *file.read(f"{at}_index").astype(np.int64).reshape(-1).tolist()]
         # Stimuli are not refused for an index that does not fit: their electrodes are then unknown.
@@ -123,6 +128,18 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
         flat = values.reshape(-1).tolist()
         return padded([flat[start:end] for start, end in pairwise(ends)])
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
+
+
+def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
+    """The electrodes in rows of the electrodes table that a column refers to; None for those of another table."""
+    table, column = file.node(ELECTRODES_TABLE), file.dataset(at)
+    to = column.attrs.get("table")
+    if not isinstance(to, h5py.Reference) or not to or table is None or file.file[to] != table:
+        return None
+    numbers = file.read(f"{ELECTRODES_TABLE}/id").astype(np.int64).reshape(-1)
+    if np.any((rows < 0) | (rows >= len(numbers))):
+        return None
+    return np.maximum(numbers[rows], UNKNOWN)
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:
