@@ -301,6 +301,49 @@ def test_other_nwb_columns_that_are_not_read_are_named(tmp_path: Path) -> None:
     assert left.message.startswith("unknown columns of /stimulus/presentation/more were left out: stim_freq (did you")
 
 
+@pytest.mark.parametrize(
+    ("column", "values", "read"),
+    [
+        ("condition", [0.5, 0.1, 0.5], ("pattern", [1, 0, 1])),
+        ("condition", np.array([0.5, 0.1, np.nan], np.float32), ("pattern", [1, 0, UNKNOWN])),
+        ("condition", [True, False, True], ("pattern", [1, 0, 1])),
+        ("condition", [3.0, 7.0, np.nan], ("pattern", [3, 7, UNKNOWN])),
+        ("presentation", [4, UNKNOWN, 6], ("presentation", [0, 1, 2])),
+        ("presentation", [4, 4, 6], ("presentation", [4, 4, 6])),
+        ("presentation", [0, 1, 0], None),
+        ("presentation", [0.0, 0.5, 1.0], None),
+        ("frequency", ["5 Hz", "5 Hz", "9 Hz"], None),
+    ],
+)
+def test_other_nwb_columns_with_other_values_than_ours(
+    column: str, values: list[object], read: tuple[str, list[int]] | None, tmp_path: Path
+) -> None:
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    nwb.add_unit(spike_times=[0.1, 0.5, 0.9])
+    table = pynwb.epoch.TimeIntervals(name="stimuli", description="x")
+    table.add_column(column, "of the other program")
+    for i, value in enumerate(values):
+        table.add_row(start_time=0.2 * i, stop_time=0.2 * i + 0.1, **{column: value})
+    nwb.add_stimulus(table)
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "w") as nwb_io:
+        nwb_io.write(nwb)
+    recording = read_recording(tmp_path / "a.nwb")
+    assert recording.stimuli.time_s.tolist() == pytest.approx([0.0, 0.2, 0.4])
+    if read is None:
+        left_out = f"unknown columns of /stimulus/presentation/stimuli were left out: {column} (known, but not with"
+        assert found(recording)["columns-left-out"].startswith(left_out)
+        assert np.isnan(recording.stimuli.frequency_hz).all()
+        assert recording.stimuli.presentation.tolist() == [0, 1, 2]
+    else:
+        assert getattr(recording.stimuli, read[0]).tolist() == read[1]
+        assert "columns-left-out" not in found(recording)
+    if values[0] == 0.5:
+        assert recording.provenance["patterns"] == "0: 0.1, 1: 0.5"
+
+
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
     assert len(recording.channels) == 3

@@ -84,12 +84,12 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
     for column, names in COLUMNS.items():
         for name in names:
             node = file.node(f"{at}/{name}")
-            if isinstance(node, h5py.Dataset) and node.shape == time_s.shape and node.dtype.kind in "iufSO":
-                values = file.read(f"{at}/{name}")
-                if (values.dtype.kind == "U") <= (column == "stimulus_pattern"):
-                    columns[column] = values
-                    used.add(name)
-                    break
+            if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape or node.dtype.kind not in "iufbSO":
+                continue
+            if (values := _values(column, file.read(f"{at}/{name}"), time_s)) is not None:
+                columns[column] = values
+                used.add(name)
+                break
     for name in ELECTRODES:
         if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
             columns["stimulus_electrodes"] = electrodes
@@ -101,6 +101,21 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
         frequency = columns["stimulus_frequency_hz"].astype(np.float64)
         columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
     return columns
+
+
+def _values(column: str, values: Column, time_s: Column) -> Column | None:
+    """The values of a column with a known name, as another program means them; None if they cannot be what it says."""
+    kind = values.dtype.kind
+    is_whole = kind in "iu" or (kind == "f" and not np.any(np.nan_to_num(values) % 1))
+    if column == "stimulus_pattern":
+        # Conditions need not be numbered: fractions (a contrast), true and false are names.
+        return values if is_whole else np.array(["" if value != value else str(value) for value in values])
+    if column == "stimulus_presentation":
+        known = values[np.argsort(time_s, kind="stable")]
+        known = known[(known >= 0) | (known < UNKNOWN)] if is_whole else known
+        # Numbers that start again, as in each block, do not number the trials of a recording.
+        return values if is_whole and not np.any(np.diff(known) < 0) else None
+    return values if kind in "iuf" else None
 
 
 def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
