@@ -146,6 +146,19 @@ def test_other_channels_are_found_by_electrode_and_otherwise_by_label() -> None:
     assert found(replace(nowhere, label=np.array([f"unit {i}" for i in range(n)]))) == [("other-channels", float(n))]
 
 
+def test_channels_that_differ_in_any_recording_are_counted() -> None:
+    first = named(0.0, {})
+    electrode = first.channels.electrode
+    others = [26_000 + electrode[:2], electrode[2:]], [electrode[:-3], 26_100 + electrode[-3:]]
+    series = [
+        replace(first, channels=replace(first.channels, electrode=np.concatenate(other)), start_min=10.0 * (i + 1))
+        for i, other in enumerate(others)
+    ]
+    (finding,) = series_findings(responses_of(first, *series))
+    assert (finding.name, finding.value) == ("other-channels", 5.0)
+    assert finding.message.startswith("5 of the 32 channels are not the same in all recordings")
+
+
 def test_a_policy_knows_its_culture_and_another_one_is_reported(tmp_path: Path) -> None:
     of_c1, of_c2 = (fit_timeline(responses_of(named(0.0, {"subject_id": name}))) for name in ("c1", "c2"))
     stored = load_timeline(save_timeline(of_c1, tmp_path / "simulators.safetensors"))
