@@ -125,6 +125,8 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     inspected = json.loads(last)
     assert [finding["name"] for finding in inspected["together"]] == ["several-cultures"]
     assert inspected["unusable"] == []
+    # They have a value, as those of each recording.
+    assert inspected["together"][0]["value"] is None
 
 
 def test_other_channels_are_found_by_electrode_and_otherwise_by_label() -> None:
