@@ -358,6 +358,28 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
     np.testing.assert_allclose(read_recording(other_nwb(tmp_path / "a.nwb", stimuli=(name,))).stimuli.time_s, times_s)
 
 
+@pytest.mark.parametrize(
+    ("of", "times_s"),
+    [("several amplitudes", [0.1, 0.5, 0.9]), ("true and false", [0.1, 0.5, 0.9]), ("noise", [0.1, 0.9])],
+)
+def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[float], tmp_path: Path) -> None:
+    import pynwb
+
+    path = other_nwb(tmp_path / "a.nwb", stimuli=())
+    data = np.zeros(10_000)
+    for at, amplitude in ((1000, 300.0), (5000, -100.0), (9000, 200.0)):
+        data[at : at + 4], data[at + 4 : at + 8] = amplitude, -amplitude
+    if of == "noise":
+        data += np.random.default_rng(0).normal(0, 20, len(data))
+    data[0] = np.nan if of == "several amplitudes" else data[0]
+    data = data != 0 if of == "true and false" else data
+    with pynwb.NWBHDF5IO(str(path), "a") as nwb_io:
+        nwb = nwb_io.read()
+        nwb.add_stimulus(pynwb.TimeSeries(name="wave", data=data, rate=10_000.0, starting_time=0.0, unit="mV"))
+        nwb_io.write(nwb)
+    np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+
+
 def test_other_nwb_with_several_stimuli_lists_them(tmp_path: Path) -> None:
     path = other_nwb(tmp_path / "a.nwb", stimuli=("pulses", "events", "lever"))
     with pytest.raises(

@@ -176,17 +176,27 @@ def _of_series(file: Hdf5File, at: str) -> Column:
 
 
 def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
-    """The samples at which a stimulus leaves 0 by more than half of its largest magnitude, for the first time in 1 ms.
+    """The samples at which a stimulus leaves 0, for the first time in 1 ms.
 
-    They are read in blocks, as they may be as many as the recording's.
+    If most samples are exactly 0, every other one is away from it. Otherwise the stimulus was measured, with noise, and
+    away is more than half of its largest magnitude. Samples are read in blocks, as they may be as many as the
+    recording's.
     """
     dataset = file.dataset(at)
-    if dataset.ndim != 1 or dataset.dtype.kind not in "iuf" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
+    if dataset.ndim != 1 or dataset.dtype.kind not in "iufb" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
         raise InvalidFile(f"{file.path}: expected one column of numbers at /{at}, got {dataset.dtype} {dataset.shape}")
     blocks = range(0, len(dataset), _BLOCK)
-    half = max((float(np.max(np.abs(dataset[b : b + _BLOCK].astype(np.float64)))) for b in blocks), default=0.0) / 2
-    if not half > 0:
+
+    def magnitude(b: int) -> Column:
+        # Samples that are not known (NaN) are no stimulus.
+        return np.asarray(np.abs(np.nan_to_num(dataset[b : b + _BLOCK].astype(np.float64))))
+
+    largest, n_zeros = 0.0, 0
+    for b in blocks:
+        block = magnitude(b)
+        largest, n_zeros = max(largest, float(np.max(block))), n_zeros + int(np.count_nonzero(block == 0))
+    if not largest > 0:
         return np.empty(0)
-    away = [np.flatnonzero(np.abs(dataset[b : b + _BLOCK].astype(np.float64)) > half) + b for b in blocks]
-    samples = np.concatenate(away)
+    least = 0.0 if n_zeros > len(dataset) / 2 else largest / 2
+    samples = np.concatenate([np.flatnonzero(magnitude(b) > least) + b for b in blocks])
     return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > APART_S * rate_hz])
