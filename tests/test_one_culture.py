@@ -74,6 +74,11 @@ def plate(path: Path, well: str, chip: str) -> Path:
 def test_chips_wells_and_subjects_are_read_from_files(tmp_path: Path) -> None:
     read = read_recording(plate(tmp_path / "a.raw.h5", "well003", "P001"))
     assert read.culture == RecordedCulture(names=(("chip_id", "P001"), ("well", "well003")))
+    # Where a file lists wells by recording, they are the same wells.
+    with h5py.File(tmp_path / "a.raw.h5", "a") as file:
+        file["recordings/rec0000/well003"] = file["wells/well003/rec0000"]
+        del file["wells"]
+    assert read_recording(tmp_path / "a.raw.h5").culture == read.culture
     cl1 = write_cl1(tmp_path / "cl1.h5", spikes=[(10, 1)], stims=[(5, 2)])
     assert read_recording(cl1).culture is None
     with h5py.File(cl1, "a") as file:
