@@ -280,7 +280,8 @@ def _check_frequencies(name: str, values_hz: tuple[float, ...]) -> None:
     for value_hz in values_hz:
         if not (math.isfinite(value_hz) and value_hz > 0):
             raise InvalidArgument(f"{name}: expected positive frequencies in Hz, got {value_hz:g}")
-    if len(set(values_hz)) < len(values_hz):
+    # Those that differ by rounding only are the same condition.
+    if len(distinct(np.array(values_hz, np.float64))) < len(values_hz):
         raise InvalidArgument(f"{name}: expected each frequency once, got {_listed(values_hz)[1:]}")
 
 
