@@ -184,6 +184,10 @@ def test_a_policy_knows_its_culture_and_another_one_is_reported(tmp_path: Path) 
         "the policies were trained on recordings of subject_id c1, but these are of subject_id c2: another culture "
         "responds differently"
     ]
+    # What only a later recording states is known too.
+    minutes = enumerate(({"subject_id": "c1"}, {"subject_id": "c1", "chip_id": "7"}))
+    of_both = fit_timeline(responses_of(*(named(10.0 * i, names) for i, names in minutes)))
+    assert of_both.culture == RecordedCulture(names=(("subject_id", "c1"), ("chip_id", "7")))
     # Policies of earlier versions do not state it.
     assert said(replace(policy, provenance={})) == []
     assert not [each for each in timeline_differences(policy, of_c1) if each.name == "other-culture"]
