@@ -360,7 +360,12 @@ def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[fl
 
 @pytest.mark.parametrize(
     ("of", "times_s"),
-    [("several amplitudes", [0.1, 0.5, 0.9]), ("true and false", [0.1, 0.5, 0.9]), ("noise", [0.1, 0.9])],
+    [
+        ("several amplitudes", [0.1, 0.5, 0.9]),
+        ("true and false", [0.1, 0.5, 0.9]),
+        ("noise", [0.1, 0.9]),
+        ("an offset", [0.1, 0.5, 0.9]),
+    ],
 )
 def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[float], tmp_path: Path) -> None:
     import pynwb
@@ -375,9 +380,17 @@ def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[
     data = data != 0 if of == "true and false" else data
     with pynwb.NWBHDF5IO(str(path), "a") as nwb_io:
         nwb = nwb_io.read()
-        nwb.add_stimulus(pynwb.TimeSeries(name="wave", data=data, rate=10_000.0, starting_time=0.0, unit="mV"))
+        stored: dict[str, object] = {"data": data}
+        if of == "an offset":
+            # As a converter from analog to digital: 2048 is 0.
+            stored = {"data": (data + 2048).astype(np.uint16), "conversion": 0.1, "offset": -204.8}
+        nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=10_000.0, starting_time=0.0, unit="mV", **stored))
+        wave = {**stored, "data": stored["data"][900:1010:50], "timestamps": [0.1, 0.2, 0.3]}
+        nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
         nwb_io.write(nwb)
     np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    if of != "noise":
+        np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 
 
 def test_other_nwb_with_several_stimuli_lists_them(tmp_path: Path) -> None:

@@ -167,7 +167,8 @@ def _of_series(file: Hdf5File, at: str) -> Column:
         data = file.read(f"{at}/data")
         if data.dtype.kind == "U":
             return time_s
-        is_pulse = data > 0 if file.attribute(at, "neurodata_type") == "IntervalSeries" else data != 0
+        is_interval = file.attribute(at, "neurodata_type") == "IntervalSeries"
+        is_pulse = data > 0 if is_interval else _from_zero(file, f"{at}/data", data) != 0
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):
@@ -189,7 +190,7 @@ def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
 
     def magnitude(b: int) -> Column:
         # Samples that are not known (NaN) are no stimulus.
-        return np.asarray(np.abs(np.nan_to_num(dataset[b : b + _BLOCK].astype(np.float64))))
+        return np.asarray(np.abs(np.nan_to_num(_from_zero(file, at, dataset[b : b + _BLOCK]))))
 
     largest, n_zeros = 0.0, 0
     for b in blocks:
@@ -200,3 +201,13 @@ def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
     least = 0.0 if n_zeros > len(dataset) / 2 else largest / 2
     samples = np.concatenate([np.flatnonzero(magnitude(b) > least) + b for b in blocks])
     return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > APART_S * rate_hz])
+
+
+def _from_zero(file: Hdf5File, at: str, data: Column) -> Column:
+    """Samples as they are stored, less the one that stands for 0: NWB's values are data x conversion + offset."""
+    offset, conversion = (file.attribute(at, name) for name in ("offset", "conversion"))
+    if not isinstance(offset, float) or not isinstance(conversion, float) or not conversion or not offset:
+        return data.astype(np.float64)
+    zero = -offset / conversion
+    # Offset and conversion are rounded.
+    return np.where(np.isclose(data, zero, rtol=1e-6, atol=0), 0.0, data - zero)
