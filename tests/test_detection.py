@@ -523,7 +523,12 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
     found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     assert agreement(found, truth)[1] == 0
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
-        del file["acquisition/traces/data"]
+        file.copy("acquisition/traces", "acquisition/others")
+    # Only convert reads traces.
+    with pytest.raises(InvalidFile, match=r"found 2: others, traces; choose with --part NAME in animat convert$"):
+        read_traces(tmp_path / "a.nwb", Detection())
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        del file["acquisition/others"], file["acquisition/traces/data"]
     with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
         read_traces(tmp_path / "a.nwb", Detection())
 

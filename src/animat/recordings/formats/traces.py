@@ -92,7 +92,7 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     series = [name for name in names if file.attribute(f"acquisition/{name}", kind) == "ElectricalSeries"]
     if not series:
         raise InvalidFile(f"{path}: expected raw traces as an ElectricalSeries in /acquisition, found none")
-    at = f"acquisition/{choose(f'{path}: series', '--part', series, part)}"
+    at = f"acquisition/{choose(f'{path}: series', '--part', series, part, commands='animat convert')}"
     rate_hz = file.attribute(f"{at}/starting_time", "rate")
     if not is_positive(rate_hz):
         raise InvalidFile(f"{path}: expected the rate of /{at} in Hz at its starting_time, found none")
