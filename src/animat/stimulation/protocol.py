@@ -145,7 +145,8 @@ class Protocol:
         """
         data = json_data(text, "protocol")
         if not isinstance(data, dict) or (defaults is None and "pulse" not in data):
-            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
+            needed = ', such as {"frequencies_hz": [5, 10]}' if defaults else ", with a pulse"
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes{needed}, got {text.strip()[:80]!r}")
         if "trials" not in data:
             data = {_FORMER.get(name, name): value for name, value in data.items()}
         return replace(defaults or PAPER, **data)
