@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, expect_kind, within
-from animat.responses.condition import RESTING, Condition, abbreviated, listed
+from animat.responses.condition import RESTING, Condition, brief_labels
 from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -144,8 +144,9 @@ class ByElectrode(Conditions):
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
         index = index_of_row[row_of.reshape(-1)]
         index[stimuli.is_rest] = index_of.get(RESTING[0], NO_CONDITION)
-        conditions = [Condition(listed(one), float(i), electrodes=(one,)) for i, one in enumerate(sets)]
-        return _with_stimuli(stimuli, index, abbreviated(conditions))
+        labels = brief_labels(sets)
+        conditions = [Condition(labels[i], float(i), electrodes=(one,)) for i, one in enumerate(sets)]
+        return _with_stimuli(stimuli, index, conditions)
 
 
 @dataclass(frozen=True)
