@@ -583,6 +583,8 @@ def test_tables_that_may_be_stimuli_are_listed_if_none_is_named_like_stimuli(tmp
 def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
     recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
     assert recording.stimuli.electrodes.tolist() == read
+    left_out = found(recording).get("columns-left-out", "")
+    assert left_out.endswith("electrodes (known, but not with such values)") == ("north" in words)
 
 
 @pytest.mark.parametrize("of_another_table", [False, True])

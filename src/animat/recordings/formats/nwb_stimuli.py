@@ -95,7 +95,8 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
             columns["stimulus_electrodes"] = electrodes
             used |= {name, f"{name}_index"}
             break
-    missing = [name for column, names in COLUMNS.items() if column not in columns for name in names]
+    known = COLUMNS | {"stimulus_electrodes": ELECTRODES}
+    missing = [name for column, names in known.items() if column not in columns for name in names]
     findings += left_out_findings("columns", [n for n in file.names(at) if n not in used], f"/{at}", missing)
     if "stimulus_frequency_hz" in columns:
         frequency = columns["stimulus_frequency_hz"].astype(np.float64)
