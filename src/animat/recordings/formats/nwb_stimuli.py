@@ -106,17 +106,26 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
 
 def _values(column: str, values: Column, time_s: Column) -> Column | None:
     """The values of a column with a known name, as another program means them; None if they cannot be what it says."""
-    kind = values.dtype.kind
-    is_whole = kind in "iu" or (kind == "f" and not np.any(np.nan_to_num(values) % 1))
+    if column == "stimulus_frequency_hz":
+        return values if values.dtype.kind in "iuf" else None
+    is_whole = _are_whole(values)
     if column == "stimulus_pattern":
         # Conditions need not be numbered: fractions (a contrast), true and false are names.
         return values if is_whole else np.array(["" if value != value else str(value) for value in values])
-    if column == "stimulus_presentation":
-        known = values[np.argsort(time_s, kind="stable")]
-        known = known[(known >= 0) | (known < UNKNOWN)] if is_whole else known
-        # Numbers that start again, as in each block, do not number the trials of a recording.
-        return values if is_whole and not np.any(np.diff(known) < 0) else None
-    return values if kind in "iuf" else None
+    if not is_whole:
+        return None
+    # As floats, since differences of unsigned numbers never fall.
+    number = np.nan_to_num(values.astype(np.float64), nan=UNKNOWN)[np.argsort(time_s, kind="stable")]
+    # Numbers that start again, as in each block, do not number the trials of a recording.
+    return None if np.any(np.diff(number[number != UNKNOWN]) < 0) else values
+
+
+def _are_whole(values: Column) -> bool:
+    """Whether values are whole numbers that fit, or not known (NaN)."""
+    if values.dtype.kind in "iu":
+        return not values.size or int(values.max()) < 2**63
+    known = values[~np.isnan(values)] if values.dtype.kind == "f" else np.array([np.inf])
+    return bool(np.all((known == np.round(known)) & (np.abs(known) < 2**53)))
 
 
 def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
