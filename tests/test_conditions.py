@@ -162,6 +162,8 @@ def test_the_tolerance_can_be_typed_or_left_out() -> None:
         ("frequency:5,x", "expected numbers"),
         ("frequency:-5", "conditions: frequency: expected positive frequencies in Hz, got -5"),
         ("frequency:5,5", "expected each frequency once"),
+        ("frequency:5,10,5.000001", "expected each frequency once, got 5,10,5.000001"),
+        ("interval:5,5.000001", "expected each frequency once"),
         ("frequency:nan", "expected positive"),
         ("interval", "expected at least one frequency"),
         ("interval:0", "expected positive"),

@@ -20,6 +20,7 @@ from animat.recordings.detection.band import band_pass
 from animat.recordings.detection.negative_peaks import find_negative_peaks, median_noise_uv
 from animat.recordings.detection.settings import Detection
 from animat.recordings.detection.spikes import DetectedSpikes, detect_spikes
+from animat.recordings.formats.traces import open_traces
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Channels
 from animat.stimulation.pulse import PUBLISHED_PULSE
@@ -508,6 +509,24 @@ def write_nwb_traces(path: Path, voltage: np.ndarray, start_s: float) -> None:
         series["starting_time"].attrs["rate"] = RATE_HZ
 
 
+def test_noise_is_in_microvolts_where_each_channel_has_its_own_conversion(tmp_path: Path) -> None:
+    voltage, _ = noisy(2, 1.0, step_uv=1.0)
+    write_nwb_traces(tmp_path / "a.nwb", voltage, start_s=0.0)
+    expected = detect_spikes(open_traces(tmp_path / "a.nwb")[0], np.empty(0), Detection()).noise_uv
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        del file["acquisition/traces/data"]
+        file["acquisition/traces/data"] = voltage / np.array([2.0, 5.0])
+        file["acquisition/traces/data"].attrs["conversion"] = 1e-6
+        file["acquisition/traces/channel_conversion"] = np.array([2.0, 5.0])
+    traces, _ = open_traces(tmp_path / "a.nwb")
+    np.testing.assert_allclose(detect_spikes(traces, np.empty(0), Detection()).noise_uv, expected, rtol=1e-5)
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        del file["acquisition/traces/channel_conversion"]
+        file["acquisition/traces/channel_conversion"] = np.ones(3)
+    with pytest.raises(InvalidFile, match="expected a conversion of each of the 2 traces, got 3"):
+        open_traces(tmp_path / "a.nwb")
+
+
 def write_stimuli(path: Path, time_s: list[float]) -> None:
     with h5py.File(path, "r+") as file:
         table = file.create_group("intervals/stimuli")
@@ -523,7 +542,12 @@ def test_raw_traces_of_an_nwb_file(tmp_path: Path) -> None:
     found = DetectedSpikes(recording.spike_times_s, recording.spike_channels, np.empty(0), ())
     assert agreement(found, truth)[1] == 0
     with h5py.File(tmp_path / "a.nwb", "r+") as file:
-        del file["acquisition/traces/data"]
+        file.copy("acquisition/traces", "acquisition/others")
+    # Only convert reads traces.
+    with pytest.raises(InvalidFile, match=r"found 2: others, traces; choose with --part NAME in animat convert$"):
+        read_traces(tmp_path / "a.nwb", Detection())
+    with h5py.File(tmp_path / "a.nwb", "r+") as file:
+        del file["acquisition/others"], file["acquisition/traces/data"]
     with pytest.raises(InvalidFile, match="expected raw traces at /acquisition/traces/data, found none"):
         read_traces(tmp_path / "a.nwb", Detection())
 

@@ -74,6 +74,11 @@ def plate(path: Path, well: str, chip: str) -> Path:
 def test_chips_wells_and_subjects_are_read_from_files(tmp_path: Path) -> None:
     read = read_recording(plate(tmp_path / "a.raw.h5", "well003", "P001"))
     assert read.culture == RecordedCulture(names=(("chip_id", "P001"), ("well", "well003")))
+    # Where a file lists wells by recording, they are the same wells.
+    with h5py.File(tmp_path / "a.raw.h5", "a") as file:
+        file["recordings/rec0000/well003"] = file["wells/well003/rec0000"]
+        del file["wells"]
+    assert read_recording(tmp_path / "a.raw.h5").culture == read.culture
     cl1 = write_cl1(tmp_path / "cl1.h5", spikes=[(10, 1)], stims=[(5, 2)])
     assert read_recording(cl1).culture is None
     with h5py.File(cl1, "a") as file:
@@ -125,6 +130,8 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     inspected = json.loads(last)
     assert [finding["name"] for finding in inspected["together"]] == ["several-cultures"]
     assert inspected["unusable"] == []
+    # They have a value, as those of each recording.
+    assert inspected["together"][0]["value"] is None
 
 
 def test_other_channels_are_found_by_electrode_and_otherwise_by_label() -> None:
@@ -146,6 +153,19 @@ def test_other_channels_are_found_by_electrode_and_otherwise_by_label() -> None:
     assert found(replace(nowhere, label=np.array([f"unit {i}" for i in range(n)]))) == [("other-channels", float(n))]
 
 
+def test_channels_that_differ_in_any_recording_are_counted() -> None:
+    first = named(0.0, {})
+    electrode = first.channels.electrode
+    others = [26_000 + electrode[:2], electrode[2:]], [electrode[:-3], 26_100 + electrode[-3:]]
+    series = [
+        replace(first, channels=replace(first.channels, electrode=np.concatenate(other)), start_min=10.0 * (i + 1))
+        for i, other in enumerate(others)
+    ]
+    (finding,) = series_findings(responses_of(first, *series))
+    assert (finding.name, finding.value) == ("other-channels", 5.0)
+    assert finding.message.startswith("5 of the 32 channels are not the same in all recordings")
+
+
 def test_a_policy_knows_its_culture_and_another_one_is_reported(tmp_path: Path) -> None:
     of_c1, of_c2 = (fit_timeline(responses_of(named(0.0, {"subject_id": name}))) for name in ("c1", "c2"))
     stored = load_timeline(save_timeline(of_c1, tmp_path / "simulators.safetensors"))
@@ -164,6 +184,10 @@ def test_a_policy_knows_its_culture_and_another_one_is_reported(tmp_path: Path) 
         "the policies were trained on recordings of subject_id c1, but these are of subject_id c2: another culture "
         "responds differently"
     ]
+    # What only a later recording states is known too.
+    minutes = enumerate(({"subject_id": "c1"}, {"subject_id": "c1", "chip_id": "7"}))
+    of_both = fit_timeline(responses_of(*(named(10.0 * i, names) for i, names in minutes)))
+    assert of_both.culture == RecordedCulture(names=(("subject_id", "c1"), ("chip_id", "7")))
     # Policies of earlier versions do not state it.
     assert said(replace(policy, provenance={})) == []
     assert not [each for each in timeline_differences(policy, of_c1) if each.name == "other-culture"]

@@ -18,12 +18,13 @@ from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition, abbreviated, listed
-from animat.responses.conditions import conditions_named
+from animat.responses.conditions import ByElectrode, conditions_named
 from animat.responses.extraction import extract_responses
 from animat.responses.inspection import inspect_recording
 from animat.stimulation.places import check_places, count_places, electrodes_of, read_places
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.schedule import make_schedule
+from animat.stimulation.stimulus import Stimuli
 from cultures import small_culture
 
 GRID = np.arange(12)
@@ -202,3 +203,11 @@ def test_large_sets_of_electrodes_are_counted_in_labels() -> None:
     assert abbreviated(abbreviated(written)) == abbreviated(written)
     alike = [*written, Condition(listed(other), 2.0, electrodes=(other,))]
     assert abbreviated(alike) == tuple(alike)
+
+
+def test_a_condition_may_be_more_electrodes_than_a_label_could_list() -> None:
+    electrodes = np.stack([10_000 + np.arange(2600), 20_000 + np.arange(2600)])
+    every = np.arange(2)
+    stimuli = Stimuli(0.5 * every, np.full(2, 5.0), every, electrodes, every)
+    labels = [condition.label for condition in ByElectrode().assign(stimuli).conditions]
+    assert labels == ["2600 electrodes from 10000", "2600 electrodes from 20000"]

@@ -139,6 +139,7 @@ def test_one_pattern_can_be_repeated() -> None:
     [
         ({"frequencies_hz": ()}, "frequencies_hz: expected at least 1"),
         ({"frequencies_hz": (5, 5)}, "frequencies_hz: expected each once"),
+        ({"frequencies_hz": (5, 5.000001)}, "frequencies_hz: expected each once, got 5, 5.000001"),
         ({"frequencies_hz": (0,)}, "frequencies_hz: expected more than 0, got 0"),
         ({"order": "shuffled"}, "order: expected 'blocked' or 'mixed'"),
         ({"pulses": 0}, "pulses: expected at least 1"),

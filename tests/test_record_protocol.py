@@ -114,7 +114,11 @@ def test_a_virtual_culture_gets_it_too(tmp_path: Path, monkeypatch: pytest.Monke
     ("text", "more", "words"),
     [
         (None, [], "no such file"),
-        ("[5]", [], "mine.json: protocol: expected what Protocol.to_json writes"),
+        (
+            "[5]",
+            [],
+            'mine.json: protocol: expected what Protocol.to_json writes, such as {"frequencies_hz": [5, 10]}, got',
+        ),
         (
             '{"pulses": 2,\n"order" "mixed"}',
             [],

@@ -53,6 +53,7 @@ def recording(**changes: Any) -> Recording:
         ({"spike_times_s": [0.0, np.nan, 1.0]}, "spike_times_s: expected finite times in seconds, got 1 of 3"),
         ({"spike_times_s": [0.0, 1.0, 0.5]}, "spike_times_s: expected times that do not fall"),
         ({"spike_times_s": [0.0, 1.0]}, "spike_channels: expected 2 values"),
+        ({"spike_times_s": [[0.0], [0.5], [1.0]]}, r"spike_times_s: expected a column of values .* got shape \(3, 1\)"),
         ({"spike_channels": [0, 1, 3]}, r"rows of the channel table \(0 to 2\), got 3 \(1 spikes on unknown"),
         ({"spike_channels": [0, 1, -1]}, "rows of the channel table"),
         ({"spike_channels": [0, 1, -0.5]}, "spike_channels: expected whole numbers, got -0.5"),

@@ -245,6 +245,18 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
         "2 in channel_label, 3 in channel_electrode",
     ),
     "positions in one column": ({"channel_xy_um": np.zeros(8)}, r"channel_xy_um: expected shape \(8, 2\)"),
+    "electrodes of channels in two dimensions": (
+        {"channel_electrode": np.arange(8)[:, None]},
+        r"channel_electrode: expected one electrode per channel, shape \(8,\), got \(8, 1\)",
+    ),
+    "an electrode of a channel below -1": (
+        {"channel_electrode": np.arange(8) - 2},
+        "channel_electrode: expected electrode numbers, or -1 if they are not known, got -2",
+    ),
+    "a number that is -2 in fewer bits": (
+        {"stimulus_pattern": np.array([1, 2**64 - 2], np.uint64)},
+        "stimulus_pattern: expected whole numbers of at most 63 bits, got 18446744073709551614",
+    ),
     "negative frequency": (
         {"stimulus_frequency_hz": np.array([5.0, -5.0])},
         "positive frequencies .* got -5",

@@ -179,6 +179,22 @@ def test_a_bad_table_is_refused_in_one_line_that_names_the_file(case: str, tmp_p
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("response_window_ms", ["two", "ten"], r"response_window_ms: expected start and end in ms, got <U3 \(2,\)"),
+        ("response_window_ms", [2j, 10], r"response_window_ms: expected start and end in ms, got complex128 \(2,\)"),
+        ("stimulus_time_s", 1.0, r"stimulus_time_s: expected one column of times in seconds, got shape \(\)"),
+    ],
+)
+def test_a_bad_npz_table_is_refused_by_the_name_of_its_key(
+    key: str, value: object, message: str, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]], **{key: value})
+    with pytest.raises(InvalidFile, match=rf"a\.npz: {message}"):
+        read_source(tmp_path / "a.npz")
+
+
 @pytest.mark.parametrize("head", ["Rate (Hz) {}", "rate_hz_{}", "RATE-HZ-{}", "rate [Hz]_{}", "count_{}", "Count {}"])
 def test_channels_are_named_by_the_rest_of_their_headers(head: str, tmp_path: Path) -> None:
     labels = ["12", "A1", "(3,4)"]

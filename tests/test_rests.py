@@ -155,6 +155,14 @@ def test_after_an_emergency_stop_there_is_no_rest_either() -> None:
         culture.deliver([], 0.1)
 
 
+def test_a_rest_after_a_stimulus_does_not_come_too_close() -> None:
+    recording = recorded(FakeCulture(), (100, 102), NONE)
+    followed = np.append(~recording.stimuli.is_rest[1:], False)
+    # Trials are 50 ms apart.
+    found = {finding.name: finding for finding in extract_responses(recording, window_ms=(2.0, 60.0)).findings}
+    assert found["stimuli-too-close"].value == np.count_nonzero(followed) < len(recording.stimuli) - 1
+
+
 def test_stimuli_on_unknown_electrodes_are_not_rests() -> None:
     recording = recorded(small_culture(), NONE)
     unknown = replace(recording.stimuli, pattern=np.full(12, -1))

@@ -301,6 +301,53 @@ def test_other_nwb_columns_that_are_not_read_are_named(tmp_path: Path) -> None:
     assert left.message.startswith("unknown columns of /stimulus/presentation/more were left out: stim_freq (did you")
 
 
+@pytest.mark.parametrize(
+    ("column", "values", "read"),
+    [
+        ("condition", [0.5, 0.1, 0.5], ("pattern", [1, 0, 1])),
+        ("condition", np.array([0.5, 0.1, np.nan], np.float32), ("pattern", [1, 0, UNKNOWN])),
+        ("condition", [True, False, True], ("pattern", [1, 0, 1])),
+        ("condition", [3.0, 7.0, np.nan], ("pattern", [3, 7, UNKNOWN])),
+        ("presentation", [4, UNKNOWN, 6], ("presentation", [0, 1, 2])),
+        ("presentation", [4, 4, 6], ("presentation", [4, 4, 6])),
+        ("presentation", [0, 1, 0], None),
+        ("presentation", np.array([0, 1, 0], np.uint8), None),
+        ("presentation", np.array([1, np.nan, 0]), None),
+        ("condition", np.array([np.inf, 1, np.inf]), ("pattern", [1, 0, 1])),
+        ("condition", np.array([2**64 - 1, 1, 1], np.uint64), ("pattern", [1, 0, 0])),
+        ("presentation", [0.0, 0.5, 1.0], None),
+        ("frequency", ["5 Hz", "5 Hz", "9 Hz"], None),
+    ],
+)
+def test_other_nwb_columns_with_other_values_than_ours(
+    column: str, values: list[object], read: tuple[str, list[int]] | None, tmp_path: Path
+) -> None:
+    import pynwb
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    nwb.add_unit(spike_times=[0.1, 0.5, 0.9])
+    table = pynwb.epoch.TimeIntervals(name="stimuli", description="x")
+    table.add_column(column, "of the other program")
+    for i, value in enumerate(values):
+        table.add_row(start_time=0.2 * i, stop_time=0.2 * i + 0.1, **{column: value})
+    nwb.add_stimulus(table)
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "w") as nwb_io:
+        nwb_io.write(nwb)
+    recording = read_recording(tmp_path / "a.nwb")
+    assert recording.stimuli.time_s.tolist() == pytest.approx([0.0, 0.2, 0.4])
+    if read is None:
+        left_out = f"unknown columns of /stimulus/presentation/stimuli were left out: {column} (known, but not with"
+        assert found(recording)["columns-left-out"].startswith(left_out)
+        assert np.isnan(recording.stimuli.frequency_hz).all()
+        assert recording.stimuli.presentation.tolist() == [0, 1, 2]
+    else:
+        assert getattr(recording.stimuli, read[0]).tolist() == read[1]
+        assert "columns-left-out" not in found(recording)
+    if values[0] == 0.5:
+        assert recording.provenance["patterns"] == "0: 0.1, 1: 0.5"
+
+
 def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
     recording = read_recording(other_nwb(tmp_path / "a.nwb", electrodes=False))
     assert len(recording.channels) == 3
@@ -313,6 +360,41 @@ def test_other_nwb_units_without_electrodes(tmp_path: Path) -> None:
 )
 def test_other_nwb_stimuli_in_series(tmp_path: Path, name: str, times_s: list[float]) -> None:
     np.testing.assert_allclose(read_recording(other_nwb(tmp_path / "a.nwb", stimuli=(name,))).stimuli.time_s, times_s)
+
+
+@pytest.mark.parametrize(
+    ("of", "times_s"),
+    [
+        ("several amplitudes", [0.1, 0.5, 0.9]),
+        ("true and false", [0.1, 0.5, 0.9]),
+        ("noise", [0.1, 0.9]),
+        ("an offset", [0.1, 0.5, 0.9]),
+    ],
+)
+def test_a_sampled_stimulus_begins_each_time_it_leaves_0(of: str, times_s: list[float], tmp_path: Path) -> None:
+    import pynwb
+
+    path = other_nwb(tmp_path / "a.nwb", stimuli=())
+    data = np.zeros(10_000)
+    for at, amplitude in ((1000, 300.0), (5000, -100.0), (9000, 200.0)):
+        data[at : at + 4], data[at + 4 : at + 8] = amplitude, -amplitude
+    if of == "noise":
+        data += np.random.default_rng(0).normal(0, 20, len(data))
+    data[0] = np.nan if of == "several amplitudes" else data[0]
+    data = data != 0 if of == "true and false" else data
+    with pynwb.NWBHDF5IO(str(path), "a") as nwb_io:
+        nwb = nwb_io.read()
+        stored: dict[str, object] = {"data": data}
+        if of == "an offset":
+            # As a converter from analog to digital: 2048 is 0.
+            stored = {"data": (data + 2048).astype(np.uint16), "conversion": 0.1, "offset": -204.8}
+        nwb.add_stimulus(pynwb.TimeSeries(name="wave", rate=10_000.0, starting_time=0.0, unit="mV", **stored))
+        wave = {**stored, "data": stored["data"][900:1010:50], "timestamps": [0.1, 0.2, 0.3]}
+        nwb.add_acquisition(pynwb.TimeSeries(name="each", unit="mV", **wave))
+        nwb_io.write(nwb)
+    np.testing.assert_allclose(read_recording(path).stimuli.time_s, times_s)
+    if of != "noise":
+        np.testing.assert_allclose(read_recording(path, stimuli="each").stimuli.time_s, [0.3])
 
 
 def test_other_nwb_with_several_stimuli_lists_them(tmp_path: Path) -> None:
@@ -505,6 +587,40 @@ def test_tables_that_may_be_stimuli_are_listed_if_none_is_named_like_stimuli(tmp
 def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
     recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
     assert recording.stimuli.electrodes.tolist() == read
+    left_out = found(recording).get("columns-left-out", "")
+    assert left_out.endswith("electrodes (known, but not with such values)") == ("north" in words)
+
+
+@pytest.mark.parametrize("of_another_table", [False, True])
+def test_electrodes_by_row_of_the_electrodes_table_have_its_numbers(tmp_path: Path, of_another_table: bool) -> None:
+    import pynwb
+    from hdmf.common import DynamicTable
+
+    start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
+    nwb = pynwb.NWBFile(session_description="x", identifier="x", session_start_time=start)
+    device = nwb.create_device(name="d")
+    group = nwb.create_electrode_group(name="g", description="g", location="in vitro", device=device)
+    for electrode in (10, 20, 30):
+        nwb.add_electrode(id=electrode, location="in vitro", group=group, rel_x=0.0, rel_y=0.0)
+    nwb.add_unit(spike_times=[0.5], electrodes=[1])
+    to: DynamicTable = nwb.electrodes
+    if of_another_table:
+        to = DynamicTable(name="sites", description="not on the array", id=[7, 8, 9])
+        nwb.add_scratch(to)
+    table = pynwb.epoch.TimeIntervals(name="stimuli", description="x")
+    table.add_column("electrodes", "pulsed together", index=True, table=to)
+    for i, rows in enumerate(([0], [1, 2], [])):
+        table.add_row(start_time=0.2 * i, stop_time=0.2 * i + 0.1, electrodes=rows)
+    nwb.add_stimulus(table)
+    with pynwb.NWBHDF5IO(str(tmp_path / "a.nwb"), "w") as nwb_io:
+        nwb_io.write(nwb)
+    recording = read_recording(tmp_path / "a.nwb")
+    assert recording.channels.electrode.tolist() == [20]
+    if of_another_table:
+        assert np.all(recording.stimuli.electrodes == UNKNOWN)
+        assert "electrodes" in found(recording)["columns-left-out"]
+    else:
+        assert recording.stimuli.electrodes.tolist() == [[10, UNKNOWN], [20, 30], [UNKNOWN, UNKNOWN]]
 
 
 def test_the_advice_to_choose_names_the_commands_that_can(tmp_path: Path) -> None:

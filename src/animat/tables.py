@@ -25,7 +25,9 @@ def freeze(table: object, name: str, **dtypes: Any) -> None:
     length = None
     for attribute, dtype in dtypes.items():
         array = read_only(table, attribute, dtype)
-        if array.ndim == 0 or length not in (None, len(array)):
+        # Only sets of electrodes have a second dimension, which their table checks.
+        is_column = array.ndim == 1 or (attribute == "electrodes" and array.ndim > 0)
+        if not is_column or length not in (None, len(array)):
             expected = "a column of" if length is None else length
             raise UnusableData(f"{attribute}: expected {expected} values in {name}, got shape {array.shape}")
         length = len(array)

@@ -98,7 +98,7 @@ class Inspect(ResponseOptions):
             together = list(series_findings([responses for _, responses in series]))
             if together:
                 print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")
-            results["together"] = [finding.to_dict() for finding in together]
+            results["together"] = [{**finding.to_dict(), "value": finding.value} for finding in together]
             if self.out is not None and series:
                 progress.update(total - 1, total, "figures of the series")
                 results |= self._draw_series(series, self.out)

@@ -21,7 +21,7 @@ from animat.neurons.kinds import Kind, fit_simulator
 from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, NeuronSimulator, stacked, to_jax
 from animat.recordings.findings import Finding
-from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recorded_culture import RecordedCulture, culture_of_series
 from animat.records import read_record
 from animat.responses.condition import Condition, stimulus_mismatch
 from animat.responses.quality.one_culture import series_findings
@@ -195,7 +195,7 @@ def fit_timeline(
     }
     simulators = jax.tree.map(lambda *leaves: stacked(leaves), *fitted)
     same = first.conditions, first.window_ms, first.presentation
-    culture = next((responses.culture for responses in ordered if responses.culture), None)
+    culture = culture_of_series(responses.culture for responses in ordered)
     return SimulatorTimeline(
         simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts, culture
     )

@@ -169,9 +169,8 @@ class PlainColumns:
             expected = f"shape ({n}, electrodes), padded with {UNKNOWN}"
             raise UnusableData(f"stimulus_electrodes: expected {expected}, got {electrodes.shape}")
         whole = _whole("stimulus_electrodes", electrodes)
-        if whole.min(initial=UNKNOWN) < UNKNOWN:
-            expected = f"electrode numbers, or {UNKNOWN} for none (stimulus_pattern {NOTHING}: nothing was delivered)"
-            raise UnusableData(f"stimulus_electrodes: expected {expected}, got {whole.min()}")
+        expected = f"electrode numbers, or {UNKNOWN} for none (stimulus_pattern {NOTHING}: nothing was delivered)"
+        _expect_electrodes("stimulus_electrodes", whole, expected)
         return whole
 
     def _presentations(
@@ -270,8 +269,17 @@ def _channel_table(labels: Column, electrode: Column | None, xy_um: Column | Non
     xy = np.full((n, 2), np.nan) if xy_um is None else _numbers("channel_xy_um", np.asarray(xy_um))
     if xy.shape != (n, 2):
         raise UnusableData(f"channel_xy_um: expected shape ({n}, 2) in micrometres, got {xy.shape}")
-    electrodes = np.full(n, UNKNOWN) if electrode is None else _whole("channel_electrode", np.asarray(electrode))
+    electrodes = np.full(n, UNKNOWN)
+    if electrode is not None:
+        name = "channel_electrode"
+        electrodes = _whole(name, _column(name, electrode, n, "one electrode per channel"))
+        _expect_electrodes(name, electrodes, f"electrode numbers, or {UNKNOWN} if they are not known")
     return Channels(label=labels, electrode=electrodes, x_um=xy[:, 0], y_um=xy[:, 1])
+
+
+def _expect_electrodes(name: str, electrodes: Column, expected: str) -> None:
+    if (lowest := electrodes.min(initial=UNKNOWN)) < UNKNOWN:
+        raise UnusableData(f"{name}: expected {expected}, got {lowest}")
 
 
 def _rows_of(values: Column, labels: Column) -> Int64[np.ndarray, " spikes"]:
@@ -314,6 +322,8 @@ def _numbers(name: str, column: Column) -> Float64[np.ndarray, "..."]:
 def _whole(name: str, column: Column) -> Int64[np.ndarray, "..."]:
     """The column as whole numbers; NaN is `UNKNOWN`."""
     if column.dtype.kind in "iu":
+        if column.dtype.kind == "u" and (largest := int(column.max(initial=0))) >= 2**63:
+            raise UnusableData(f"{name}: expected whole numbers of at most 63 bits, got {largest}")
         return column.astype(np.int64)
     numbers = np.where(np.isnan(values := _numbers(name, column)), UNKNOWN, values)
     wrong = ~(np.abs(numbers) < 2**53) | (numbers != np.round(numbers))

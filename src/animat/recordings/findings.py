@@ -49,9 +49,16 @@ def left_out_findings(
     """The finding on unknown keys or columns of a file, if any, each with the missing one whose name is similar."""
     if not names:
         return ()
-    listed = ", ".join(f"{name} ({near[2:]})" if (near := did_you_mean(name, missing)) else name for name in names)
+    listed = ", ".join(_left_out(name, missing) for name in names)
     message = f"unknown {what}{f' of {file}' if file else ''} were left out: {listed}"
     return (Finding(f"{what}-left-out", "note", message, float(len(names))),)
+
+
+def _left_out(name: str, missing: Sequence[str]) -> str:
+    if name in missing:
+        return f"{name} (known, but not with such values)"
+    near = did_you_mean(name, missing)
+    return f"{name} ({near[2:]})" if near else name
 
 
 def merged(findings: Iterable[Finding]) -> tuple[Finding, ...]:

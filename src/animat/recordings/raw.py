@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from animat.errors import InvalidArgument
 from animat.recordings.recording import Channels
@@ -15,9 +15,12 @@ from animat.recordings.recording import Channels
 TILE_SAMPLES, TILE_CHANNELS = 256, 64
 
 
-def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np.ndarray, "samples channels"]:
+def in_microvolts(
+    steps: np.ndarray[Any, Any], uv_per_step: float | Float64[np.ndarray, " channels"]
+) -> Float32[np.ndarray, "samples channels"]:
     """Traces in microvolts, with each channel contiguous in memory, as filters need it."""
     samples, channels = steps.shape
+    scale = np.broadcast_to(np.asarray(uv_per_step, np.float32), channels)
     rows = np.empty((channels, samples), dtype=np.float32)
     # In tiles, which takes a quarter of the time: successive samples of 1,024 channels are 4 KB apart, for which caches
     # have few places.
@@ -25,7 +28,7 @@ def in_microvolts(steps: np.ndarray[Any, Any], uv_per_step: float) -> Float32[np
         block = slice(first, first + TILE_CHANNELS)
         for start in range(0, samples, TILE_SAMPLES):
             rows[block, start : start + TILE_SAMPLES] = steps[start : start + TILE_SAMPLES, block].T
-        rows[block] *= np.float32(uv_per_step)
+        rows[block] *= scale[block, None]
     return rows.T
 
 

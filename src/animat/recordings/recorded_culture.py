@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 NAMES = ("subject_id", "cell_batch_id", "chip_id", "well", "system_id")
 """Keys of a provenance by which a device or a file identifies the culture, and what it is on."""
@@ -65,3 +65,15 @@ def names_in(provenance: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
     """The entries of a provenance that identify the culture."""
     known = ((name, provenance.get(name, "")) for name in NAMES)
     return tuple((name, value) for name, value in known if value not in ("", UNKNOWN_SUBJECT_ID))
+
+
+def culture_of_series(cultures: Iterable[RecordedCulture | None]) -> RecordedCulture | None:
+    """The culture of several recordings, with what any of them states; of different ones, what the first states."""
+    known = [culture for culture in cultures if culture is not None]
+    if not known:
+        return None
+    values: dict[str, str] = {}
+    for culture in known:
+        values = dict(culture.names) | values
+    names = tuple((name, values[name]) for name in NAMES if name in values)
+    return replace(next((culture for culture in known if culture.kind), known[0]), names=names)

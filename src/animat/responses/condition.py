@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import field, replace
 from typing import Annotated
 
@@ -78,16 +78,21 @@ def listed(electrodes: Sequence[int]) -> str:
     return f"electrode{'s' if len(electrodes) > 1 else ''} {'+'.join(map(str, electrodes))}"
 
 
-def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
-    """Conditions whose labels count the electrodes of large sets (`"16 electrodes from 909"`) instead of listing them.
+def brief_labels(sets: Collection[Sequence[int]]) -> list[str]:
+    """The labels of several sets; large ones are counted (`"16 electrodes from 909"`) instead of listed.
 
-    If that would give two sets the same label, all are listed. Older files list them.
+    If that would give two sets the same label, all are listed.
     """
+    counted = {tuple(one): f"{len(one)} electrodes from {one[0]}" for one in sets if len(one) > _MOST_LISTED}
+    if len(set(counted.values())) < len(counted):
+        counted = {}
+    return [counted.get(tuple(one)) or listed(one) for one in sets]
+
+
+def abbreviated(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
+    """Conditions with the `brief_labels` of their sets of electrodes. Older files list them."""
     sets = {one.electrodes[0] for one in conditions if one.electrodes is not None and len(one.electrodes) == 1}
-    large = [electrodes for electrodes in sets if len(electrodes) > _MOST_LISTED]
-    brief = {electrodes: f"{len(electrodes)} electrodes from {electrodes[0]}" for electrodes in large}
-    if len(set(brief.values())) < len(brief):
-        return tuple(conditions)
+    brief = dict(zip(sets, brief_labels(sets), strict=True))
     return tuple(
         replace(one, label=one.label.replace(listed(one.electrodes[0]), brief[one.electrodes[0]]))
         if one.electrodes and one.electrodes[0] in brief

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from animat.errors import InvalidArgument, expect_kind, within
-from animat.responses.condition import RESTING, Condition, abbreviated, listed
+from animat.responses.condition import RESTING, Condition, brief_labels
 from animat.stimulation.frequency import distinct, is_same
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.stimulus import NOTHING, Stimuli
@@ -144,8 +144,9 @@ class ByElectrode(Conditions):
         index_of_row = np.array([index_of.get(s, NO_CONDITION) for s in set_of_row], dtype=np.int64)
         index = index_of_row[row_of.reshape(-1)]
         index[stimuli.is_rest] = index_of.get(RESTING[0], NO_CONDITION)
-        conditions = [Condition(listed(one), float(i), electrodes=(one,)) for i, one in enumerate(sets)]
-        return _with_stimuli(stimuli, index, abbreviated(conditions))
+        labels = brief_labels(sets)
+        conditions = [Condition(labels[i], float(i), electrodes=(one,)) for i, one in enumerate(sets)]
+        return _with_stimuli(stimuli, index, conditions)
 
 
 @dataclass(frozen=True)
@@ -280,7 +281,8 @@ def _check_frequencies(name: str, values_hz: tuple[float, ...]) -> None:
     for value_hz in values_hz:
         if not (math.isfinite(value_hz) and value_hz > 0):
             raise InvalidArgument(f"{name}: expected positive frequencies in Hz, got {value_hz:g}")
-    if len(set(values_hz)) < len(values_hz):
+    # Those that differ by rounding only are the same condition.
+    if len(distinct(np.array(values_hz, np.float64))) < len(values_hz):
         raise InvalidArgument(f"{name}: expected each frequency once, got {_listed(values_hz)[1:]}")
 
 

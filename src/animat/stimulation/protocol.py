@@ -7,11 +7,13 @@ import os
 from dataclasses import replace
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field, SkipValidation
 
 from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, json_data, record
+from animat.stimulation.frequency import distinct
 from animat.stimulation.places import NONE, Places, check_places, count_places
 from animat.stimulation.pulse import PUBLISHED_PULSE, Pulse
 
@@ -93,8 +95,9 @@ class Protocol:
     pulse: Annotated[Pulse, BeforeValidator(Pulse.from_list)] = PUBLISHED_PULSE
 
     def __post_init__(self) -> None:
-        if len(set(self.frequencies_hz)) < len(self.frequencies_hz):
-            listed = ", ".join(f"{hz:g}" for hz in self.frequencies_hz)
+        # Responses to those that differ by rounding only cannot be told apart.
+        if len(distinct(np.array(self.frequencies_hz))) < len(self.frequencies_hz):
+            listed = ", ".join(f"{hz:.10g}" for hz in self.frequencies_hz)
             raise InvalidArgument(f"frequencies_hz: expected each once, got {listed}")
         object.__setattr__(self, "places", check_places(self.places))
         of_each = self.trials * self.pulses * max(1, self.n_places)
@@ -142,7 +145,8 @@ class Protocol:
         """
         data = json_data(text, "protocol")
         if not isinstance(data, dict) or (defaults is None and "pulse" not in data):
-            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes, with a pulse, got {text[:80]!r}")
+            needed = ', such as {"frequencies_hz": [5, 10]}' if defaults else ", with a pulse"
+            raise InvalidArgument(f"protocol: expected what Protocol.to_json writes{needed}, got {text.strip()[:80]!r}")
         if "trials" not in data:
             data = {_FORMER.get(name, name): value for name, value in data.items()}
         return replace(defaults or PAPER, **data)

@@ -218,8 +218,16 @@ def _as_text(values: Column) -> Column:
     return np.array(flat, dtype=np.str_).reshape(values.shape)
 
 
+INSPECT_OR_CONVERT = "animat inspect or animat convert; other commands need the file converted first"
+
+
 def choose(
-    what: str, option: str, names: Iterable[str], asked: str | None, describe: Callable[[str], str] = lambda name: name
+    what: str,
+    option: str,
+    names: Iterable[str],
+    asked: str | None,
+    describe: Callable[[str], str] = lambda name: name,
+    commands: str = INSPECT_OR_CONVERT,
 ) -> str:
     """The name that was asked for, or the only one; other cases are refused, with a list of the names.
 
@@ -227,6 +235,7 @@ def choose(
         what: what is chosen and where, such as `rig.h5: part`.
         option: the option that chooses it, such as `--part`.
         describe: how a name is listed.
+        commands: which have the option.
     """
     candidates = list(names)
     listed = some_of([describe(name)[:80] for name in candidates])
@@ -236,5 +245,5 @@ def choose(
         raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
     if len(candidates) == 1:
         return candidates[0]
-    raise InvalidFile(f"{what}: expected one, found {len(candidates)}: {listed}; choose with {option} NAME in "
-                      "animat inspect or animat convert; other commands need the file converted first")  # fmt: skip
+    found = f"expected one, found {len(candidates)}: {listed}"
+    raise InvalidFile(f"{what}: {found}; choose with {option} NAME in {commands}")

@@ -133,8 +133,8 @@ def _new(file: Hdf5File, part: str | None) -> _Layout:
             layout.findings.append(Finding("frames-lost", severity, message, float(lost)))
     if len(recordings) > 1:
         layout.provenance["part"] = name
-    # Only the number of a well tells the cultures of one plate apart.
-    if (well := name.partition("/")[0]).startswith("well"):
+    # Only the number of a well tells the cultures of one plate apart; it comes first or last.
+    if well := next((each for each in name.split("/") if each.startswith("well")), None):
         layout.provenance["well"] = well
     chip = file.first("wellplate/id")
     if isinstance(chip, str) and chip and chip.isprintable():

@@ -13,8 +13,9 @@ from animat.errors import InvalidFile, some_of
 from animat.recordings.columns import Column
 from animat.recordings.findings import Finding, left_out_findings
 from animat.recordings.formats.hdf5 import Hdf5File, choose, is_positive
+from animat.recordings.formats.nwb_layout import ELECTRODES_TABLE
 from animat.recordings.formats.text_table import whole_numbers
-from animat.tables import padded
+from animat.tables import UNKNOWN, padded
 
 FIRST = "stimulus/presentation"
 ELSEWHERE = ("intervals", "acquisition")
@@ -83,23 +84,48 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
     for column, names in COLUMNS.items():
         for name in names:
             node = file.node(f"{at}/{name}")
-            if isinstance(node, h5py.Dataset) and node.shape == time_s.shape and node.dtype.kind in "iufSO":
-                values = file.read(f"{at}/{name}")
-                if (values.dtype.kind == "U") <= (column == "stimulus_pattern"):
-                    columns[column] = values
-                    used.add(name)
-                    break
+            if not isinstance(node, h5py.Dataset) or node.shape != time_s.shape or node.dtype.kind not in "iufbSO":
+                continue
+            if (values := _values(column, file.read(f"{at}/{name}"), time_s)) is not None:
+                columns[column] = values
+                used.add(name)
+                break
     for name in ELECTRODES:
         if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
             columns["stimulus_electrodes"] = electrodes
             used |= {name, f"{name}_index"}
             break
-    missing = [name for column, names in COLUMNS.items() if column not in columns for name in names]
+    known = COLUMNS | {"stimulus_electrodes": ELECTRODES}
+    missing = [name for column, names in known.items() if column not in columns for name in names]
     findings += left_out_findings("columns", [n for n in file.names(at) if n not in used], f"/{at}", missing)
     if "stimulus_frequency_hz" in columns:
         frequency = columns["stimulus_frequency_hz"].astype(np.float64)
         columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
     return columns
+
+
+def _values(column: str, values: Column, time_s: Column) -> Column | None:
+    """The values of a column with a known name, as another program means them; None if they cannot be what it says."""
+    if column == "stimulus_frequency_hz":
+        return values if values.dtype.kind in "iuf" else None
+    is_whole = _are_whole(values)
+    if column == "stimulus_pattern":
+        # Conditions need not be numbered: fractions (a contrast), true and false are names.
+        return values if is_whole else np.array(["" if value != value else str(value) for value in values])
+    if not is_whole:
+        return None
+    # As floats, since differences of unsigned numbers never fall.
+    number = np.nan_to_num(values.astype(np.float64), nan=UNKNOWN)[np.argsort(time_s, kind="stable")]
+    # Numbers that start again, as in each block, do not number the trials of a recording.
+    return None if np.any(np.diff(number[number != UNKNOWN]) < 0) else values
+
+
+def _are_whole(values: Column) -> bool:
+    """Whether values are whole numbers that fit, or not known (NaN)."""
+    if values.dtype.kind in "iu":
+        return not values.size or int(values.max()) < 2**63
+    known = values[~np.isnan(values)] if values.dtype.kind == "f" else np.array([np.inf])
+    return bool(np.all((known == np.round(known)) & (np.abs(known) < 2**53)))
 
 
 def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
@@ -115,6 +141,10 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
     if dataset.dtype.kind not in "iu":
         return None
     values = file.read(at).astype(np.int64)
+    if file.attribute(at, "neurodata_type") == "DynamicTableRegion":
+        if (numbers := _electrodes_in_rows(file, at, values)) is None:
+            return None
+        values = numbers
     if file.has(f"{at}_index"):
         ends = [0, *file.read(f"{at}_index").astype(np.int64).reshape(-1).tolist()]
         # Stimuli are not refused for an index that does not fit: their electrodes are then unknown.
@@ -123,6 +153,18 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
         flat = values.reshape(-1).tolist()
         return padded([flat[start:end] for start, end in pairwise(ends)])
     return values if values.shape[:1] == (n,) and values.ndim <= 2 else None
+
+
+def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
+    """The electrodes in rows of the electrodes table that a column refers to; None for those of another table."""
+    table, column = file.node(ELECTRODES_TABLE), file.dataset(at)
+    to = column.attrs.get("table")
+    if not isinstance(to, h5py.Reference) or not to or table is None or file.file[to] != table:
+        return None
+    numbers = file.read(f"{ELECTRODES_TABLE}/id").astype(np.int64).reshape(-1)
+    if np.any((rows < 0) | (rows >= len(numbers))):
+        return None
+    return np.maximum(numbers[rows], UNKNOWN)
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:
@@ -135,7 +177,8 @@ def _of_series(file: Hdf5File, at: str) -> Column:
         data = file.read(f"{at}/data")
         if data.dtype.kind == "U":
             return time_s
-        is_pulse = data > 0 if file.attribute(at, "neurodata_type") == "IntervalSeries" else data != 0
+        is_interval = file.attribute(at, "neurodata_type") == "IntervalSeries"
+        is_pulse = data > 0 if is_interval else _from_zero(file, f"{at}/data", data) != 0
         return np.asarray(time_s[is_pulse] if np.any(is_pulse) else time_s)
     rate_hz, start_s = file.attribute(f"{at}/starting_time", "rate"), file.first(f"{at}/starting_time")
     if not is_positive(rate_hz) or not isinstance(start_s, int | float):
@@ -144,17 +187,37 @@ def _of_series(file: Hdf5File, at: str) -> Column:
 
 
 def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
-    """The samples at which a stimulus leaves 0 by more than half of its largest magnitude, for the first time in 1 ms.
+    """The samples at which a stimulus leaves 0, for the first time in 1 ms.
 
-    They are read in blocks, as they may be as many as the recording's.
+    If most samples are exactly 0, every other one is away from it. Otherwise the stimulus was measured, with noise, and
+    away is more than half of its largest magnitude. Samples are read in blocks, as they may be as many as the
+    recording's.
     """
     dataset = file.dataset(at)
-    if dataset.ndim != 1 or dataset.dtype.kind not in "iuf" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
+    if dataset.ndim != 1 or dataset.dtype.kind not in "iufb" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
         raise InvalidFile(f"{file.path}: expected one column of numbers at /{at}, got {dataset.dtype} {dataset.shape}")
     blocks = range(0, len(dataset), _BLOCK)
-    half = max((float(np.max(np.abs(dataset[b : b + _BLOCK].astype(np.float64)))) for b in blocks), default=0.0) / 2
-    if not half > 0:
+
+    def magnitude(b: int) -> Column:
+        # Samples that are not known (NaN) are no stimulus.
+        return np.asarray(np.abs(np.nan_to_num(_from_zero(file, at, dataset[b : b + _BLOCK]))))
+
+    largest, n_zeros = 0.0, 0
+    for b in blocks:
+        block = magnitude(b)
+        largest, n_zeros = max(largest, float(np.max(block))), n_zeros + int(np.count_nonzero(block == 0))
+    if not largest > 0:
         return np.empty(0)
-    away = [np.flatnonzero(np.abs(dataset[b : b + _BLOCK].astype(np.float64)) > half) + b for b in blocks]
-    samples = np.concatenate(away)
+    least = 0.0 if n_zeros > len(dataset) / 2 else largest / 2
+    samples = np.concatenate([np.flatnonzero(magnitude(b) > least) + b for b in blocks])
     return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > APART_S * rate_hz])
+
+
+def _from_zero(file: Hdf5File, at: str, data: Column) -> Column:
+    """Samples as they are stored, less the one that stands for 0: NWB's values are data x conversion + offset."""
+    offset, conversion = (file.attribute(at, name) for name in ("offset", "conversion"))
+    if not isinstance(offset, float) or not isinstance(conversion, float) or not conversion or not offset:
+        return data.astype(np.float64)
+    zero = -offset / conversion
+    # Offset and conversion are rounded.
+    return np.where(np.isclose(data, zero, rtol=1e-6, atol=0), 0.0, data - zero)

@@ -64,8 +64,8 @@ def read_response_npz(path: Path) -> ResponseTable:
     if per_stimulus == {n_channels} and n != n_channels:
         raise UnusableData(f"{key}: expected a row for each of {n_channels} stimuli, got {values.shape}: transpose it")
     window = arrays.pop("response_window_ms", None)
-    if window is not None and np.shape(window) != (2,):
-        raise UnusableData(f"response_window_ms: expected start and end in ms, got shape {np.shape(window)}")
+    if window is not None and (window.shape != (2,) or window.dtype.kind not in "iuf"):
+        raise UnusableData(f"response_window_ms: expected start and end in ms, got {window.dtype} {window.shape}")
     window_ms = None if window is None else (float(window[0]), float(window[1]))
     labels = arrays.pop("channel_label", np.arange(n_channels))
     provenance = {"source": path.name, "format": "NPZ of responses"}
@@ -185,7 +185,8 @@ def _table(
     has_times = "stimulus_time_s" in columns
     times = np.asarray(columns.pop("stimulus_time_s", np.arange(len(values), dtype=np.float64)))
     plain = PlainColumns(np.empty(0), np.empty(0, np.int64), times, channel_label=labels, **columns)
-    if len(values) != len(times):
+    # Times in another shape are refused below.
+    if times.ndim == 1 and len(values) != len(times):
         raise UnusableData(f"responses: expected a row for each of {len(times)} stimuli, got {len(values)}")
     if not has_times:
         order = "the table has no stimulus times: its rows are assumed to be in order of presentation"

@@ -10,7 +10,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from animat.errors import InvalidFile
 from animat.recordings.columns import duration_between
@@ -32,6 +32,8 @@ from animat.tables import UNKNOWN
 
 OLD_LSB_V = 6.294e-6
 """Volts per step in the old layout, if the file does not state it."""
+Scale = float | Float64[np.ndarray, " channels"]
+"""Microvolts per step, of all channels or of each."""
 
 
 def open_traces(
@@ -92,7 +94,7 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
     series = [name for name in names if file.attribute(f"acquisition/{name}", kind) == "ElectricalSeries"]
     if not series:
         raise InvalidFile(f"{path}: expected raw traces as an ElectricalSeries in /acquisition, found none")
-    at = f"acquisition/{choose(f'{path}: series', '--part', series, part)}"
+    at = f"acquisition/{choose(f'{path}: series', '--part', series, part, commands='animat convert')}"
     rate_hz = file.attribute(f"{at}/starting_time", "rate")
     if not is_positive(rate_hz):
         raise InvalidFile(f"{path}: expected the rate of /{at} in Hz at its starting_time, found none")
@@ -101,7 +103,9 @@ def _nwb(file: Hdf5File, part: str | None, base: Recording) -> RawTraces:
         rows = file.read(f"{at}/electrodes").astype(np.int64)
         if len(rows) and rows.max() < len(base.channels) and rows.min() >= 0:
             labels = base.channels.label[rows]
-    scale = 1e6 * _number(file.attribute(f"{at}/data", "conversion"), 1.0)
+    scale: Scale = 1e6 * _number(file.attribute(f"{at}/data", "conversion"), 1.0)
+    if file.has(f"{at}/channel_conversion"):
+        scale = scale * file.read(f"{at}/channel_conversion").astype(np.float64).reshape(-1)
     start_s = float(file.first(f"{at}/starting_time") or 0.0)
     base = replace(base, sampling_rate_hz=float(rate_hz))
     return _traces(file, f"{at}/data", base, scale, start_s=start_s, labels=labels)
@@ -111,7 +115,7 @@ def _traces(
     file: Hdf5File,
     where: str,
     base: Recording,
-    uv_per_step: float,
+    uv_per_step: Scale,
     *,
     channels_first: bool = False,
     start_s: float = 0.0,
@@ -130,6 +134,8 @@ def _traces(
             "spikes detected by the rig can be read without it"
         )
     samples, columns = dataset.shape[::-1] if channels_first else dataset.shape
+    if isinstance(uv_per_step, np.ndarray) and len(uv_per_step) != columns:
+        raise InvalidFile(f"{path}: expected a conversion of each of the {columns} traces, got {len(uv_per_step)}")
     table = base.channels
     if labels is None and len(table) == columns:
         rows = np.arange(columns)
@@ -147,7 +153,8 @@ def _traces(
     else:
         used, nowhere = np.arange(columns), np.full(columns, np.nan)
         channels = Channels(used.astype(np.str_), np.full(columns, UNKNOWN), nowhere, nowhere)
-    read_uv = partial(read_dataset_uv, path, where, used, channels_first, uv_per_step)
+    scale = uv_per_step[used] if isinstance(uv_per_step, np.ndarray) else uv_per_step
+    read_uv = partial(read_dataset_uv, path, where, used, channels_first, scale)
     return RawTraces(read_uv, channels, int(samples), base.sampling_rate_hz, start_s)
 
 
@@ -156,7 +163,7 @@ def read_dataset_uv(
     where: str,
     columns: Int64[np.ndarray, " channels"],
     channels_first: bool,
-    uv_per_step: float,
+    uv_per_step: Scale,
     start: int,
     stop: int,
 ) -> Float32[np.ndarray, "samples channels"]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Bool
 
 from animat.errors import in_min
 from animat.recordings.findings import Finding
@@ -33,14 +34,19 @@ def series_findings(series: Sequence[Responses]) -> Iterator[Finding]:
         message = f"the recordings have {fewest:,} to {most:,} channels: {advice}"
         yield Finding("other-channels", "warning", message, float(most - fewest))
         return
-    tables = [responses.channels for responses in series if responses.channels is not None]
-    if different := max((_different(tables[0], table) for table in tables[1:]), default=0):
+    if different := _different([responses.channels for responses in series if responses.channels is not None]):
         message = f"{different:,} of the {most:,} channels are not the same in all recordings: {advice}"
         yield Finding("other-channels", "warning", message, float(different))
 
 
-def _different(table: Channels, other: Channels) -> int:
-    """How many channels of one table are not in another: by electrode if it is known of all, otherwise by label."""
+def _different(tables: Sequence[Channels]) -> int:
+    """The most channels of any of these tables that are not in all of the others."""
+    in_all = [np.all([_is_in(table, other) for other in tables], axis=0) for table in tables]
+    return max((int(np.count_nonzero(~each)) for each in in_all), default=0)
+
+
+def _is_in(table: Channels, other: Channels) -> Bool[np.ndarray, " channels"]:
+    """Whether each channel of a table is in another: by electrode if it is known of all, otherwise by label."""
     knows = all(np.all(each.electrode != UNKNOWN) for each in (table, other))
     one, two = (each.electrode if knows else each.label for each in (table, other))
-    return int(np.count_nonzero(~np.isin(one, two)))
+    return np.isin(one, two)

@@ -124,7 +124,10 @@ def _timing(
         yield Finding("dead-window", "refuse", message)
         return
     read = stimuli.is_last_of_presentation
-    gap_ms = 1e3 * np.append(np.diff(stimuli.time_s), np.inf)
+    # Up to the next row that is a pulse, as nothing is delivered at a rest.
+    pulses = np.flatnonzero(~stimuli.is_rest)
+    following = np.searchsorted(pulses, np.arange(len(stimuli)), side="right")
+    gap_ms = 1e3 * (np.append(stimuli.time_s[pulses], np.inf)[following] - stimuli.time_s)
     # 1e-6 ms: an interval equal to the window's end is not shorter for being rounded.
     if overlapping := int(np.count_nonzero(read & (gap_ms < end_ms - 1e-6))):
         message = (
