@@ -200,9 +200,10 @@ class Driver:
         stretch = self._observe(stimuli, duration_s, since_s)
         pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(since_s - self._zero_s + times_s)
         after_s = pulse_time_s[-1:]
-        # Lateness of the real times.
+        # Lateness of the real times; where nothing is delivered, no pulse is late.
         due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
-        late_s = float(np.max(pulse_time_s - due_at_s))
+        given = [i for i, stimulus in enumerate(stimuli) if not stimulus.is_rest]
+        late_s = float(np.max((pulse_time_s - due_at_s)[given], initial=0.0))
         late_s = late_s if late_s > self._least_late_s else 0.0
         drawn_from = None if is_warm_up else agent.drawn_from
         x_hz, response = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
