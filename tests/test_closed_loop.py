@@ -517,6 +517,16 @@ def test_a_stimulus_is_repeated_at_most_so_often(tmp_path: Path) -> None:
     assert session.episodes[0].is_whole
 
 
+def test_the_shuffled_control_repeats_what_it_has_delivered(tmp_path: Path) -> None:
+    loop = loop_of(burst_threshold=0.0, on_burst="repeat", most_repeats=3)
+    with FakeCulture() as culture:
+        agents = [Agent("shuffled", "", OneCondition(1), "shuffled")]
+        session = run_session(culture, loop, agents, tmp_path, episodes=3)
+    delivered = np.array([tick.delivered for tick in session.ticks]).reshape(3 * 6, 4)
+    assert np.all(delivered == delivered[:, :1])
+    assert len(set(delivered[:, 0].tolist())) > 1
+
+
 class RecordedAs:
     """What a loop takes from a policy."""
 

@@ -125,14 +125,13 @@ class Driver:
             seen = observation
             if remembering is not None:
                 seen = np.concatenate([observation, remembering.observed(self._remembered)])
-            chosen = self._choose(agent, controller, seen)
+            chosen = delivered = self._choose(agent, controller, seen)
+            if agent.delivery == "shuffled":
+                delivered = int(self._rng.integers(len(loop.conditions)))
+            elif agent.delivery == "yoked":
+                delivered = source[iteration % len(source)]
             repeats = 0
             while True:
-                delivered = chosen
-                if agent.delivery == "shuffled":
-                    delivered = int(self._rng.integers(len(loop.conditions)))
-                elif agent.delivery == "yoked":
-                    delivered = source[iteration % len(source)]
                 tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if not again:
                     break
