@@ -252,6 +252,18 @@ def test_presentations_are_those_of_a_recording(tmp_path: Path) -> None:
     assert {tick.chosen for tick in session.ticks} == set(range(5))
 
 
+@pytest.mark.parametrize("rate_hz", [1_000.0, 10_000.0, 12_500.0])
+def test_pulses_that_are_on_time_are_not_late_by_the_rounding_to_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate_hz: float
+) -> None:
+    monkeypatch.setattr(FakeCulture, "sampling_rate_hz", rate_hz)
+    # Periods that are no whole number of samples.
+    loop = loop_of(conditions=tuple(Condition(f"{f:g} Hz", f, "Hz") for f in (7.0, 15.0, 30.0, 60.0, 70.0)))
+    with FakeCulture() as culture:
+        session = run_session(culture, loop, [RANDOM], tmp_path, episodes=8)
+    assert session.outline.late == 0, session.outline.latest_s
+
+
 def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(tmp_path: Path) -> None:
     class Ticking:
         """A clock that ticks each time that it is looked at."""
@@ -503,6 +515,16 @@ def test_a_stimulus_is_repeated_at_most_so_often(tmp_path: Path) -> None:
         session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1)
     assert [tick.handled for tick in session.ticks] == ["repeated", "repeated", "used"] * 6
     assert session.episodes[0].is_whole
+
+
+def test_the_shuffled_control_repeats_what_it_has_delivered(tmp_path: Path) -> None:
+    loop = loop_of(burst_threshold=0.0, on_burst="repeat", most_repeats=3)
+    with FakeCulture() as culture:
+        agents = [Agent("shuffled", "", OneCondition(1), "shuffled")]
+        session = run_session(culture, loop, agents, tmp_path, episodes=3)
+    delivered = np.array([tick.delivered for tick in session.ticks]).reshape(3 * 6, 4)
+    assert np.all(delivered == delivered[:, :1])
+    assert len(set(delivered[:, 0].tolist())) > 1
 
 
 class RecordedAs:

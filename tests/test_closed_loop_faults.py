@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from animat.cli import main
-from animat.closed_loop.agents import Agent
+from animat.closed_loop.agents import Agent, OneCondition
 from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
@@ -30,11 +30,12 @@ from animat.cultures.request import Request
 from animat.cultures.safety import SIMULATED_LIMITS
 from animat.errors import InvalidArgument, InvalidFile, UnsafeStimulus, UnusableData
 from animat.recordings.reading import read_recording
+from animat.responses.condition import RESTING, Condition
 from animat.robots import Navigation
 from animat.stimulation.pulse import BALANCED_PULSE
 from animat.stimulation.stimulus import Stimulus
 from fake_culture import FakeCulture, Fault
-from test_closed_loop import RANDOM, assert_read_alike, loop_of
+from test_closed_loop import CONDITIONS, RANDOM, assert_read_alike, loop_of
 
 LONG = Navigation(episode_limit=100_000, stride_m=1e-9)
 
@@ -401,6 +402,24 @@ def test_a_backend_that_answers_late(tmp_path: Path, on_late: str) -> None:
             assert session.episodes[0].late == 1
             assert clock.time_s == pytest.approx(100.0 + culture.now_s - 12.0, abs=1e-6)
             assert_read_alike(tmp_path, loop)
+
+
+@pytest.mark.parametrize("how", ["silent", "resting"])
+def test_where_nothing_is_delivered_no_pulse_is_late(tmp_path: Path, how: str) -> None:
+    clock = FakeClock()
+
+    def late(culture: FakeCulture, observed: Observed) -> Observed:
+        clock.time_s += observed.duration_s + 0.25
+        return observed
+
+    rest = Condition("no electrode", 0.0, frequencies_hz=(20.0,), electrodes=RESTING)
+    conditions = {"silent": CONDITIONS, "resting": (rest,)}[how]
+    agent = Agent("one", "", OneCondition(0), "silent" if how == "silent" else "chosen")
+    loop = loop_of(conditions=conditions, real_time=True, on_late="stop")
+    with FakeCulture(fault=late, at=3) as culture:
+        session = run_session(culture, loop, [agent], tmp_path, episodes=1, clock=clock)
+    assert session.ending.by == "plan", session.ending
+    assert session.outline.late == 0 and culture.pulses == 0
 
 
 class Broken:

@@ -80,7 +80,7 @@ protocols = st.builds(
     trials=st.integers(1, 9),
     setup_s=st.floats(0, 5),
     pause_s=st.floats(0, 5),
-    tail_s=st.floats(0, 1),
+    tail_s=st.floats(50e-6, 1),
     pulse=st.sampled_from([PUBLISHED_PULSE, BALANCED_PULSE]),
 )
 
@@ -100,6 +100,8 @@ def test_a_schedule_does_what_its_protocol_says(protocol: Protocol, seed: int) -
         np.testing.assert_allclose(stimuli.time_s * 20_000, np.rint(stimuli.time_s * 20_000), atol=1e-6)
         assert block.setup_s == protocol.setup_s
         assert stimuli.time_s[0] == pytest.approx(protocol.pause_s, abs=51e-6)
+        # A delivery takes stimuli before its end only.
+        assert stimuli.time_s[-1] < block.duration_s
         assert block.duration_s == pytest.approx(stimuli.time_s[-1] + protocol.tail_s, abs=51e-6)
         np.testing.assert_allclose(np.diff(stimuli.time_s), 1 / stimuli.frequency_hz[1:], atol=101e-6)
         presentations += stimuli.presentation.tolist()
@@ -193,7 +195,8 @@ NOT_PROTOCOLS = {
     '{"pause_s": null}': "pause_s: expected a number, got None",
     '{"pause_s": Infinity}': "pause_s: expected a finite number",
     '{"setup_s": 1e6}': "setup_s: expected at most 86,400",
-    '{"tail_s": -1}': "tail_s: expected at least 0",
+    '{"tail_s": -1}': "tail_s: expected at least 5e-05",
+    '{"tail_s": 0}': "tail_s: expected at least 5e-05, got 0",
     '{"pulse": []}': "pulse.phases: expected at least 1",
     '{"pulse": {"duration_us": 1}}': "pulse.phases: expected a list, got {'duration_us': 1}",
     '{"pulse": [{"duration_us": 200}]}': "pulse.phases.amplitude: expected either amplitude_mv or amplitude_ua",

@@ -328,6 +328,15 @@ def test_only_a_guard_admits() -> None:
         Admitted([one()], 0.0, by=None)
 
 
+def test_a_gap_of_more_than_a_second_does_not_keep_the_first_stimulus_waiting() -> None:
+    guard = Guard(replace(SIMULATED_LIMITS, gap_us=5e6), SITES)
+    ends_s = 0.5 + BALANCED_PULSE.duration_us * 1e-6
+    guard.admit([Stimulus(0.5, (10,), BALANCED_PULSE)], 0.0)
+    with pytest.raises(UnsafeStimulus, match="gap_us: expected"):
+        guard.check([Stimulus(0.0, (11,), BALANCED_PULSE)], ends_s + 4.999)
+    guard.check([Stimulus(0.0, (11,), BALANCED_PULSE)], ends_s + 5)
+
+
 def test_limits_that_cannot_be_are_refused() -> None:
     with pytest.raises(InvalidArgument, match="phase_us: expected"):
         replace(LIMITS, phase_us=(500.0, 100.0))

@@ -655,6 +655,19 @@ def test_a_device_is_held_by_one_object_and_forgets_nothing_when_another_takes_i
         assert first.now_s < ended_s + 0.1
 
 
+@pytest.mark.parametrize("limit", ["interval_us", "gap_us"])
+def test_who_takes_a_device_over_waits_as_long_as_its_limits_look_back(
+    limit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Seen, "device", holding.of_the_machine("shared"), raising=False)
+    limits = replace(SIMULATED_LIMITS, **{limit: 3e6})
+    with Seen(limits=limits):
+        pass
+    with Seen(limits=limits) as second:
+        # Each counts from the same time.
+        assert second.now_s == FakeCulture().now_s + 3
+
+
 HOLD = """
 import sys
 from pathlib import Path

@@ -72,6 +72,8 @@ class Driver:
         self._channels, self._rate_hz = culture.channels, culture.sampling_rate_hz
         # A device keeps its own time, from which the machine's clock drifts away.
         self._is_held_back = loop.real_time and culture.device is None
+        # The grid and the rounding to samples move a pulse by half a step each.
+        self._least_late_s = max(TICK_S, (TICK_S + 1 / self._rate_hz) / 2) + 1e-9
         self._adaptive = None if loop.adaptive_from is None else AdaptiveThresholds(loop.adaptive_from)
         self._percentiles = loop.percentiles
         self._decoder, self._members = loop.decoder, loop.readouts.members(culture.channels)
@@ -123,14 +125,13 @@ class Driver:
             seen = observation
             if remembering is not None:
                 seen = np.concatenate([observation, remembering.observed(self._remembered)])
-            chosen = self._choose(agent, controller, seen)
+            chosen = delivered = self._choose(agent, controller, seen)
+            if agent.delivery == "shuffled":
+                delivered = int(self._rng.integers(len(loop.conditions)))
+            elif agent.delivery == "yoked":
+                delivered = source[iteration % len(source)]
             repeats = 0
             while True:
-                delivered = chosen
-                if agent.delivery == "shuffled":
-                    delivered = int(self._rng.integers(len(loop.conditions)))
-                elif agent.delivery == "yoked":
-                    delivered = source[iteration % len(source)]
                 tick, again = self._present(agent, episode, iteration, chosen, delivered, repeats)
                 if not again:
                     break
@@ -198,10 +199,11 @@ class Driver:
         stretch = self._observe(stimuli, duration_s, since_s)
         pulse_time_s = stretch.stimulus_time_s if stimuli else self._on_samples(since_s - self._zero_s + times_s)
         after_s = pulse_time_s[-1:]
-        # Lateness of the real times; up to a grid step comes from the grid and from rounding to samples.
+        # Lateness of the real times; where nothing is delivered, no pulse is late.
         due_at_s = due_s - self._zero_s + np.arange(loop.pulses) / frequency_hz
-        late_s = float(np.max(pulse_time_s - due_at_s))
-        late_s = late_s if late_s > TICK_S + 1e-9 else 0.0
+        given = [i for i, stimulus in enumerate(stimuli) if not stimulus.is_rest]
+        late_s = float(np.max((pulse_time_s - due_at_s)[given], initial=0.0))
+        late_s = late_s if late_s > self._least_late_s else 0.0
         drawn_from = None if is_warm_up else agent.drawn_from
         x_hz, response = read_response(loop, drawn_from, stretch, self._members, after_s, self._rng)
         is_burst = response["is_burst"]

@@ -34,7 +34,7 @@ class Tick:
             something went wrong before the robot had moved.
         command: that moved the robot, one for each readout where there are several; None where it was not moved.
         reward, observation: of the step, and after it.
-        late_s: largest lateness of its pulses; 0 within a step of the grid.
+        late_s: largest lateness of its pulses; 0 if the grid and the rounding to samples explain it.
         decided_s: from when the data of the previous response window had arrived until this presentation was requested.
         wall_s: the machine's clock at the end, from the start of the session.
         neurons: the history state after it, trace and load; empty if no agent sees it.

@@ -28,8 +28,8 @@ class History:
         self._starts: list[int] = []
         self._starts_on: dict[int, list[int]] = {}
         self._seen_ns = 0
-        self.busy_until_ns = -NS
-        """When the last stimulus ends."""
+        self.busy_until_ns = -(2**63)
+        """When the last stimulus ends; before any, too long ago for every gap."""
 
     def in_second_to(self, time_ns: int, electrode: int | None = None) -> int:
         """Stimuli, on one electrode or on any, that began less than a second before a time not before the last."""

@@ -162,8 +162,8 @@ class Openable(abc.ABC):
                     limits = self.limits
                     plain_limits(self._asked_limits or limits).check_within(self.device_limits)
                     if is_handed_over:
-                        # What the other delivered is unknown here: wait as long as rates and intervals look back.
-                        self._rest(max(1.0, limits.interval_us * 1e-6))
+                        # What the other delivered is unknown here: wait as long as any limit on pace looks back.
+                        self._rest(max(1.0, limits.interval_us * 1e-6, limits.gap_us * 1e-6))
                     now_s = seconds("now_s", self.now_s)
                     self.__turns = Turns(Guard(limits, self.stimulation_electrodes, self.__history, now_s))
             except BaseException as error:

@@ -28,6 +28,8 @@ _FORMER = {"presentations": "trials"}
 Count = Annotated[Whole, Field(ge=1, le=1_000_000)]
 Pulses = Annotated[Whole, Field(ge=1, le=_MOST_PULSES)]
 Seconds = Annotated[Number, Field(ge=0, le=86_400)]
+Tail = Annotated[Number, Field(ge=50e-6, le=86_400)]
+"""A delivery ends after the time of its last stimulus, by a step of the grid of times or more."""
 Frequency = Annotated[Number, Field(gt=0, le=10_000)]
 
 
@@ -74,7 +76,7 @@ class Protocol:
         setup_s: set-up time before each block (mixed: before the only block). It is not recorded, and the recording's
             clock leaves it out.
         pause_s: recorded without stimuli before each block.
-        tail_s: recorded after the last pulse of each block.
+        tail_s: recorded after the last pulse of each block; at least 50 us.
         pulse: what every electrode delivers.
 
     Raises:
@@ -91,7 +93,7 @@ class Protocol:
     places: Annotated[Places, SkipValidation] = ()
     setup_s: Seconds = 14.0
     pause_s: Seconds = 2.0
-    tail_s: Seconds = 0.1
+    tail_s: Tail = 0.1
     pulse: Annotated[Pulse, BeforeValidator(Pulse.from_list)] = PUBLISHED_PULSE
 
     def __post_init__(self) -> None:
