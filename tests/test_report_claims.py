@@ -23,7 +23,7 @@ from animat.report.results import ComparedReturns, ControlReturns, OverCultures,
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arm_differences, arms_table
-from animat.studies.captions import CULTURE
+from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.cultures import CulturesRun
 from animat.studies.cultures_page import _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
@@ -31,7 +31,7 @@ from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper, _facts_of_culture
+from animat.studies.publishing import _as_in_paper, _facts_of_culture, _lead, _pictures
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
 from animat.studies.source import Source
@@ -269,6 +269,22 @@ def test_two_robots_of_a_kind_are_distinguished(tmp_path: Path) -> None:
         RobotSpec("culture", kind="cartpole")
     with pytest.raises(InvalidArgument, match="cartpole, detour, navigation"):
         RobotSpec("as printed")
+
+
+def test_names_of_robots_keep_their_capitals_and_every_section_its_anchor(tmp_path: Path) -> None:
+    """A Gymnasium CartPole beside the house's own cartpole was called Cartpole too, and its entry led to the other."""
+    robots = (RobotSpec("my Rover", kind="navigation"), RobotSpec("CartPole", kind="cartpole"), RobotSpec("cartpole"))
+    assert _lead(Study(robots=robots)).startswith("My Rover, CartPole and cartpole, driven through a virtual culture.")
+    rows = [(score("CartPole", "a", 5.0, 4.0, 6.0, 0.0, 10.0), np.ones(2))]
+    (tmp_path / "figures").mkdir()
+    save_figure(draw_headline(rows), tmp_path / "figures" / "CartPole-controls.png")
+    (picture,) = _pictures(tmp_path, "CartPole", ROBOT, {"policies": 2, "episodes": 3})
+    assert picture.title == "CartPole: controls"
+    titles = ("CartPole", "Cartpole", "Scores", "Cartpole-", "Scores", "my Rover")
+    page = write_page(tmp_path / "page.html", "t", "l", [Section(title) for title in titles], []).read_text()
+    anchors = re.findall('<h2 id="([^"]*)">', page)
+    assert len(set(anchors)) == len(titles) and re.findall('href="#([^"]*)"', page) == anchors
+    assert anchors[0] == "cartpole" and anchors[-1] == "my-rover"
 
 
 # --- what arms are evaluated on ------------------------------------------------------------------------------------

@@ -120,10 +120,16 @@ class Section:
     verbatim: str = ""
     links: tuple[str, ...] = ()
 
-    @property
-    def anchor(self) -> str:
-        """Its fragment identifier on the page."""
-        return "".join(letter if letter.isalnum() else "-" for letter in self.title.lower())
+
+def anchors_of(sections: Sequence[Section]) -> list[str]:
+    """A fragment identifier on the page for each section; of sections with nearly the same title each has its own."""
+    anchors: list[str] = []
+    for section in sections:
+        anchor = "".join(letter if letter.isalnum() else "-" for letter in section.title.lower())
+        while anchor in anchors:
+            anchor += "-"
+        anchors.append(anchor)
+    return anchors
 
 
 def write_page(
@@ -147,7 +153,8 @@ def write_page(
     )
     environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url}
     page = environment.get_template("report.html.j2")
-    return write_whole(Path(path), page.render(title=title, lead=lead, sections=sections, colophon=colophon))
+    filled = page.render(title=title, lead=lead, sections=sections, anchors=anchors_of(sections), colophon=colophon)
+    return write_whole(Path(path), filled)
 
 
 def _data_url(png: Path) -> str:

@@ -63,7 +63,7 @@ class Publish(StudyTask):
         facts = {name: getattr(study, name) for name in ("policies", "episodes", "episodes_over_time")}
         for spec in study.robots:
             pictures = _pictures(folder, spec.name, ROBOT, {**facts, "round": f"{round_of(study, spec):,}"})
-            sections.append(Section(spec.name.capitalize(), pictures=pictures))
+            sections.append(Section(_begin(spec.name), pictures=pictures))
         if kept:
             table = report_tables.controllability_table(study, folder, kept)
             pictures = _pictures(folder, "culture", CULTURE, _facts_of_culture(series))
@@ -89,7 +89,12 @@ def _lead(study: Study) -> str:
     robots = _and([spec.name for spec in study.robots])
     neurons = {"virtual": "a virtual culture", "files": "recordings"}[study.culture.kind]
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
-    return f"{robots.capitalize()}, driven through {neurons}. {summarise_arms(study)}, trained for {trained}."
+    return f"{_begin(robots)}, driven through {neurons}. {summarise_arms(study)}, trained for {trained}."
+
+
+def _begin(text: str) -> str:
+    """The text with a capital at its beginning; names in it keep their own."""
+    return text[:1].upper() + text[1:]
 
 
 def _and(parts: Sequence[str]) -> str:
@@ -115,7 +120,7 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
             mapping = f"In “{best.arm}” {describe_mapping(study.arm(best.arm))}"
-            text = f"{spec.name[:1].upper() + spec.name[1:]}: {_describe(best)}{at_random}"
+            text = f"{_begin(spec.name)}: {_describe(best)}{at_random}"
             sentences.append(text if mapping in explained else f"{text} {mapping}")
             explained.append(mapping)
     rows = results.comparisons
@@ -237,7 +242,7 @@ def _pictures(
     for name, (title, caption, numbers) in captions.items():
         file, files = f"figures/{of}-{name}", (each.format(of=of) for each in numbers)
         if (folder / f"{file}.png").exists():
-            pictures.append(picture_of(folder, file, f"{of.capitalize()}: {title}", caption.format(**facts), *files))
+            pictures.append(picture_of(folder, file, f"{_begin(of)}: {title}", caption.format(**facts), *files))
     return tuple(pictures)
 
 
@@ -261,7 +266,7 @@ def _controls(study: Study, results: Results) -> Section:
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
-        ("Each control removes something.", *(each[:1].upper() + each[1:] for each in sentences)),
+        ("Each control removes something.", *map(_begin, sentences)),
         points,
         (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results.controls)),
     )
