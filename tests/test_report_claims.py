@@ -31,7 +31,7 @@ from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper, _facts_of_culture, _lead, _pictures
+from animat.studies.publishing import _as_in_paper, _colophon, _facts_of_culture, _lead, _pictures
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
 from animat.studies.source import Source
@@ -243,6 +243,26 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "Drawing from a histogram" not in drawn and "measured responses" in drawn["Histogram"]
     alone = dict(decisions(replace(changed, robots=(RobotSpec("navigation"),))))
     assert "Pole mass" not in alone
+
+
+def test_a_study_without_neurons_says_nothing_of_a_culture() -> None:
+    """It was said to be driven through a virtual culture, whose pulse, bursts and histogram were then described."""
+    alone = replace(paper_study(quick=True), arms=(Arm("alone", mapping="none"),), comparisons=())
+    assert _lead(alone).startswith("Cartpole and navigation, driven without neurons. An arm is")
+    decided = [name for name, _ in decisions(alone)]
+    assert not {"Recordings", "The culture", "Pulse", "Bursts", "Histogram range", "Percentiles"} & set(decided)
+    assert {"Policies", "Iterations on cartpole", "Pole mass", "Walls", "Learning"} <= set(decided)
+    with_neurons = [name for name, _ in decisions(replace(alone, arms=(Arm("1 threshold"), *alone.arms)))]
+    assert [name for name in with_neurons if name in decided] == decided
+
+
+def test_a_report_names_the_seed_of_a_culture_only_if_one_was_grown() -> None:
+    manifest = {"versions": {"animat": "0"}, "fingerprint": "f"}
+    grown = replace(paper_study(), culture=Source(seed=4), seed=2)
+    assert _colophon(grown, manifest)[1].startswith("Seeds: culture 4, training and evaluation 2. ")
+    at_hand = replace(grown, culture=Source("files", files=("mine",)))
+    for study in (at_hand, replace(grown, arms=(Arm("alone", mapping="none"),), comparisons=())):
+        assert _colophon(study, manifest)[1].startswith("Seeds: training and evaluation 2. ")
 
 
 # --- robots of one kind -----------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float64
@@ -75,21 +75,32 @@ class Publish(StudyTask):
         if study.culture.kind == "files":
             settings += ", provided that the files are at the same paths relative to study.toml"
         sections += [_findings(results), Section("How it was done", (f"{settings}.",), verbatim=study_to_toml(study))]
-        versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
-        colophon = [
-            f"Made with {versions}.",
-            f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study with the same "
-            "versions on the same machine has the same results, bit for bit.",
-            f"Study {manifest['fingerprint']}",
+        return [
+            *drawn,
+            narrow,
+            write_page(folder / REPORT, study.title, _lead(study), sections, _colophon(study, manifest)),
         ]
-        return [*drawn, narrow, write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
 
 
 def _lead(study: Study) -> str:
     robots = _and([spec.name for spec in study.robots])
-    neurons = {"virtual": "a virtual culture", "files": "recordings"}[study.culture.kind]
+    neurons = {"virtual": "through a virtual culture", "files": "through recordings"}[study.culture.kind]
+    driven = neurons if study.needs_neurons else "without neurons"
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
-    return f"{_begin(robots)}, driven through {neurons}. {summarise_arms(study)}, trained for {trained}."
+    return f"{_begin(robots)}, driven {driven}. {summarise_arms(study)}, trained for {trained}."
+
+
+def _colophon(study: Study, manifest: Mapping[str, Any]) -> list[str]:
+    versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
+    # Recordings at hand have no seed.
+    is_grown = study.needs_neurons and study.culture.kind == "virtual"
+    seeds = f"culture {study.culture.seed}, " if is_grown else ""
+    return [
+        f"Made with {versions}.",
+        f"Seeds: {seeds}training and evaluation {study.seed}. The same study with the same versions on the same "
+        "machine has the same results, bit for bit.",
+        f"Study {manifest['fingerprint']}",
+    ]
 
 
 def _begin(text: str) -> str:
