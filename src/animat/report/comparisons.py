@@ -21,6 +21,7 @@ from animat.report.style import (
     add_common_legend,
     new_figure,
     style_axes,
+    title_figure,
 )
 
 
@@ -45,7 +46,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     policies. `pairs` has at least one comparison, all on one robot.
     """
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
-    figure.suptitle(title, fontsize=10)
+    title_figure(figure, title)
     rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])
     for whole, close, pair in zip(*rows, pairs, strict=True):
         row = pair.row

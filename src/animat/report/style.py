@@ -55,6 +55,11 @@ def wrapped(title: str, width_in: float) -> str:
     return fill(title.replace("+", "+ "), max(8, int(width_in / 0.082))).replace("+ ", "+")
 
 
+def title_figure(figure: Figure, title: str) -> None:
+    """Set the title of a figure, on as many lines as it needs; dollar signs in it, as in names of files, stay."""
+    figure.suptitle(wrapped(title, figure.get_figwidth()), fontsize=10, parse_math=False)
+
+
 def add_legend(axes: Axes, **place: Any) -> None:
     """Add a legend without a frame; `place` as for `Axes.legend`."""
     axes.legend(fontsize=8, frameon=False, **place)
@@ -118,7 +123,7 @@ def grid_of_panels(
     columns = min(columns, max(n, 1))
     rows = max(1, -(-n // columns))
     figure = new_figure(max(width_in * columns, 4.5), height_in * rows + 0.35)
-    figure.suptitle(title, fontsize=10)
+    title_figure(figure, title)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=share_x, sharey=share_y).reshape(-1)
     for axes in panels[n:]:
         axes.set_visible(False)
