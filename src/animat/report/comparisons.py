@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,9 @@ from animat.report.style import (
     style_axes,
     title_figure,
 )
+
+_NAME_WIDTH = 14
+"""Characters per line of an arm's name, as two stand side by side under a panel."""
 
 
 class Pair(NamedTuple):
@@ -73,11 +77,12 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
 
 
 def _name(arm: str, score: float | None) -> str:
-    """The arm on two lines, and its score on a third."""
-    name = arm if " " in arm else f"{arm} "
+    """The arm on two lines or more, and its score on the last."""
+    first, _, rest = arm.partition(" ")
+    lines = [each for part in (first, rest) for each in wrap(part, _NAME_WIDTH) or [""]]
     # Adding 0 turns -0 into 0.
     scored = "" if score is None else f"\nscore {round(score, 2) + 0.0:.2f}"
-    return with_minus(name.replace(" ", "\n", 1) + scored)
+    return with_minus("\n".join(lines) + scored)
 
 
 def _draw_boxes(axes: Axes, returns: Float64[np.ndarray, " policies"], place: int, colour: str) -> None:

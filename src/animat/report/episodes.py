@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from animat.report.style import Figure, grid_of_panels, new_figure, style_axes, title_figure
+from animat.report.style import Figure, grid_of_panels, new_figure, style_axes, title_figure, wrapped
 from animat.robots.base import Robot, capability
 from animat.robots.drawing import draw_robot
 
 Path = Float[np.ndarray, "iterations+1 observations"]
 _FRAMES = 7
+_WIDE_IN = 3.1
+"""Width of a panel of paths."""
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
@@ -22,10 +24,10 @@ def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: st
     Observations are in the robot's units.
     """
     draw = capability(robot, "draw_paths")
-    figure, panels = grid_of_panels(len(paths), 3, 3.1, 2.5, title)
+    figure, panels = grid_of_panels(len(paths), 3, _WIDE_IN, 2.5, title)
     for axes, (name, episodes) in zip(panels, paths.items(), strict=True):
         draw(axes, episodes)
-        style_axes(axes, name, axes.get_xlabel(), axes.get_ylabel())
+        style_axes(axes, wrapped(name, _WIDE_IN), axes.get_xlabel(), axes.get_ylabel())
     return figure
 
 

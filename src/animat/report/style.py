@@ -31,6 +31,10 @@ NON_BURST, BURST, MEDIAN = BLUE, RED, RED
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
 
 
+NAME_WIDTH = 28
+"""Characters per line of a name beside a panel, of which there are two in a row."""
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure of a size in inches; it needs no display and changes no global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
