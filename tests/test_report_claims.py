@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import re
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from animat.neurons.fidelity import Fidelity
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
-from animat.report.html import Picture, Section, with_links, with_minus, write_page
+from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Courses, draw_over_time
 from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
@@ -490,6 +492,28 @@ def test_files_that_a_page_names_are_links() -> None:
     low = Pair(replace(ROW, score_first=-0.07, score_second=-0.001), *np.array([[1.0, 2.0], [1.0, 2.0]]), 0.0)
     labels = [text.get_text() for text in draw_comparisons([low], "").axes[0].get_xticklabels()]
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
+
+
+def test_links_lead_to_files_whatever_their_folders_are_called(tmp_path: Path) -> None:
+    """`culture-12:30/report.html` was taken for a protocol, and all after # or ? for no part of the name."""
+    names = ("day #1", "12:30", "50%", "30%25", "a?b=1", "ü & <i>", "day -1", "1e-05", "plain_1")
+    files = tuple(f"culture-{name}/report.html" for name in names)
+    for file in files:
+        (tmp_path / file).parent.mkdir()
+        (tmp_path / file).touch()
+    there = save_figure(
+        draw_headline([(score("arm", "1-threshold", 5.0, 4.0, 6.0, 0.0, 10.0), np.ones(2))]), tmp_path / "a.png"
+    )
+    points = tuple((file, f"finished: {file}") for file in files)
+    tables = tuple(Table("t", ("a",), (("b",),), beside=file) for file in files)
+    picture = Picture(there, "t", "c", files)
+    section = Section("s", points=points, links=files, tables=tables, pictures=(picture,))
+    page = write_page(tmp_path / "page.html", "t", "l", [section], []).read_text()
+    found = [urlsplit(html.unescape(each)) for each in re.findall(r'href="([^"#][^"]*)"', page)]
+    assert all((each.scheme, each.netloc, each.query, each.fragment) == ("", "", "", "") for each in found)
+    assert [unquote(each.path) for each in found] == [*files, *files, *files]
+    shown = [html.unescape(each) for each in re.findall(r"finished: <a [^>]*>([^<]*)</a>", page)]
+    assert shown == [*files]
 
 
 def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> None:

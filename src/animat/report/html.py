@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import quote
 
 from PIL import Image
 
@@ -35,11 +36,17 @@ def with_links(text: str, files: Sequence[str] = ()) -> str:
     from markupsafe import Markup, escape
 
     # The longest first, as one name can contain another.
-    names = "|".join(re.escape(with_minus(file)) for file in sorted(files, key=len, reverse=True))
-    parts = re.split(f"({names})", with_minus(text)) if names else [with_minus(text)]
+    names = "|".join(re.escape(file) for file in sorted(files, key=len, reverse=True))
+    parts = re.split(f"({names})", text) if names else [text]
+    link = Markup('<a href="{}">{}</a>')
     # Every second part is a name.
-    linked = (Markup('<a href="{0}">{0}</a>').format(part) if i % 2 else escape(part) for i, part in enumerate(parts))
+    linked = (link.format(url_of(part), part) if i % 2 else escape(with_minus(part)) for i, part in enumerate(parts))
     return Markup("").join(linked)
+
+
+def url_of(file: str) -> str:
+    """The link to a file relative to the page: names can contain `#` or `:`, which mean something else in a link."""
+    return quote(file)
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url}
+    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": url_of}
     page = environment.get_template("report.html.j2")
     filled = page.render(title=title, lead=lead, sections=sections, anchors=anchors_of(sections), colophon=colophon)
     return write_whole(Path(path), filled)
