@@ -731,6 +731,7 @@ def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:
         (float("inf"), "∞"),
         (-float("inf"), "−∞"),
         (2.5e6, "2.50e+06"),
+        (1_905_088, "1,905,088"),
         (-1234.5, "−1,234"),
         (-0.0, "0"),
         (999.4, "999"),

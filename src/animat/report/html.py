@@ -178,7 +178,7 @@ def cell(value: Any) -> str:
         return with_minus(str(value))
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
-    whole = abs(value) < 1e6 and (value == int(value) or abs(value) >= 999.5)
+    whole = isinstance(value, int) or (abs(value) < 1e6 and (value == int(value) or abs(value) >= 999.5))
     # Trailing zeros stay: 23.0 next to 22.4.
     return (f"{value + 0:,.0f}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
 
