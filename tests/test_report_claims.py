@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import html
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -474,6 +476,38 @@ def test_a_figure_that_is_gone_is_named_by_the_error(part: str, tmp_path: Path) 
     assert not (tmp_path / "page.html").exists()
     with pytest.raises(InvalidFile, match=f"^{gone}: cannot be read: "):
         _ = Picture(gone, "a", "b").width_px
+
+
+def test_figures_saved_in_several_threads_share_no_settings(tmp_path: Path) -> None:
+    """Of two at a time the later SVG had other bytes, and matplotlib kept the settings of one for all later figures."""
+    from matplotlib import rcParams
+
+    first_began, second_began, first_ended = threading.Event(), threading.Event(), threading.Event()
+    texts = []
+
+    class First:
+        def savefig(self, path: Path, **_: Any) -> None:
+            first_began.set()
+            # Alone it waits in vain.
+            second_began.wait(0.3)
+            path.touch()
+
+    class Second:
+        def savefig(self, path: Path, **_: Any) -> None:
+            second_began.set()
+            first_ended.wait(10.0)
+            texts.append(rcParams["svg.fonttype"])
+            path.touch()
+
+    before = rcParams["svg.fonttype"]
+    with ThreadPoolExecutor(2) as executor:
+        first: Any = executor.submit(save_figure, First(), tmp_path / "a.svg")  # type: ignore[arg-type]
+        first.add_done_callback(lambda _: first_ended.set())
+        first_began.wait(10.0)
+        second: Any = executor.submit(save_figure, Second(), tmp_path / "b.svg")  # type: ignore[arg-type]
+        assert [first.result(), second.result()] == [tmp_path / "a.svg", tmp_path / "b.svg"]
+    after, rcParams["svg.fonttype"] = rcParams["svg.fonttype"], before
+    assert texts == ["none"] and after == before == "path"
 
 
 def test_there_is_one_kind_of_minus() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
@@ -29,6 +30,8 @@ NON_BURST, BURST, MEDIAN = BLUE, RED, RED
 
 # Text stays text in an SVG. Without the salt, element names are random, and the same figure gives different files.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
+_SAVING_LOCK = threading.Lock()
+"""matplotlib's settings are those of all threads, such as the workers of an executor."""
 
 
 NAME_WIDTH = 28
@@ -115,7 +118,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
         raise InvalidArgument(f"{path}: expected a figure's name to end in .png, .svg or .pdf, got {path.suffix!r}")
     # With a date, the same figure would give different files; PNG has none.
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with atomic_write(path) as beside, matplotlib.rc_context(_SAVING):
+    with atomic_write(path) as beside, _SAVING_LOCK, matplotlib.rc_context(_SAVING):
         figure.savefig(beside, format=kind, dpi=PNG_DPI, metadata=metadata)
     return path
 
