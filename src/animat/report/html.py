@@ -188,6 +188,7 @@ def with_error(value: float, error: float | None) -> str:
     if error is None or not (math.isfinite(value) and math.isfinite(error)):
         return f"{cell(value)}\u00a0±\u00a0{cell(error)}"
     decimals = min(3, max(0, 1 - math.floor(math.log10(error)))) if error > 0 else 1
-    rounded = f"{error:.{decimals}f}"
-    shown = rounded if error == 0 or float(rounded) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
-    return f"{value:.{decimals}f}\u00a0±\u00a0{shown}".replace("-", MINUS)
+    rounded = f"{error:,.{decimals}f}"
+    shown = rounded if error == 0 or round(error, decimals) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
+    # Adding 0 turns -0 into 0.
+    return f"{round(value, decimals) + 0.0:,.{decimals}f}\u00a0±\u00a0{shown}".replace("-", MINUS)
