@@ -17,29 +17,30 @@ import pytest
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
+from animat.recordings.findings import Finding
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
 from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Courses, draw_over_time
-from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
+from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Results, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arm_differences, arms_table
-from animat.studies.captions import CULTURE, ROBOT
+from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.cultures import CulturesRun
-from animat.studies.cultures_page import _summary
+from animat.studies.cultures_page import _describe, _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
 from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper, _colophon, _facts_of_culture, _lead, _pictures
+from animat.studies.publishing import _as_in_paper, _colophon, _facts_of, _facts_of_culture, _findings, _lead, _pictures
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
 from animat.studies.source import Source
-from animat.studies.specification import Arm, RobotSpec, Simulators, Study
+from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
@@ -258,6 +259,21 @@ def test_a_study_without_neurons_says_nothing_of_a_culture() -> None:
     assert {"Policies", "Iterations on cartpole", "Pole mass", "Walls", "Learning"} <= set(decided)
     with_neurons = [name for name, _ in decisions(replace(alone, arms=(Arm("1 threshold"), *alone.arms)))]
     assert [name for name in with_neurons if name in decided] == decided
+
+
+def test_one_of_anything_is_in_the_singular() -> None:
+    of_culture = _facts_of_culture([responses_of([1.0])])
+    facts = _facts_of(Study(policies=1, episodes=1, episodes_over_time=1)) | of_culture | {"round": "9"}
+    for caption in (HEADLINE, *(each.text for each in (*CULTURE.values(), *ROBOT.values()))):
+        said = caption.format(**facts)
+        assert not re.search(r"\b1 (policies|episodes|recordings|responses|channels)\b", said), said
+    many = _facts_of(Study(policies=2, episodes=1000, episodes_over_time=3))
+    assert many == {"policies": "2 policies", "episodes": "1,000 episodes", "episodes_over_time": "3 episodes"}
+    over = OverCultures("c", "cartpole", 1, 0.0, 1.0, 1.0, None, None, 1, 1, 1)
+    found = CulturesRun(Path(), {}, {}, {}, (over,), None)
+    assert "in 1 of 1 culture;" in _describe(Compared("c", "a", "b"), found.summary[0])
+    note = Results((), (), (), (), (), (Finding("bursts", "note", "m"), Finding("x", "warning", "m")))
+    assert _findings(note).paragraphs[0].startswith("1 warning and 1 note on the recordings")
 
 
 def test_a_report_names_the_seed_of_a_culture_only_if_one_was_grown() -> None:

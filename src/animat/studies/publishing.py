@@ -12,6 +12,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float64
 
+from animat.errors import counted
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
@@ -57,12 +58,11 @@ class Publish(StudyTask):
         headline = _headline(study, results, all_episodes(study, folder, study.robots))
         drawn = save_formats(draw_headline(headline), folder, "figures/headline")
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
-        title, caption = "Every arm on every robot", HEADLINE.format(policies=study.policies)
+        title, caption = "Every arm on every robot", HEADLINE.format(**_facts_of(study))
         picture = picture_of(folder, "figures/headline", title, caption, "tables/scores.csv", narrow=narrow)
         sections = [_summary(study, results, [row for row, _ in headline], picture)]
-        facts = {name: getattr(study, name) for name in ("policies", "episodes", "episodes_over_time")}
         for spec in study.robots:
-            pictures = _pictures(folder, spec.name, ROBOT, {**facts, "round": f"{round_of(study, spec):,}"})
+            pictures = _pictures(folder, spec.name, ROBOT, {**_facts_of(study), "round": f"{round_of(study, spec):,}"})
             sections.append(Section(_begin(spec.name), pictures=pictures))
         if kept:
             table = report_tables.controllability_table(study, folder, kept)
@@ -145,7 +145,7 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
         sentences.append(" ".join([_as_in_paper(printed), *explain]))
     elif rows:
         found = sum(row.outcome == SECOND for row in rows)
-        sentences.append(f"In {found} of {len(rows)} comparisons the second arm was found to be better.")
+        sentences.append(f"In {found} of {counted(len(rows), 'comparison')} the second arm was found to be better.")
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
@@ -235,12 +235,21 @@ def _scores(results: Results) -> Section:
     return Section("Scores", (note,), tables=(report_tables.scores_table(results.scores), optima, *goals))
 
 
+def _facts_of(study: Study) -> dict[str, str]:
+    """The placeholders in captions of a robot's figures."""
+    return {
+        "policies": counted(study.policies, "policy", "policies"),
+        "episodes": counted(study.episodes, "episode"),
+        "episodes_over_time": counted(study.episodes_over_time, "episode"),
+    }
+
+
 def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
     """The placeholders in captions of the culture's figures."""
     return {
-        "channels": f"{series[0].n_channels:,}",
-        "responses": f"{len(series[0]):,}",
-        "recordings": f"{len(series)}",
+        "channels": counted(series[0].n_channels, "channel"),
+        "responses": counted(len(series[0]), "response"),
+        "recordings": counted(len(series), "recording"),
         "cut": BURSTS if series[0].is_burst.any() else NO_BURSTS,
     }
 
@@ -303,8 +312,8 @@ def _findings(results: Results) -> Section:
     file = "tables/findings.csv"
     warnings = tuple((finding.name, finding.message) for finding in results.findings if finding.severity != "note")
     counts = (
-        f"{len(warnings)} warnings and {len(results.findings) - len(warnings)} notes on the recordings, the simulators "
-        f"made from them and the optima; all are in {file}."
+        f"{counted(len(warnings), 'warning')} and {counted(len(results.findings) - len(warnings), 'note')} on the "
+        f"recordings, the simulators made from them and the optima; all are in {file}."
     )
     tables = (Table("Warnings", ("finding", "message"), warnings, beside=file),) if warnings else ()
     left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)
