@@ -212,6 +212,20 @@ def test_before_its_first_moment_a_film_draws_nothing_of_it() -> None:
     np.testing.assert_array_equal(frame[200:, 480:-16][:60], empty[200:, 480:-16][:60])
 
 
+def test_long_names_do_not_reach_into_the_panels() -> None:
+    usual = scene_of([5.0] * 40)
+    labels = [f"electrodes {'+'.join(map(str, range(n, n + 30)))}" for n in (1, 2)]
+    delivered = [replace(moment, delivered=labels[0]) for moment in usual.moments]
+    long = replace(usual, title=20 * "a robot of my own ", conditions=tuple(labels), moments=tuple(delivered))
+    silent = replace(long, moments=tuple(replace(moment, delivered="") for moment in delivered))
+    scenes = (long, replace(long, title="a robot"), silent)
+    shown, short, without = (np.asarray(Frames(scene, lambda _: None).at(1.0)) for scene in scenes)
+    np.testing.assert_array_equal(shown[:, 470:], short[:, 470:])
+    assert (shown[:30, :440] != short[:30, :440]).any()
+    np.testing.assert_array_equal(shown[-20:, 470:], without[-20:, 470:])
+    assert (shown[-20:, :440] != without[-20:, :440]).any()
+
+
 def test_a_film_without_neurons_has_no_panel_of_responses(monkeypatch: pytest.MonkeyPatch) -> None:
     texts = written_by(scene_of([math.nan] * 10), monkeypatch)
     assert [text for text in texts if text.startswith(("response", "command", "return"))] == [

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import html
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
@@ -13,29 +17,30 @@ import pytest
 from animat.errors import InvalidArgument, InvalidFile
 from animat.evaluation.statistics import compare
 from animat.neurons.fidelity import Fidelity
+from animat.recordings.findings import Finding
 from animat.report.comparisons import Pair, draw_comparisons
 from animat.report.controls import draw_controls
 from animat.report.headline import draw_headline
-from animat.report.html import Picture, Section, with_links, with_minus, write_page
+from animat.report.html import Picture, Section, Table, with_links, with_minus, write_page
 from animat.report.learning_curves import LearningCurve, draw_learning_curves, over_rounds
 from animat.report.over_time import Courses, draw_over_time
-from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Score, StudyOptimum
+from animat.report.results import ComparedReturns, ControlReturns, OverCultures, Results, Score, StudyOptimum
 from animat.report.style import save_figure
 from animat.robots import Cartpole
 from animat.studies.arms import arm_differences, arms_table
-from animat.studies.captions import CULTURE
+from animat.studies.captions import CULTURE, HEADLINE, ROBOT
 from animat.studies.cultures import CulturesRun
-from animat.studies.cultures_page import _summary
+from animat.studies.cultures_page import _describe, _summary
 from animat.studies.differences import decisions, differing_comparisons, explain
 from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper, _facts_of_culture
+from animat.studies.publishing import _as_in_paper, _colophon, _facts_of, _facts_of_culture, _findings, _lead, _pictures
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
 from animat.studies.source import Source
-from animat.studies.specification import Arm, RobotSpec, Simulators, Study
+from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.tabulating import AS_IN_PAPER, FIRST, NONE, SECOND, TOO_FEW, outcome_of
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
@@ -245,6 +250,41 @@ def test_decisions_follow_a_changed_study() -> None:
     assert "Pole mass" not in alone
 
 
+def test_a_study_without_neurons_says_nothing_of_a_culture() -> None:
+    """It was said to be driven through a virtual culture, whose pulse, bursts and histogram were then described."""
+    alone = replace(paper_study(quick=True), arms=(Arm("alone", mapping="none"),), comparisons=())
+    assert _lead(alone).startswith("Cartpole and navigation, driven without neurons. An arm is")
+    decided = [name for name, _ in decisions(alone)]
+    assert not {"Recordings", "The culture", "Pulse", "Bursts", "Histogram range", "Percentiles"} & set(decided)
+    assert {"Policies", "Iterations on cartpole", "Pole mass", "Walls", "Learning"} <= set(decided)
+    with_neurons = [name for name, _ in decisions(replace(alone, arms=(Arm("1 threshold"), *alone.arms)))]
+    assert [name for name in with_neurons if name in decided] == decided
+
+
+def test_one_of_anything_is_in_the_singular() -> None:
+    of_culture = _facts_of_culture([responses_of([1.0])])
+    facts = _facts_of(Study(policies=1, episodes=1, episodes_over_time=1)) | of_culture | {"round": "9"}
+    for caption in (HEADLINE, *(each.text for each in (*CULTURE.values(), *ROBOT.values()))):
+        said = caption.format(**facts)
+        assert not re.search(r"\b1 (policies|episodes|recordings|responses|channels)\b", said), said
+    many = _facts_of(Study(policies=2, episodes=1000, episodes_over_time=3))
+    assert many == {"policies": "2 policies", "episodes": "1,000 episodes", "episodes_over_time": "3 episodes"}
+    over = OverCultures("c", "cartpole", 1, 0.0, 1.0, 1.0, None, None, 1, 1, 1)
+    found = CulturesRun(Path(), {}, {}, {}, (over,), None)
+    assert "in 1 of 1 culture;" in _describe(Compared("c", "a", "b"), found.summary[0])
+    note = Results((), (), (), (), (), (Finding("bursts", "note", "m"), Finding("x", "warning", "m")))
+    assert _findings(note).paragraphs[0].startswith("1 warning and 1 note on the recordings")
+
+
+def test_a_report_names_the_seed_of_a_culture_only_if_one_was_grown() -> None:
+    manifest = {"versions": {"animat": "0"}, "fingerprint": "f"}
+    grown = replace(paper_study(), culture=Source(seed=4), seed=2)
+    assert _colophon(grown, manifest)[1].startswith("Seeds: culture 4, training and evaluation 2. ")
+    at_hand = replace(grown, culture=Source("files", files=("mine",)))
+    for study in (at_hand, replace(grown, arms=(Arm("alone", mapping="none"),), comparisons=())):
+        assert _colophon(study, manifest)[1].startswith("Seeds: training and evaluation 2. ")
+
+
 # --- robots of one kind -----------------------------------------------------------------------------------------------
 
 
@@ -269,6 +309,22 @@ def test_two_robots_of_a_kind_are_distinguished(tmp_path: Path) -> None:
         RobotSpec("culture", kind="cartpole")
     with pytest.raises(InvalidArgument, match="cartpole, detour, navigation"):
         RobotSpec("as printed")
+
+
+def test_names_of_robots_keep_their_capitals_and_every_section_its_anchor(tmp_path: Path) -> None:
+    """A Gymnasium CartPole beside the house's own cartpole was called Cartpole too, and its entry led to the other."""
+    robots = (RobotSpec("my Rover", kind="navigation"), RobotSpec("CartPole", kind="cartpole"), RobotSpec("cartpole"))
+    assert _lead(Study(robots=robots)).startswith("My Rover, CartPole and cartpole, driven through a virtual culture.")
+    rows = [(score("CartPole", "a", 5.0, 4.0, 6.0, 0.0, 10.0), np.ones(2))]
+    (tmp_path / "figures").mkdir()
+    save_figure(draw_headline(rows), tmp_path / "figures" / "CartPole-controls.png")
+    (picture,) = _pictures(tmp_path, "CartPole", ROBOT, {"policies": 2, "episodes": 3})
+    assert picture.title == "CartPole: controls"
+    titles = ("CartPole", "Cartpole", "Scores", "Cartpole-", "Scores", "my Rover")
+    page = write_page(tmp_path / "page.html", "t", "l", [Section(title) for title in titles], []).read_text()
+    anchors = re.findall('<h2 id="([^"]*)">', page)
+    assert len(set(anchors)) == len(titles) and re.findall('href="#([^"]*)"', page) == anchors
+    assert anchors[0] == "cartpole" and anchors[-1] == "my-rover"
 
 
 # --- what arms are evaluated on ------------------------------------------------------------------------------------
@@ -438,6 +494,38 @@ def test_a_figure_that_is_gone_is_named_by_the_error(part: str, tmp_path: Path) 
         _ = Picture(gone, "a", "b").width_px
 
 
+def test_figures_saved_in_several_threads_share_no_settings(tmp_path: Path) -> None:
+    """Of two at a time the later SVG had other bytes, and matplotlib kept the settings of one for all later figures."""
+    from matplotlib import rcParams
+
+    first_began, second_began, first_ended = threading.Event(), threading.Event(), threading.Event()
+    texts = []
+
+    class First:
+        def savefig(self, path: Path, **_: Any) -> None:
+            first_began.set()
+            # Alone it waits in vain.
+            second_began.wait(0.3)
+            path.touch()
+
+    class Second:
+        def savefig(self, path: Path, **_: Any) -> None:
+            second_began.set()
+            first_ended.wait(10.0)
+            texts.append(rcParams["svg.fonttype"])
+            path.touch()
+
+    before = rcParams["svg.fonttype"]
+    with ThreadPoolExecutor(2) as executor:
+        first: Any = executor.submit(save_figure, First(), tmp_path / "a.svg")  # type: ignore[arg-type]
+        first.add_done_callback(lambda _: first_ended.set())
+        first_began.wait(10.0)
+        second: Any = executor.submit(save_figure, Second(), tmp_path / "b.svg")  # type: ignore[arg-type]
+        assert [first.result(), second.result()] == [tmp_path / "a.svg", tmp_path / "b.svg"]
+    after, rcParams["svg.fonttype"] = rcParams["svg.fonttype"], before
+    assert texts == ["none"] and after == before == "path"
+
+
 def test_there_is_one_kind_of_minus() -> None:
     assert with_minus("constant -1 from -0.5 to -.5, 1.5e-05") == "constant −1 from −0.5 to −.5, 1.5e−05"
     same = "2-10 ms, p0-1, --at-min 5, tables/-1.csv, Mann-Whitney, recording_0-1, 2022-11-23"
@@ -454,6 +542,28 @@ def test_files_that_a_page_names_are_links() -> None:
     low = Pair(replace(ROW, score_first=-0.07, score_second=-0.001), *np.array([[1.0, 2.0], [1.0, 2.0]]), 0.0)
     labels = [text.get_text() for text in draw_comparisons([low], "").axes[0].get_xticklabels()]
     assert [label.split("\n")[-1] for label in labels] == ["score −0.07", "score 0.00"]
+
+
+def test_links_lead_to_files_whatever_their_folders_are_called(tmp_path: Path) -> None:
+    """`culture-12:30/report.html` was taken for a protocol, and all after # or ? for no part of the name."""
+    names = ("day #1", "12:30", "50%", "30%25", "a?b=1", "ü & <i>", "day -1", "1e-05", "plain_1")
+    files = tuple(f"culture-{name}/report.html" for name in names)
+    for file in files:
+        (tmp_path / file).parent.mkdir()
+        (tmp_path / file).touch()
+    there = save_figure(
+        draw_headline([(score("arm", "1-threshold", 5.0, 4.0, 6.0, 0.0, 10.0), np.ones(2))]), tmp_path / "a.png"
+    )
+    points = tuple((file, f"finished: {file}") for file in files)
+    tables = tuple(Table("t", ("a",), (("b",),), beside=file) for file in files)
+    picture = Picture(there, "t", "c", files)
+    section = Section("s", points=points, links=files, tables=tables, pictures=(picture,))
+    page = write_page(tmp_path / "page.html", "t", "l", [section], []).read_text()
+    found = [urlsplit(html.unescape(each)) for each in re.findall(r'href="([^"#][^"]*)"', page)]
+    assert all((each.scheme, each.netloc, each.query, each.fragment) == ("", "", "", "") for each in found)
+    assert [unquote(each.path) for each in found] == [*files, *files, *files]
+    shown = [html.unescape(each) for each in re.findall(r"finished: <a [^>]*>([^<]*)</a>", page)]
+    assert shown == [*files]
 
 
 def test_optima_over_time_are_labelled_coarse_and_missing_arms_are_counted() -> None:

@@ -44,6 +44,7 @@ from animat.recordings.reading import read_recording, read_recordings
 from animat.report.html import cell, with_error
 from animat.responses.series import extract_series
 from animat.robots import Cartpole, Navigation
+from animat.stimulation.protocol import Protocol, read_protocol
 from animat.stimulation.selection import SelectionRule
 from animat.studies.captions import CULTURE, ROBOT
 from animat.studies.folder import claim_folder, describe_study, hash_files
@@ -58,6 +59,7 @@ from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Simulators, Study
 from animat.studies.toml import read_study, study_to_toml
 from animat.studies.training import training_of
+from animat.training.lessons import read_lessons
 from animat.training.policy import Policy
 from animat.writing import LOCK, exclusive_lock
 from cultures import small_culture
@@ -731,6 +733,7 @@ def test_the_report_asks_nothing_of_a_network(finished: Path) -> None:
         (float("inf"), "∞"),
         (-float("inf"), "−∞"),
         (2.5e6, "2.50e+06"),
+        (1_905_088, "1,905,088"),
         (-1234.5, "−1,234"),
         (-0.0, "0"),
         (999.4, "999"),
@@ -751,6 +754,8 @@ def test_cells_are_short(value: object, written: str) -> None:
         (22.4071, 0.00393, "22.407 ± 0.004"),
         (119.98, 7.6e-6, "119.980 ± < 0.001"),
         (120.0, 0.0, "120.0 ± 0.0"),
+        (-0.002, 0.41, "0.00 ± 0.41"),
+        (-1234.5, 1093.0, "−1,234 ± 1,093"),
         (3.0, None, "3 ± –"),
         (3.0, float("nan"), "3 ± –"),
     ],
@@ -1007,6 +1012,19 @@ def test_a_missing_file_is_reported_in_one_line(tmp_path: Path, capsys: pytest.C
     with pytest.raises(InvalidArgument, match="workers: expected None with an executor"):
         run_study(read_study(TINY), tmp_path / "out", workers=2, executor=Halts())
     assert not (tmp_path / "out").exists()
+
+
+def test_files_with_a_byte_order_mark_are_read_as_without(tmp_path: Path) -> None:
+    """Editors of Windows write one; it was malformed text."""
+    texts = {"study.toml": TINY.read_text(), "lessons.toml": '[[lessons]]\nname = "é"\n', "slow.json": '{"trials": 7}'}
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+    assert read_study(tmp_path / "study.toml") == read_study(TINY)
+    assert [lesson.name for lesson in read_lessons(tmp_path / "lessons.toml")] == ["é"]
+    assert read_protocol(tmp_path / "slow.json") == Protocol(trials=7)
+    (tmp_path / "twice.toml").write_text("\ufeff" + TINY.read_text(), encoding="utf-8-sig")
+    with pytest.raises(InvalidFile, match="expected TOML"):
+        read_study(tmp_path / "twice.toml")
 
 
 def test_the_specifications_on_the_page_are_read(tmp_path: Path) -> None:

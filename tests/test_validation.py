@@ -550,6 +550,20 @@ def test_the_figure_names_its_axes(known: Validation) -> None:
 
 
 @pytest.mark.parametrize(
+    "name",
+    ["known.npz", "cost$_{a$.npz", "culture 12, day 42 in vitro, mixed, by the second operator, again.nwb"],
+)
+def test_the_figure_has_the_whole_name_of_its_file(known: Validation, name: str) -> None:
+    """Two dollar signs were a formula, which ended in a traceback, and long names were cut off at both ends."""
+    figure = draw_validation(name, known)
+    figure.canvas.draw()
+    title = figure._suptitle  # type: ignore[attr-defined]
+    within = title.get_window_extent()
+    assert 0 <= within.x0 < within.x1 <= figure.bbox.width
+    assert title.get_text().replace("\n", " ").startswith(f"{name}: ")
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--conditions", "all"], "conditions: expected two or more, so that there is something to predict from"),

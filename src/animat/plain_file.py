@@ -63,7 +63,8 @@ def read_plain_text(path: str | os.PathLike[str], most_bytes: int) -> str:
     if len(content) > most_bytes:
         raise InvalidFile(f"{path}: expected at most {most_bytes:,} bytes, got more")
     try:
-        return content.decode("utf-8")
+        # Editors of Windows begin such files with a mark, as spreadsheets do with tables.
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InvalidFile(f"{path}: expected text in UTF-8, got something else ({error.reason})") from error
 

@@ -73,7 +73,7 @@ def _run_one(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
 
 def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
     from animat.columns import align_columns
-    from animat.errors import AnimatError
+    from animat.errors import AnimatError, counted
     from animat.studies.cultures import run_over_cultures
     from animat.studies.cultures_page import write_cultures_page
     from animat.studies.results import MISSING
@@ -92,7 +92,8 @@ def _run_many(study: Study, base: Path, command: JobOptions) -> dict[str, Any]:
         head = "", "first", "second", "difference", "95 % interval", "second mean larger in", "significantly better in"
         print("\n".join(align_columns(head, cells)))
     jobs = sum(len(each.done_now) for each in results.finished.values())
-    print(f"{len(results.finished)} cultures, {jobs} jobs in {time.monotonic() - began:.0f} s; report: {report}")
+    done = f"{counted(len(results.finished), 'culture')}, {counted(jobs, 'job')}"
+    print(f"{done} in {time.monotonic() - began:.0f} s; report: {report}")
     if results.parquet is None:
         print(f"scores.csv only, no Parquet table: {MISSING}")
     for name, why in results.failed.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,11 @@ from animat.report.style import (
     add_common_legend,
     new_figure,
     style_axes,
+    title_figure,
 )
+
+_NAME_WIDTH = 14
+"""Characters per line of an arm's name, as two stand side by side under a panel."""
 
 
 class Pair(NamedTuple):
@@ -45,7 +50,7 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
     policies. `pairs` has at least one comparison, all on one robot.
     """
     figure = new_figure(max(2.7 * len(pairs), 4.5), 6.4)
-    figure.suptitle(title, fontsize=10)
+    title_figure(figure, title)
     rows = figure.subplots(2, len(pairs), squeeze=False, height_ratios=[1.0, 0.9])
     for whole, close, pair in zip(*rows, pairs, strict=True):
         row = pair.row
@@ -72,11 +77,12 @@ def draw_comparisons(pairs: Sequence[Pair], title: str) -> Figure:
 
 
 def _name(arm: str, score: float | None) -> str:
-    """The arm on two lines, and its score on a third."""
-    name = arm if " " in arm else f"{arm} "
+    """The arm on two lines or more, and its score on the last."""
+    first, _, rest = arm.partition(" ")
+    lines = [each for part in (first, rest) for each in wrap(part, _NAME_WIDTH) or [""]]
     # Adding 0 turns -0 into 0.
     scored = "" if score is None else f"\nscore {round(score, 2) + 0.0:.2f}"
-    return with_minus(name.replace(" ", "\n", 1) + scored)
+    return with_minus("\n".join(lines) + scored)
 
 
 def _draw_boxes(axes: Axes, returns: Float64[np.ndarray, " policies"], place: int, colour: str) -> None:

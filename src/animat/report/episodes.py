@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from animat.report.style import Figure, grid_of_panels, new_figure, style_axes
+from animat.report.style import Figure, grid_of_panels, new_figure, style_axes, title_figure, wrapped
 from animat.robots.base import Robot, capability
 from animat.robots.drawing import draw_robot
 
 Path = Float[np.ndarray, "iterations+1 observations"]
 _FRAMES = 7
+_WIDE_IN = 3.1
+"""Width of a panel of paths."""
 
 
 def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: str) -> Figure:
@@ -22,10 +24,10 @@ def draw_paths(robot: Robot[Any], paths: Mapping[str, Sequence[Path]], title: st
     Observations are in the robot's units.
     """
     draw = capability(robot, "draw_paths")
-    figure, panels = grid_of_panels(len(paths), 3, 3.1, 2.5, title)
+    figure, panels = grid_of_panels(len(paths), 3, _WIDE_IN, 2.5, title)
     for axes, (name, episodes) in zip(panels, paths.items(), strict=True):
         draw(axes, episodes)
-        style_axes(axes, name, axes.get_xlabel(), axes.get_ylabel())
+        style_axes(axes, wrapped(name, _WIDE_IN), axes.get_xlabel(), axes.get_ylabel())
     return figure
 
 
@@ -37,7 +39,7 @@ def draw_frames(robot: Robot[Any], episodes: Mapping[str, tuple[Path, Sequence[f
     first = draw_robot(robot, next(iter(episodes.values()))[0][0])
     wide = first.shape[1] / first.shape[0]
     figure = new_figure(9.5, 0.6 + len(episodes) * (9.5 / _FRAMES / wide + 0.28))
-    figure.suptitle(title, fontsize=10)
+    title_figure(figure, title)
     rows = figure.subplots(len(episodes), _FRAMES, squeeze=False)
     for axes_row, (name, (path, commands)) in zip(rows, episodes.items(), strict=True):
         for axes, i in zip(axes_row, np.linspace(0, len(path) - 1, _FRAMES).round().astype(int), strict=True):

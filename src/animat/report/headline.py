@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 
 import numpy as np
 from jaxtyping import Float64
 
 from animat.report.results import Score
-from animat.report.style import BLUE, GREY, OPTIMUM, SKY, Figure, add_common_legend, new_figure, style_axes
+from animat.report.style import (
+    BLUE,
+    GREY,
+    NAME_WIDTH,
+    OPTIMUM,
+    SKY,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+    wrapped,
+)
 
 
 def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]], *, narrow: bool = False) -> Figure:
@@ -19,12 +31,14 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
     """
     robots = list(dict.fromkeys(row.robot for row, _ in rows))
     most = max(sum(row.robot == robot for row, _ in rows) for robot in robots)
-    height_in, n = 1.2 + 0.34 * most, len(robots)
+    names = {row.arm: fill(row.arm, NAME_WIDTH) for row, _ in rows}
+    lines = max(name.count("\n") + 1 for name in names.values())
+    height_in, n = 1.2 + max(0.34, 0.18 * lines) * most, len(robots)
     figure = new_figure(3.6, height_in * n) if narrow else new_figure(4.6 * n, height_in)
     panels = list(figure.subplots(*((n, 1) if narrow else (1, n)), squeeze=False).flat)
     for axes, robot in zip(panels, robots, strict=True):
         own = [each for each in rows if each[0].robot == robot]
-        style_axes(axes, robot, "mean return of an episode", "")
+        style_axes(axes, wrapped(robot, 2.0), "mean return of an episode", "")
         every = [(row.interquartile_mean, row.random, row.optimum, *policies.tolist()) for row, policies in own]
         known = [value for of_arm in every for value in of_arm if value is not None]
         # All returns, with some room for intervals on either side.
@@ -45,7 +59,7 @@ def draw_headline(rows: Sequence[tuple[Score, Float64[np.ndarray, " policies"]]]
             axes.plot(policies, [place + 0.22] * len(policies), "o", color=BLUE, markersize=2.5, label="each policy")
             axes.plot(row.interquartile_mean, place, "o", color=BLUE, markersize=6, label="their interquartile mean")
         axes.set_xlim(left, right)
-        axes.set_yticks(range(len(own)), [row.arm for row, _ in own])
+        axes.set_yticks(range(len(own)), [names[row.arm] for row, _ in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
         axes.grid(axis="x", linewidth=0.4, alpha=0.5)
     add_common_legend(figure, panels, columns=2 if narrow else 3 if n == 1 else 5)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import quote
 
 from PIL import Image
 
@@ -35,11 +36,17 @@ def with_links(text: str, files: Sequence[str] = ()) -> str:
     from markupsafe import Markup, escape
 
     # The longest first, as one name can contain another.
-    names = "|".join(re.escape(with_minus(file)) for file in sorted(files, key=len, reverse=True))
-    parts = re.split(f"({names})", with_minus(text)) if names else [with_minus(text)]
+    names = "|".join(re.escape(file) for file in sorted(files, key=len, reverse=True))
+    parts = re.split(f"({names})", text) if names else [text]
+    link = Markup('<a href="{}">{}</a>')
     # Every second part is a name.
-    linked = (Markup('<a href="{0}">{0}</a>').format(part) if i % 2 else escape(part) for i, part in enumerate(parts))
+    linked = (link.format(url_of(part), part) if i % 2 else escape(with_minus(part)) for i, part in enumerate(parts))
     return Markup("").join(linked)
+
+
+def url_of(file: str) -> str:
+    """The link to a file relative to the page: names can contain `#` or `:`, which mean something else in a link."""
+    return quote(file)
 
 
 @dataclass(frozen=True)
@@ -120,10 +127,16 @@ class Section:
     verbatim: str = ""
     links: tuple[str, ...] = ()
 
-    @property
-    def anchor(self) -> str:
-        """Its fragment identifier on the page."""
-        return "".join(letter if letter.isalnum() else "-" for letter in self.title.lower())
+
+def anchors_of(sections: Sequence[Section]) -> list[str]:
+    """A fragment identifier on the page for each section; of sections with nearly the same title each has its own."""
+    anchors: list[str] = []
+    for section in sections:
+        anchor = "".join(letter if letter.isalnum() else "-" for letter in section.title.lower())
+        while anchor in anchors:
+            anchor += "-"
+        anchors.append(anchor)
+    return anchors
 
 
 def write_page(
@@ -145,9 +158,10 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url}
+    environment.filters |= {"cell": cell, "prose": with_links, "data_url": _data_url, "url": url_of}
     page = environment.get_template("report.html.j2")
-    return write_whole(Path(path), page.render(title=title, lead=lead, sections=sections, colophon=colophon))
+    filled = page.render(title=title, lead=lead, sections=sections, anchors=anchors_of(sections), colophon=colophon)
+    return write_whole(Path(path), filled)
 
 
 def _data_url(png: Path) -> str:
@@ -164,7 +178,7 @@ def cell(value: Any) -> str:
         return with_minus(str(value))
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
-    whole = abs(value) < 1e6 and (value == int(value) or abs(value) >= 999.5)
+    whole = isinstance(value, int) or (abs(value) < 1e6 and (value == int(value) or abs(value) >= 999.5))
     # Trailing zeros stay: 23.0 next to 22.4.
     return (f"{value + 0:,.0f}" if whole else f"{value:#.3g}".rstrip(".")).replace("-", MINUS)
 
@@ -174,6 +188,7 @@ def with_error(value: float, error: float | None) -> str:
     if error is None or not (math.isfinite(value) and math.isfinite(error)):
         return f"{cell(value)}\u00a0±\u00a0{cell(error)}"
     decimals = min(3, max(0, 1 - math.floor(math.log10(error)))) if error > 0 else 1
-    rounded = f"{error:.{decimals}f}"
-    shown = rounded if error == 0 or float(rounded) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
-    return f"{value:.{decimals}f}\u00a0±\u00a0{shown}".replace("-", MINUS)
+    rounded = f"{error:,.{decimals}f}"
+    shown = rounded if error == 0 or round(error, decimals) else f"<\u00a0{10.0**-decimals:.{decimals}f}"
+    # Adding 0 turns -0 into 0.
+    return f"{round(value, decimals) + 0.0:,.{decimals}f}\u00a0±\u00a0{shown}".replace("-", MINUS)

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import BLUE, GREY, OPTIMUM, Figure, add_common_legend, grid_of_panels, style_axes
+from animat.report.style import BLUE, GREY, OPTIMUM, Figure, add_common_legend, grid_of_panels, style_axes, wrapped
 
 _RESAMPLES = 2000
+_WIDE_IN = 3.1
+"""Width of a panel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class LearningCurve:
 def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
     """One panel per arm: policies, their mean with its 95 % bootstrap interval, random actions and the optimum."""
     columns = 2 if len(curves) == 4 else min(3, len(curves))
-    figure, panels = grid_of_panels(len(curves), columns, 3.1, 2.4, title, share_x=True, share_y=True)
+    figure, panels = grid_of_panels(len(curves), columns, _WIDE_IN, 2.4, title, share_x=True, share_y=True)
     for axes, curve in zip(panels, curves, strict=True):
         x = curve.iterations / 1000
         for of_policy in curve.returns:
@@ -56,7 +58,7 @@ def draw_learning_curves(curves: Sequence[LearningCurve], title: str) -> Figure:
                 # A level holds up to the end of its chunk; the first chunk begins at 0.
                 steps = np.append(0.0, x), np.append(levels[:1], levels)
                 axes.step(*steps, where="pre", color=colour, linestyle=line, linewidth=1.2, label=name)
-        style_axes(axes, curve.name, "iterations (thousands)", "return")
+        style_axes(axes, wrapped(curve.name, _WIDE_IN), "iterations (thousands)", "return")
         axes.set_xlim(0, None)
     add_common_legend(figure, panels, columns=4 if columns == 3 else 2)
     return figure

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 
 from animat.report.results import OverCultures
-from animat.report.style import BLACK, BLUE, GREY, Figure, add_common_legend, new_figure, style_axes
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    NAME_WIDTH,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+    wrapped,
+)
 
 
 def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> Figure:
@@ -19,7 +30,7 @@ def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> 
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=True):
         own = [each for each in rows if each[0].robot == robot]
-        style_axes(axes, robot, "difference of the mean returns,\nsecond arm minus first", "")
+        style_axes(axes, wrapped(robot, 2.0), "difference of the mean returns,\nsecond arm minus first", "")
         axes.axvline(0, color=GREY, linewidth=0.8)
         for place, (row, differences) in enumerate(own):
             places = [place + 0.16] * len(differences)
@@ -28,7 +39,7 @@ def draw_over_cultures(rows: Sequence[tuple[OverCultures, Sequence[float]]]) -> 
             if low is not None and high is not None:
                 axes.plot([low, high], [place - 0.12] * 2, color=BLACK, linewidth=1.6, label="95 % interval")
             axes.plot(row.difference, place - 0.12, "D", color=BLACK, markersize=5, label="mean over cultures")
-        axes.set_yticks(range(len(own)), [row.comparison for row, _ in own])
+        axes.set_yticks(range(len(own)), [fill(row.comparison, NAME_WIDTH) for row, _ in own])
         axes.set_ylim(len(own) - 0.5, -0.5)
     add_common_legend(figure, panels, columns=3)
     return figure

@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
-from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes
+from animat.report.style import GREY, OPTIMUM, PALETTE, Figure, add_common_legend, grid_of_panels, style_axes, wrapped
 
+_WIDE_IN = 4.6
+"""Width of a panel."""
 _MOST = len(PALETTE)
 """The most arms in a panel, as there are no more colours."""
 
@@ -45,7 +47,7 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
 
     The end of training on the culture's clock is marked.
     """
-    figure, panels = grid_of_panels(len(panels_of), 2, 4.6, 3.4, title, share_x=True)
+    figure, panels = grid_of_panels(len(panels_of), 2, _WIDE_IN, 3.4, title, share_x=True)
     names = list(dict.fromkeys(name for of in panels_of for name in list(of.returns)[:_MOST]))
     for axes, of in zip(panels, panels_of, strict=True):
         minutes = of.minutes
@@ -66,6 +68,6 @@ def draw_over_time(panels_of: Sequence[Courses], title: str, *, trained_until_mi
         axes.axvline(trained_until_min, color=GREY, linewidth=1.0, label="end of training")
         left_out = len(of.returns) - _MOST
         more = f" ({left_out} more arms in the tables)" if left_out > 0 else ""
-        style_axes(axes, f"{of.title}{more}", "recording (min)", "return")
+        style_axes(axes, wrapped(f"{of.title}{more}", _WIDE_IN), "recording (min)", "return")
     add_common_legend(figure, panels, columns=3)
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
@@ -29,6 +30,12 @@ NON_BURST, BURST, MEDIAN = BLUE, RED, RED
 
 # Text stays text in an SVG. Without the salt, element names are random, and the same figure gives different files.
 _SAVING: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "animat"}
+_SAVING_LOCK = threading.Lock()
+"""matplotlib's settings are those of all threads, such as the workers of an executor."""
+
+
+NAME_WIDTH = 28
+"""Characters per line of a name beside a panel, of which there are two in a row."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -53,6 +60,11 @@ def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 def wrapped(title: str, width_in: float) -> str:
     """A title of a panel of this width, on as many lines as it needs; sets of electrodes break between electrodes."""
     return fill(title.replace("+", "+ "), max(8, int(width_in / 0.082))).replace("+ ", "+")
+
+
+def title_figure(figure: Figure, title: str) -> None:
+    """Set the title of a figure, on as many lines as it needs; dollar signs in it, as in names of files, stay."""
+    figure.suptitle(wrapped(title, figure.get_figwidth()), fontsize=10, parse_math=False)
 
 
 def add_legend(axes: Axes, **place: Any) -> None:
@@ -106,7 +118,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
         raise InvalidArgument(f"{path}: expected a figure's name to end in .png, .svg or .pdf, got {path.suffix!r}")
     # With a date, the same figure would give different files; PNG has none.
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with atomic_write(path) as beside, matplotlib.rc_context(_SAVING):
+    with atomic_write(path) as beside, _SAVING_LOCK, matplotlib.rc_context(_SAVING):
         figure.savefig(beside, format=kind, dpi=PNG_DPI, metadata=metadata)
     return path
 
@@ -118,7 +130,7 @@ def grid_of_panels(
     columns = min(columns, max(n, 1))
     rows = max(1, -(-n // columns))
     figure = new_figure(max(width_in * columns, 4.5), height_in * rows + 0.35)
-    figure.suptitle(title, fontsize=10)
+    title_figure(figure, title)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=share_x, sharey=share_y).reshape(-1)
     for axes in panels[n:]:
         axes.set_visible(False)

@@ -10,7 +10,18 @@ from jaxtyping import Float64
 
 from animat.neurons.free_runs import LAGS
 from animat.neurons.validation import FREE_RUNS, MARGINAL, PIT_BINS, Band, Validation, pit_shares
-from animat.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, Figure, add_common_legend, new_figure, style_axes
+from animat.report.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    Figure,
+    add_common_legend,
+    new_figure,
+    style_axes,
+    title_figure,
+)
 
 _COLOURS = {MARGINAL: GREY, "histogram": ORANGE, "empirical": GREEN, "memory": BLUE}
 _HEADER = f"  {'simulator':<11}{'bits/trial':>11}{'CRPS (Hz)':>11}{'off by (p)':>14}{'lag 1':>8}{'run length':>25}"
@@ -58,7 +69,7 @@ def draw_validation(name: str, validation: Validation) -> Figure:
     v = validation
     figure = new_figure(10.5, 3.7)
     shaded = f"shaded: 95 % of chance, and of {FREE_RUNS} free runs of the simulators"
-    figure.suptitle(f"{name}: {sum(v.n_held):,} held-out responses; {shaded}", fontsize=10)
+    title_figure(figure, f"{name}: {sum(v.n_held):,} held-out responses; {shaded}")
     calibration, correlation, runs = figure.subplots(1, 3)
     # The empirical kind would coincide with the histogram.
     shown = [v.of(kind) for kind in dict.fromkeys(("histogram", v.kind, "memory"))]

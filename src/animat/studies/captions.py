@@ -22,14 +22,14 @@ HEADLINE = (
     "Each row is an arm, described in the table below, at the last recording that it was evaluated on; further right "
     "is better. Small dots: each policy's mean return. Large dot: their interquartile mean (the mean of the middle "
     "half), with its 95 % interval; an arrow means that the interval extends beyond the axis. Crosses: random actions. "
-    "Bars: the optimal return, which no controller can exceed, where it is known. {policies} policies per arm."
+    "Bars: the optimal return, which no controller can exceed, where it is known. {policies} per arm."
 )
 
 CULTURE = {
     "array": Caption(
         "the array",
         "The array from above. Each dot is a recording site; the brighter it is, the more it fires. A circle marks "
-        "each stimulated electrode. The first recording, {channels} channels.",
+        "each stimulated electrode. The first recording, {channels}.",
         ("tables/culture-array.csv",),
     ),
     "raster": Caption(
@@ -45,7 +45,7 @@ CULTURE = {
     ),
     "bursts": Caption(
         "burst separation",
-        "The {responses} responses of the first recording: how often each size x occurs, x against the share of "
+        "The first recording has {responses}: how often each size x occurs, x against the share of "
         "active channels, one dot per response, and how often each share occurs. A burst activates many channels at "
         "once. {cut}",
         ("tables/culture-bursts.csv", RESPONSES),
@@ -68,8 +68,8 @@ CULTURE = {
     "drift": Caption(
         "drift",
         "Above: percentiles of all non-burst responses. Middle: how often the response to each stimulus exceeds their "
-        "median; curves that converge mean that control is lost. Below: the share of bursts. {recordings} recordings "
-        "of about {responses} responses each.",
+        "median; curves that converge mean that control is lost. Below: the share of bursts. {recordings} "
+        "of about {responses} each.",
         ("tables/culture-drift.csv", "tables/culture-conditions.csv"),
     ),
 }
@@ -84,7 +84,7 @@ NO_BURSTS = "Here no response is set apart as a burst, so there is no threshold.
 ROBOT = {
     "learning": Caption(
         "learning curves",
-        "Return against iterations of training; up is better. Thin: each of {policies} policies. Thick: their mean "
+        "Return against iterations of training; up is better. Thin: each policy ({policies}). Thick: their mean "
         "with its 95 % bootstrap interval. Each point is the mean over the episodes that ended within the {round} "
         "iterations before, in which every environment ends at least one. Curves begin there, because the first "
         "episodes to end are not a representative sample. Actions are drawn. Lines: random actions and the optimal "
@@ -95,7 +95,7 @@ ROBOT = {
     ),
     "comparisons": Caption(
         "comparisons",
-        "One column per comparison, {policies} policies per side, each a point: its mean return over the episodes. "
+        "One column per comparison, {policies} per side, each a point: its mean return over the episodes. "
         "Boxes: quartiles and median; whiskers reach to the furthest point within 1.5 times the box's height. Above: "
         "with random actions and the optimal return. Below: enlarged. Stars: * p < 0.05, ** p < 0.01, *** p < 0.001, "
         "n.s. otherwise; p is two-sided, Mann-Whitney, normal approximation, corrected by Holm: “p corrected” in the "
@@ -104,8 +104,8 @@ ROBOT = {
     ),
     "over-time": Caption(
         "at every recording",
-        "The same policies on the simulator of each recording: median and quartiles over {policies} policies of "
-        "{episodes_over_time} episodes each, with the optimal return. A fall that the optimal return shares is due to "
+        "The same policies on the simulator of each recording: median and quartiles over {policies} of "
+        "{episodes_over_time} each, with the optimal return. A fall that the optimal return shares is due to "
         "the simulator: to the culture, and to what its bins keep of it. A steeper fall is due to the policy. The "
         "optimal return at every recording is on a coarse grid, which can lie slightly below the fine one, and is left "
         "out for mappings without steps, such as linear.",
@@ -115,7 +115,7 @@ ROBOT = {
         "controls",
         "One row per agent; further right is better. If a control does as well as trained policies, what it lacks was "
         "not needed. Whiskers: standard errors over policies (for a control of one actor: over episodes), of "
-        "{episodes} episodes each where no comparison says otherwise.",
+        "{episodes} each where no comparison says otherwise.",
         ("tables/controls.csv",),
     ),
     "paths": Caption(

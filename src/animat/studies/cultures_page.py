@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from animat.errors import counted
 from animat.report.html import Section, cell, columns_of, table_of, write_page
 from animat.report.over_cultures import draw_over_cultures
 from animat.report.results import OverCultures
@@ -29,7 +30,7 @@ def write_cultures_page(study: Study, found: CulturesRun) -> Path:
     points = [(name, f"finished: {page}") for name, page in pages.items()]
     points += [(name, f"failed: {why}") for name, why in found.failed.items()]
     sections.append(Section("Each culture", points=tuple(points), links=tuple(pages.values())))
-    cultures = f"{len(found.finished)} cultures" + (f", {len(found.failed)} more failed" if found.failed else "")
+    cultures = counted(len(found.finished), "culture") + (f", {len(found.failed)} more failed" if found.failed else "")
     lead = f"{cultures}. {summarise_arms(study)} on every culture."
     return write_page(found.folder / REPORT, f"{study.title}: many cultures", lead, sections, [f"Seed {study.seed}."])
 
@@ -63,7 +64,7 @@ def _summary(study: Study, found: CulturesRun) -> Section:
         "Differences on each culture",
         "Each point is a culture: the mean return of the second arm's policies minus that of the first's; to the right "
         "of 0 the second arm is better. Above each row of points: their mean with its 95 % interval, of "
-        f"{len(found.comparisons)} cultures.",
+        f"{counted(len(found.comparisons), 'culture')}.",
         COMPARISONS,
     )
     return Section("Results in short", (), tuple(points), (arms_table(study), table), (picture,))
@@ -71,8 +72,8 @@ def _summary(study: Study, found: CulturesRun) -> Section:
 
 def _describe(compared: Compared, row: OverCultures) -> str:
     larger = (
-        f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of {row.cultures} "
-        "cultures"
+        f"“{compared.second}” has a larger mean return than “{compared.first}” in {row.larger_in} of "
+        f"{counted(row.cultures, 'culture')}"
     )
     if not row.tested:
         return f"{larger}; with so few policies no test finds a difference in one culture."

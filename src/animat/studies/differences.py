@@ -31,18 +31,16 @@ _CULTURES = {
 
 def decisions(study: Study, series: Sequence[Responses] = ()) -> tuple[tuple[str, str], ...]:
     """Where the paper is silent or contradicts itself, and what this study does instead; `series` gives the numbers."""
-    return (
-        *_size_decisions(study),
-        *_culture_decisions(study),
-        *_simulator_decisions(study, series),
-        *_learning_decisions(study),
-    )
+    neurons = (*_culture_decisions(study),) if study.needs_neurons else ()
+    simulators = (*_simulator_decisions(study, series),) if study.needs_neurons else ()
+    robots = (each for spec in study.robots for each in spec.robot().departures())
+    return (*_size_decisions(study), *neurons, *robots, *simulators, *_learning_decisions(study))
 
 
 def _size_decisions(study: Study) -> Iterator[tuple[str, str]]:
     """Where the numbers of recordings, policies or iterations differ."""
     culture, paper = study.culture, Source()
-    if culture.kind == "virtual" and _recorded(culture) != _recorded(paper):
+    if study.needs_neurons and culture.kind == "virtual" and _recorded(culture) != _recorded(paper):
         yield "Recordings", f"The paper has {_recorded(paper)}. Here there are {_recorded(culture)}."
     if study.policies != PAPER_POLICIES:
         yield "Policies", f"The paper has {PAPER_POLICIES} per arm. Here there are {study.policies}."
@@ -78,8 +76,6 @@ def _culture_decisions(study: Study) -> Iterator[tuple[str, str]]:
             "The paper prints nine thresholds, hence ten levels, from −1 to +1 in steps of 0.2, which would be "
             "eleven. Zero is left out: −1.0, −0.8, −0.6, −0.4, −0.2, +0.2, ..., +1.0. So the robot always moves.",
         )
-    for spec in study.robots:
-        yield from spec.robot().departures()
 
 
 def _simulator_decisions(study: Study, series: Sequence[Responses]) -> Iterator[tuple[str, str]]:

@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float64
 
+from animat.errors import counted
 from animat.evaluation.statistics import p_of_u
 from animat.neurons.fidelity import Fidelity
 from animat.neurons.timeline import load_timeline
@@ -57,13 +58,12 @@ class Publish(StudyTask):
         headline = _headline(study, results, all_episodes(study, folder, study.robots))
         drawn = save_formats(draw_headline(headline), folder, "figures/headline")
         narrow = save_figure(draw_headline(headline, narrow=True), folder / "figures" / "headline-narrow.png")
-        title, caption = "Every arm on every robot", HEADLINE.format(policies=study.policies)
+        title, caption = "Every arm on every robot", HEADLINE.format(**_facts_of(study))
         picture = picture_of(folder, "figures/headline", title, caption, "tables/scores.csv", narrow=narrow)
         sections = [_summary(study, results, [row for row, _ in headline], picture)]
-        facts = {name: getattr(study, name) for name in ("policies", "episodes", "episodes_over_time")}
         for spec in study.robots:
-            pictures = _pictures(folder, spec.name, ROBOT, {**facts, "round": f"{round_of(study, spec):,}"})
-            sections.append(Section(spec.name.capitalize(), pictures=pictures))
+            pictures = _pictures(folder, spec.name, ROBOT, {**_facts_of(study), "round": f"{round_of(study, spec):,}"})
+            sections.append(Section(_begin(spec.name), pictures=pictures))
         if kept:
             table = report_tables.controllability_table(study, folder, kept)
             pictures = _pictures(folder, "culture", CULTURE, _facts_of_culture(series))
@@ -75,21 +75,37 @@ class Publish(StudyTask):
         if study.culture.kind == "files":
             settings += ", provided that the files are at the same paths relative to study.toml"
         sections += [_findings(results), Section("How it was done", (f"{settings}.",), verbatim=study_to_toml(study))]
-        versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
-        colophon = [
-            f"Made with {versions}.",
-            f"Seeds: culture {study.culture.seed}, training and evaluation {study.seed}. The same study with the same "
-            "versions on the same machine has the same results, bit for bit.",
-            f"Study {manifest['fingerprint']}",
+        return [
+            *drawn,
+            narrow,
+            write_page(folder / REPORT, study.title, _lead(study), sections, _colophon(study, manifest)),
         ]
-        return [*drawn, narrow, write_page(folder / REPORT, study.title, _lead(study), sections, colophon)]
 
 
 def _lead(study: Study) -> str:
     robots = _and([spec.name for spec in study.robots])
-    neurons = {"virtual": "a virtual culture", "files": "recordings"}[study.culture.kind]
+    neurons = {"virtual": "through a virtual culture", "files": "through recordings"}[study.culture.kind]
+    driven = neurons if study.needs_neurons else "without neurons"
     trained = _and([f"{spec.trained_for:,} iterations on {spec.name}" for spec in study.robots])
-    return f"{robots.capitalize()}, driven through {neurons}. {summarise_arms(study)}, trained for {trained}."
+    return f"{_begin(robots)}, driven {driven}. {summarise_arms(study)}, trained for {trained}."
+
+
+def _colophon(study: Study, manifest: Mapping[str, Any]) -> list[str]:
+    versions = ", ".join(f"{name} {version}" for name, version in manifest["versions"].items())
+    # Recordings at hand have no seed.
+    is_grown = study.needs_neurons and study.culture.kind == "virtual"
+    seeds = f"culture {study.culture.seed}, " if is_grown else ""
+    return [
+        f"Made with {versions}.",
+        f"Seeds: {seeds}training and evaluation {study.seed}. The same study with the same versions on the same "
+        "machine has the same results, bit for bit.",
+        f"Study {manifest['fingerprint']}",
+    ]
+
+
+def _begin(text: str) -> str:
+    """The text with a capital at its beginning; names in it keep their own."""
+    return text[:1].upper() + text[1:]
 
 
 def _and(parts: Sequence[str]) -> str:
@@ -115,7 +131,7 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
         if best is not None:
             at_random = _at_random(spec.name, study.arm(best.arm), results.controls)
             mapping = f"In “{best.arm}” {describe_mapping(study.arm(best.arm))}"
-            text = f"{spec.name[:1].upper() + spec.name[1:]}: {_describe(best)}{at_random}"
+            text = f"{_begin(spec.name)}: {_describe(best)}{at_random}"
             sentences.append(text if mapping in explained else f"{text} {mapping}")
             explained.append(mapping)
     rows = results.comparisons
@@ -129,7 +145,7 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
         sentences.append(" ".join([_as_in_paper(printed), *explain]))
     elif rows:
         found = sum(row.outcome == SECOND for row in rows)
-        sentences.append(f"In {found} of {len(rows)} comparisons the second arm was found to be better.")
+        sentences.append(f"In {found} of {counted(len(rows), 'comparison')} the second arm was found to be better.")
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
@@ -219,12 +235,21 @@ def _scores(results: Results) -> Section:
     return Section("Scores", (note,), tables=(report_tables.scores_table(results.scores), optima, *goals))
 
 
+def _facts_of(study: Study) -> dict[str, str]:
+    """The placeholders in captions of a robot's figures."""
+    return {
+        "policies": counted(study.policies, "policy", "policies"),
+        "episodes": counted(study.episodes, "episode"),
+        "episodes_over_time": counted(study.episodes_over_time, "episode"),
+    }
+
+
 def _facts_of_culture(series: Sequence[Responses]) -> dict[str, str]:
     """The placeholders in captions of the culture's figures."""
     return {
-        "channels": f"{series[0].n_channels:,}",
-        "responses": f"{len(series[0]):,}",
-        "recordings": f"{len(series)}",
+        "channels": counted(series[0].n_channels, "channel"),
+        "responses": counted(len(series[0]), "response"),
+        "recordings": counted(len(series), "recording"),
         "cut": BURSTS if series[0].is_burst.any() else NO_BURSTS,
     }
 
@@ -237,7 +262,7 @@ def _pictures(
     for name, (title, caption, numbers) in captions.items():
         file, files = f"figures/{of}-{name}", (each.format(of=of) for each in numbers)
         if (folder / f"{file}.png").exists():
-            pictures.append(picture_of(folder, file, f"{of.capitalize()}: {title}", caption.format(**facts), *files))
+            pictures.append(picture_of(folder, file, f"{_begin(of)}: {title}", caption.format(**facts), *files))
     return tuple(pictures)
 
 
@@ -261,7 +286,7 @@ def _controls(study: Study, results: Results) -> Section:
     sentences = [*(f"{each}." for each in not_outperforming(results)), *describe_reflexes(results.reflexes)]
     return Section(
         "Is it the culture?",
-        ("Each control removes something.", *(each[:1].upper() + each[1:] for each in sentences)),
+        ("Each control removes something.", *map(_begin, sentences)),
         points,
         (*(table for table in comparisons if table.rows), report_tables.controls_table(study, results.controls)),
     )
@@ -287,8 +312,8 @@ def _findings(results: Results) -> Section:
     file = "tables/findings.csv"
     warnings = tuple((finding.name, finding.message) for finding in results.findings if finding.severity != "note")
     counts = (
-        f"{len(warnings)} warnings and {len(results.findings) - len(warnings)} notes on the recordings, the simulators "
-        f"made from them and the optima; all are in {file}."
+        f"{counted(len(warnings), 'warning')} and {counted(len(results.findings) - len(warnings), 'note')} on the "
+        f"recordings, the simulators made from them and the optima; all are in {file}."
     )
     tables = (Table("Warnings", ("finding", "message"), warnings, beside=file),) if warnings else ()
     left_out = tuple(("Left out", f"{finding.message}.") for finding in results.findings if finding.name == LEFT_OUT)

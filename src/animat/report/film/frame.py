@@ -53,7 +53,7 @@ class Frames:
         moment = scene.moments[now]
         image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), _PAPER)
         draw = ImageDraw.Draw(image)
-        draw.text((14, 12), scene.title, _INK, _font(17))
+        draw.text((14, 12), _shortened(scene.title, 17), _INK, _font(17))
         self._draw_robot(image, draw, now)
         self._draw_captions(draw, moment)
         first = int(np.searchsorted(self._times_s, time_s - SHOWN_S))
@@ -104,7 +104,8 @@ class Frames:
         draw.text((14, HEIGHT_PX - 48), f"{moment.agent}, episode {moment.episode}, {step}", _INK, _font(15))
         if not self._has_room_for_all:
             if moment.delivered:
-                draw.text((14, HEIGHT_PX - 8), f"stimulus: {moment.delivered}", _INK, _font(13), anchor="ls")
+                stimulus = _shortened(f"stimulus: {moment.delivered}", 13)
+                draw.text((14, HEIGHT_PX - 8), stimulus, _INK, _font(13), anchor="ls")
             return
         x = 14
         for label, colour in self._colours.items():
@@ -186,6 +187,14 @@ def _round_up(value: float) -> float:
     """Round up to one digit."""
     unit = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
     return math.ceil(value / unit) * unit
+
+
+def _shortened(text: str, size: int) -> str:
+    """The text, or as much of it as there is room for left of the strips, with an ellipsis."""
+    most_px = _LEFT - 28
+    while _font(size).getlength(text) > most_px:
+        text = f"{text[:-2]}…"
+    return text
 
 
 @cache
