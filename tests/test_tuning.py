@@ -289,6 +289,19 @@ def test_a_discount_is_drawn_evenly_in_the_logarithm_of_its_distance_from_1(tmp_
     assert kstest(exponents, uniform(-3, 2).cdf).pvalue > 0.01
 
 
+@pytest.mark.parametrize("discount", [0.1, 0.3, 0.45, 0.99])
+def test_the_study_s_own_discount_is_tried_as_it_is_written(discount: float) -> None:
+    """Searched by its distance from 1, from which not every number can be computed back."""
+    from animat.tuning.search import Search
+
+    plain = read_tuning(TINY)
+    study = with_settings(plain.study, {"discount": discount})
+    search = {"discount": {"low": discount, "high": 0.999, "log": True}, "tau": {"low": 0.001, "high": 0.05}}
+    made = tuning_of(study, replace(plain.tune, search=search))
+    own, *_ = Search(made).ask(2)
+    assert own == {"discount": discount, "tau": 0.005}
+
+
 def test_importance_finds_the_setting_that_decides() -> None:
     from animat.tuning.search import importance_of
 
