@@ -625,6 +625,15 @@ BAD = {
         ["evaluate", "{folder}", "--recordings", "{recordings}"],
         ["--recordings: expected none for policies without neurons, got {recordings}"],
     ),
+    **{
+        f"{option} for policies without neurons, {command}": (
+            lambda folder, *_: WITHOUT_NEURONS.save(folder / "p0.safetensors"),
+            [command, "{folder}", option, value],
+            [f"{option}: expected none for policies without neurons, got {value}"],
+        )
+        for command in ("evaluate", "replay")
+        for option, value in (("--at-min", "3"), ("--conditions", "pattern"), ("--burst-threshold", "0.5"))
+    },
     "zero sessions": (
         nothing,
         ["record", "--sessions", "0", "--out", "{folder}/r"],
@@ -752,6 +761,9 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --neural-observation --mapping none", "--neural-observation: expected only with a mapping"),
         ("train --mapping none --delivery shuffled", "--delivery: expected none without neurons"),
         ("train --mapping none --recordings .", "--recordings: expected none without neurons, got ."),
+        ("train --mapping none --bins 5", "--bins: expected none without neurons, got 5"),
+        ("train --mapping none --window-ms 2 20.5", "--window-ms: expected none without neurons, got 2 20.5"),
+        ("train --mapping none --simulator memory", "--simulator: expected none without neurons, got memory"),
         ("record --culture replay", "--recordings: expected some for --culture replay, got none"),
         ("record --recordings .", "--recordings: expected none for --culture virtual, got 1"),
         ("train --shadowing drawn --mapping none", "--shadowing: expected a mapping with 'drawn', got none"),

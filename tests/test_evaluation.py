@@ -247,6 +247,10 @@ def test_simulators_fitted_differently_from_training_are_reported() -> None:
     noticed = evaluate({"a": policy}, timeline, episodes=50).findings
     (finding,) = (each for each in noticed if each.name == "other-simulator")
     assert finding.message.endswith("fitted differently: bins 40, here 20")
+    of_memory = replace(policy, provenance={"simulators": trained | {"kind": "memory", "bins": None}})
+    noticed = evaluate({"a": of_memory}, timeline, episodes=50).findings
+    (finding,) = (each for each in noticed if each.name == "other-simulator")
+    assert finding.message.endswith("fitted differently: kind memory, here histogram"), "a memory has no bins"
     alike = replace(policy, provenance={"simulators": trained | {"bins": 20}})
     noticed = evaluate({"a": alike}, timeline, episodes=50).findings
     assert "other-simulator" not in {each.name for each in noticed}

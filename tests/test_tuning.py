@@ -35,7 +35,7 @@ from animat.training.settings import SAC
 from animat.training.specification import CHUNKS, Training
 from animat.tuning import tasks
 from animat.tuning.journal import JOURNAL, TrialResult, read_journal
-from animat.tuning.results import BEST, HISTORY, RESULTS, TuningResult
+from animat.tuning.results import BEST, HISTORY, RESULTS, Final, TuningResult, write_results
 from animat.tuning.run import tune
 from animat.tuning.side_by_side import Trials
 from animat.tuning.space import Range, first_settings, with_settings
@@ -289,6 +289,19 @@ def test_a_discount_is_drawn_evenly_in_the_logarithm_of_its_distance_from_1(tmp_
     assert kstest(exponents, uniform(-3, 2).cdf).pvalue > 0.01
 
 
+@pytest.mark.parametrize("discount", [0.1, 0.3, 0.45, 0.99])
+def test_the_study_s_own_discount_is_tried_as_it_is_written(discount: float) -> None:
+    """Searched by its distance from 1, from which not every number can be computed back."""
+    from animat.tuning.search import Search
+
+    plain = read_tuning(TINY)
+    study = with_settings(plain.study, {"discount": discount})
+    search = {"discount": {"low": discount, "high": 0.999, "log": True}, "tau": {"low": 0.001, "high": 0.05}}
+    made = tuning_of(study, replace(plain.tune, search=search))
+    own, *_ = Search(made).ask(2)
+    assert own == {"discount": discount, "tau": 0.005}
+
+
 def test_importance_finds_the_setting_that_decides() -> None:
     from animat.tuning.search import importance_of
 
@@ -309,6 +322,20 @@ def test_importance_finds_the_setting_that_decides() -> None:
     assert next(iter(shares)) == "tau" and shares["tau"] > 0.8
     assert sum(shares.values()) == pytest.approx(1)
     assert importance_of(space, results[:3]) == {}
+
+
+def test_what_diverged_after_a_rung_is_not_drawn_as_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr("animat.tuning.results.save_figure", lambda figure, _: figures.append(figure))
+    settings = {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
+    own = TrialResult(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
+    stopped = TrialResult(1, settings, "stopped", (20,), ((0.0,),))
+    diverged = TrialResult(2, settings, "diverged", (20,), ((9.0,),))
+    finals = [Final(0, settings, (2.0, 2.1))]
+    write_results(tmp_path, read_tuning(TINY), [own, stopped, diverged], finals)
+    drawn = {line.get_label(): list(line.get_xdata()) for line in figures[0].axes[0].lines}
+    assert drawn["stopped at 33 %"] == [1]
+    assert drawn["diverged"] == [2]
 
 
 @pytest.mark.oracle
@@ -344,3 +371,15 @@ def test_the_command_prints_what_was_found(
     assert any("own settings" in line for line in lines)
     assert any(line.startswith("importance: ") for line in lines)
     assert any(str(finished / BEST) in line for line in lines)
+
+
+def test_the_command_counts_a_single_trial_as_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {"learning_rate": 1e-3, "discount": 0.99, "simulator": "histogram"}
+    trial = TrialResult(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
+    final = Final(0, settings, (2.0, 2.1))
+    tuned = TuningResult(tmp_path, final, (final,), (trial,), {})
+    monkeypatch.setattr("animat.tuning.run.tune", lambda *_, **__: tuned)
+    assert main(["tune", str(TINY), "--out", str(tmp_path / "out")]) == 0
+    assert "\n1 trial (1 complete) in " in capsys.readouterr().out

@@ -24,7 +24,7 @@ from animat.cli import main
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.free_runs import LAGS, autocorrelation, free_runs, run_lengths, shares_lasting
-from animat.neurons.history import Memory, Ranked
+from animat.neurons.history import NO_MEMORY, Memory, Ranked
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import MemorySimulator, fit_memory
 from animat.neurons.prediction import halved, predict
@@ -264,6 +264,18 @@ def test_runs_and_correlations_are_those_of_plain_loops(x: list[int | None]) -> 
         assert found[0, lag - 1] == pytest.approx(np.mean(pairs) / variance if pairs else np.nan, nan_ok=True)
 
 
+def test_where_no_memory_is_found_it_brings_nothing() -> None:
+    """Both simulators draw from the same responses."""
+    rng = np.random.default_rng(1)
+    condition = rng.integers(0, 3, 300)
+    responses = series(rng.gamma(6, 1 + 0.4 * condition), condition, 3)
+    simulator = fit_simulator(halved(responses).first, kind="memory")
+    assert isinstance(simulator, MemorySimulator) and simulator.memory == NO_MEMORY
+    found = validate(responses)
+    assert np.array_equal(found.of("memory").bits, found.of("empirical").bits)
+    assert found.gain("memory", "empirical") == (0.0, 0.0)
+
+
 def test_a_free_run_remembers_its_own_answers() -> None:
     """Trial by trial: what the simulator does not answer it is given, and a rest is forgotten over."""
     rng = np.random.default_rng(2)
@@ -355,6 +367,7 @@ def by_hand(responses: Responses, kind: str, readout: int | None = None) -> dict
     coarse = [(len(everything) * p + 1) / (len(everything) + 10) for p in commands(equally(everything))]
     alike = {c: commands(equally(x)) for c, x in of_condition.items()}
     nearest = neighbours(responses, [i for i, _, _ in first], read_hz) if kind == "memory" else None
+    remembers = fit_memory(halved(responses, readout).first).memory != NO_MEMORY
     known = {c: (len(x), binned(x, edges) if kind == "histogram" else equally(x)) for c, x in of_condition.items()}
     if kind == MARGINAL:
         known = dict.fromkeys(of_condition, (len(everything), equally(everything)))
@@ -365,7 +378,7 @@ def by_hand(responses: Responses, kind: str, readout: int | None = None) -> dict
             drawn = nearest(i, c)
             size, weights = len(drawn), equally(drawn)
         prior = [0.1] * 10 if kind == MARGINAL else coarse
-        if kind == "memory":
+        if nearest is not None and remembers:
             m = len(of_condition[c])
             prior = [(m * p + 10 * q) / (m + 10) for p, q in zip(alike[c], coarse, strict=True)]
         k = command[float(x)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -86,7 +86,25 @@ class SimulatorOptions(ResponseOptions):
             return self.timeline(recordings, trained)
         if recordings:
             raise InvalidArgument(f"--recordings: expected none for policies without neurons, got {recordings[0]}")
+        self.expect_no_simulator("for policies without neurons")
         return None
+
+    def expect_no_simulator(self, where: str) -> None:
+        """Refuse options of recordings and simulators where there are none, as they would have no effect."""
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if option.name in _OF_SIMULATORS and value != option.default:
+                raise InvalidArgument(f"{option.name}: expected none {where}, got {_typed(value)}")
+
+
+_OF_SIMULATORS = ("conditions", "window_ms", "burst_threshold", "simulator", "bins", "range_hz", "allow", "at_min")
+"""Options that choose simulators, or how they are made."""
+
+
+def _typed(value: Any) -> str:
+    """An option's value as on the command line."""
+    several = value if isinstance(value, tuple) else (value,)
+    return " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in several)
 
 
 def simulator_settings(

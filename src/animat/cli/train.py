@@ -148,6 +148,8 @@ class Train(SimulatorOptions, JobOptions):
             raise InvalidArgument(f"--delivery: expected none without neurons, got {self.delivery}")
         elif self.recordings:
             raise InvalidArgument(f"--recordings: expected none without neurons, got {self.recordings[0]}")
+        else:
+            self.expect_no_simulator("without neurons")
         lessons = () if self.lessons is None else read_lessons(self.lessons)
         with in_file(self.lessons or ""):
             expect_lessons(lessons, robot, draws_recordings=self.shadowing == "drawn")

@@ -50,7 +50,7 @@ class TuneFile(JobOptions):
         shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in tuned.importance.items())
         print(f"importance: {shares or 'too few trials with different returns to tell'}")
         states = ", ".join(f"{n} {state}" for state, n in tuned.to_dict()["trials"].items() if n)
-        print(f"{len(tuned.trials)} trials ({states}) in {time.monotonic() - began:.0f} s")
+        print(f"{counted(len(tuned.trials), 'trial')} ({states}) in {time.monotonic() - began:.0f} s")
         figures = f"{self.out / HISTORY}{f', {self.out / IMPORTANCE}' if tuned.importance else ''}"
         print(f"best settings: {self.out / BEST}; figures: {figures}")
         return {"folder": str(tuned.folder), "best_toml": str(self.out / BEST), **tuned.to_dict()}

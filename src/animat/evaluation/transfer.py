@@ -62,6 +62,9 @@ def other_simulator(trained: Mapping[str, Any], given: Mapping[str, Any]) -> Ite
         return None if name == "by" and str(value).startswith("frequency") else value
 
     differing = [name for name in trained if rule(name, trained[name]) != rule(name, given.get(name))]
+    if "kind" in differing:
+        # Only histograms have bins and a range.
+        differing = [name for name in differing if name not in ("bins", "range_hz")]
     if differing:
         values = ", ".join(
             f"{_LABELS.get(name, name)} {_or_default(trained[name])}, here {_or_default(given.get(name))}"

@@ -11,7 +11,9 @@ from jaxtyping import Float64
 
 from animat.errors import InvalidArgument
 from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
+from animat.neurons.history import NO_MEMORY
 from animat.neurons.kinds import Kind, fit_simulator
+from animat.neurons.memory import MemorySimulator
 from animat.neurons.prediction import CLASSES, Halves, halved, predict, predict_marginal, share_below
 from animat.neurons.timeline import default_kind
 from animat.responses.responses import Responses
@@ -234,7 +236,9 @@ def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, re
     for each in (MARGINAL, *kinds):
         simulator = simulators.get(each)
         prediction = predict_marginal(halves) if simulator is None else predict(simulator, halves)
-        prior = probabilities.get("empirical" if each == "memory" else MARGINAL, 1 / CLASSES)
+        # Without memory it is the empirical simulator, than which that one is not coarser.
+        remembers = isinstance(simulator, MemorySimulator) and simulator.memory != NO_MEMORY
+        prior = probabilities.get("empirical" if remembers else MARGINAL, 1 / CLASSES)
         probabilities[each] = prediction.of_commands(prior)
         of_observed = np.take_along_axis(probabilities[each], halves.commands_of(halves.x_hz)[:, None], 1)[:, 0]
         transforms = prediction.transforms()

@@ -33,7 +33,7 @@ def draw_history(
 
     Args:
         trials: number of each trial, and for each rung that it reached the chunks done and the mean return; none if it
-            diverged before.
+            diverged, however far it was trained before.
         rungs: chunks done at the end of each rung; the last is the full training.
         best: number of the best trial, its mean return when retrained, and the standard error.
         own: mean return and standard error of the initial settings, retrained; None if they diverged.

@@ -94,7 +94,10 @@ def write_results(folder: Path, tuning: Tuning, trials: Sequence[TrialResult], f
     write_whole(folder / BEST, f"# animat study {BEST}\n{study_to_toml(study)}")
     write_whole(folder / RESULTS, json.dumps(tuned.to_dict(), indent=1) + "\n")
     robot, own = tuning.study.robots[0].name, finals[0]
-    rungs = [(trial.trial, trial.chunks, trial.means) for trial in trials]
+    rungs = [
+        (trial.trial, (), ()) if trial.state == "diverged" else (trial.trial, trial.chunks, trial.means)
+        for trial in trials
+    ]
     chosen = (best.trial, best.mean, best.standard_error)
     reference = None if own.returns is None else (own.mean, own.standard_error)
     save_figure(draw_history(rungs, tuning.tune.chunks, chosen, reference, f"Tuning on {robot}"), folder / HISTORY)

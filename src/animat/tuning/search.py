@@ -36,14 +36,20 @@ class Search:
         self._optuna = optuna
         self._study = optuna.create_study(direction="maximize", sampler=sampler)
         self._space, self._distributions = tuning.space, distributions(tuning.space)
-        for settings in first_settings(tuning.study, tuning.space):
+        self._first = first_settings(tuning.study, tuning.space)
+        for settings in self._first:
             self._study.enqueue_trial(_mirrored(tuning.space, settings))
         self._running: list[Trial] = []
 
     def ask(self, n: int) -> list[Settings]:
         """Propose the settings of the next `n` trials, before the result of any of them is known."""
         self._running = [self._study.ask(self._distributions) for _ in range(n)]
-        return [_mirrored(self._space, trial.params) for trial in self._running]
+        proposed = [_mirrored(self._space, trial.params) for trial in self._running]
+        # As they are written: a discount of 0.1 would come back as 0.09999999999999998.
+        for trial, settings in zip(self._running, proposed, strict=True):
+            if trial.number < len(self._first):
+                settings.update(self._first[trial.number])
+        return proposed
 
     def report(self, results: Sequence[TrialResult]) -> None:
         """Report the results of the trials proposed last, in the same order."""
