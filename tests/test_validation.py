@@ -542,7 +542,7 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_the_verdict_has_the_numbers_of_the_table(known: Validation) -> None:
     verdict, *table = validation_text("known.npz", known).splitlines()
-    off, bits = re.findall(r"off by (0\.\d+) at most, .* worth (\S+ ± \S+) bits", verdict)[0]
+    off, bits = re.findall(r"off by (0\.\d+) at most, .* worth (\S+ \+- \S+) bits", verdict)[0]
     assert any(line.split()[0] == "memory" and line.split()[3] == off for line in table if line.strip())
     assert any(f"conditions bring {bits} bits" in line for line in table)
 

@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115, PTH123
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115, PTH123
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # A character that the encoding lacks, such as ± in ASCII, is printed as a question mark.
+        # A character that the encoding lacks, such as an accent in a name in ASCII, is printed as a question mark.
         sys.stdout.reconfigure(errors="replace")
     try:
         try:

@@ -242,7 +242,7 @@ class ContextGap:
         coupling = f"best coupling {self.coupling:.1f}"
         if not np.isfinite(self.standard_error):
             return f"{coupling}; no context gap with one episode"
-        coupling, known = f"{coupling} ± {self.standard_error:.1f}", self.best_known
+        coupling, known = f"{coupling} +- {self.standard_error:.1f}", self.best_known
         if self.gap is None:
             best = "the optimal return" if known is None else f"the best known agent ({known:.1f})"
             return f"{coupling}; no context gap, as {best} is not above that of random stimuli"

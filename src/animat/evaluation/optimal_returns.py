@@ -42,7 +42,7 @@ class OptimalReturn:
 
     def to_text(self) -> str:
         """One line."""
-        random = f"random {self.random:.1f} ± {self.random_standard_error:.1f}"
+        random = f"random {self.random:.1f} +- {self.random_standard_error:.1f}"
         return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}; {self.context.to_text()}"
 
 

@@ -87,8 +87,8 @@ class Optimum:
         text += f" (grid {self.grid_error:.1f})"
         if self.episodes:
             text += (
-                f"; its controller, run: {self.monte_carlo:.1f} ± {self.standard_error:.1f}, without knowing the time "
-                f"left {self.without_clock:.1f} ± {self.without_clock_standard_error:.1f}"
+                f"; its controller, run: {self.monte_carlo:.1f} +- {self.standard_error:.1f}, without knowing the time "
+                f"left {self.without_clock:.1f} +- {self.without_clock_standard_error:.1f}"
             )
         if self.left_out:
             text += f"; too few responses to count: {', '.join(self.left_out)}"
@@ -101,7 +101,7 @@ class Optimum:
 
 def bracket_findings(value: float, grid_error: float, monte_carlo: float, error: float) -> tuple[Finding, ...]:
     """A warning if a value and its controller's return differ by more than 3 of its `error` plus the grid's error."""
-    difference, of_controller = value - monte_carlo, f"its controller's return {monte_carlo:.2f} ± {error:.2f}"
+    difference, of_controller = value - monte_carlo, f"its controller's return {monte_carlo:.2f} +- {error:.2f}"
     # No warning for NaN, where the controller was not run.
     if not abs(difference) > max(_SAME, 3 * error + grid_error):
         return ()

@@ -186,7 +186,7 @@ class Validation:
         for gain, unit in ((conditions, "bits"), (self.gain("empirical", MARGINAL, "crps_hz"), "Hz of CRPS")):
             if not gain.is_certain:
                 return (
-                    f"Cannot be trusted: knowing the condition is worth {gain.value:.3f} ± {gain.error:.3f} {unit} "
+                    f"Cannot be trusted: knowing the condition is worth {gain.value:.3f} +- {gain.error:.3f} {unit} "
                     "per trial, which is not clearly above 0, so there is next to nothing to steer with"
                 )
         if distance > LARGE_DISTANCE:
@@ -204,7 +204,7 @@ class Validation:
             return f"With care: the {better[-1]} simulator predicts better; train with --simulator {better[-1]}"
         return (
             f"Can be trusted: the held-out distribution is off by {distance:.3f} at most, and the condition is worth "
-            f"{conditions.value:.3f} ± {conditions.error:.3f} bits per trial"
+            f"{conditions.value:.3f} +- {conditions.error:.3f} bits per trial"
         )
 
 
