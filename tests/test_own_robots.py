@@ -157,6 +157,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
     [
         ({"observe": lambda self, state: jnp.stack([state.x_m] * 2)}, r"observe: .*shape \(1,\), got shape \(2,\)"),
         ({"observe": lambda self, state: state.x_m}, r"observe: .*shape \(1,\), got shape \(\)"),
+        ({"observe": lambda self, state: jnp.stack([state.x_m + 1j])}, "observe: expected one number .* got complex64"),
         ({"observe": lambda self, state: jnp.stack([state.x_m / 0])}, "NaN or infinite ones in an observation"),
         ({"observe": lambda self, state: jnp.stack([state.y])}, "observe: expected it to run .* AttributeError"),
         ({"reset": lambda self, key: At(jnp.float32(jnp.nan))}, "NaN or infinite ones in a state"),
