@@ -309,7 +309,7 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
         (lambda x: 0.5, "expected 25 commands from -1 to 1, got 0.5"),
         (lambda x: x, "expected 25 commands from -1 to 1"),
         (
-            lambda x: -x / 100,
+            lambda x: -x / (x + 100),
             "expected commands that never fall as the response rises, got -0 at 0 Hz and -0.0",
         ),
         (
@@ -321,6 +321,8 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
             lambda x: x * 0 + isinstance(x, np.ndarray),
             "expected the same command for a single response as in an array, 1, got 0",
         ),
+        # A line without its ends, which only a response far above the largest measured one shows.
+        (lambda x: (x - 6) / 12, "expected 25 commands from -1 to 1, got "),
         (lambda x: x * np.nan, "expected 25 commands from -1 to 1"),
         (lambda x: x.command, "expected commands, got AttributeError"),
     ],
