@@ -96,5 +96,11 @@ def test_a_robot_without_a_drawing_is_refused() -> None:
         name = "unicycle"
         n_commands = 1
 
+    class Crashing(Unicycle):
+        def draw(self, observation: np.ndarray, *_: object) -> None:
+            raise ValueError(f"no wheel\nin {observation}")
+
     with pytest.raises(InvalidArgument, match="unicycle has no method `draw`"):
         draw_robot(Unicycle(), np.zeros(3))  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match=r"^unicycle\.draw: expected a picture, got ValueError: no wheel$"):
+        draw_robot(Crashing(), np.zeros(3))  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, first_line
 from animat.lazy import Axes
 from animat.robots.base import Robot, capability
 
@@ -57,11 +57,16 @@ def draw_robot(
         red, green, blue from 0 to 255.
 
     Raises:
-        InvalidArgument: for a robot without such a method, or if it does not return a picture.
+        InvalidArgument: for a robot without such a method, or if it raises or does not return a picture.
     """
     if robot.n_commands > 1:
         command = np.broadcast_to(command, robot.n_commands)
-    drawn = capability(robot, "draw")(np.asarray(observation, np.float64), command, earlier, height_px)
+    draw = capability(robot, "draw")
+    try:
+        drawn = draw(np.asarray(observation, np.float64), command, earlier, height_px)
+    except Exception as error:
+        # Anything may go wrong in a user's robot.
+        raise InvalidArgument(f"{robot.name}.draw: expected a picture, got {first_line(error)}") from error
     picture = np.asarray(drawn)
     if picture.shape[2:] != (3,) or picture.dtype != np.uint8:
         got = f"{picture.dtype} of shape {picture.shape}"
