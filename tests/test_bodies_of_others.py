@@ -288,6 +288,8 @@ def test_what_cannot_be_a_body_is_refused_in_one_line_before_training(
     assert code != 0 and error.count("\n") == 1 and "Traceback" not in error
     assert FAULTS[name] in error and f"{TOY}{name}-v0" in error, error
     assert not (tmp_path / "out").exists()
+    assert main(["robots", f"{TOY}{name}-v0"]) == code
+    assert capsys.readouterr().err == error
 
 
 def test_a_limit_is_known_under_an_environments_own_wrappers() -> None:

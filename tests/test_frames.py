@@ -70,6 +70,19 @@ def test_what_is_too_small_to_be_seen_is_left_out_without_harm() -> None:
     assert draw_robot(Navigation(arena_width_m=20, arena_height_m=20), np.zeros(3), height_px=30).shape == (30, 30, 3)
 
 
+@pytest.mark.parametrize(
+    "robot", [Cartpole(track_length_m=50), Cartpole(pole_length_m=0.01), Navigation(arena_width_m=50)]
+)
+def test_a_long_track_is_shown_whole_in_a_picture_of_limited_size(robot: Cartpole | Navigation) -> None:
+    """A thousand times as long, it would take gigabytes."""
+    x_m = robot.observation_spec[0].scale
+    picture = draw_robot(robot, np.array([x_m, 0, 0, 0][: len(robot.observation_spec)]), height_px=120)
+    assert picture.shape == (120, 480, 3)
+    rows, columns = np.nonzero((picture != PAPER).any(axis=2))
+    np.testing.assert_allclose([rows.min() + rows.max(), columns.min() + columns.max()], [119, 479], atol=6)
+    assert columns.min() < 30
+
+
 def test_what_lies_outside_the_picture_is_left_out_without_harm() -> None:
     canvas = Canvas(20, 20, (0.0, 0.0), 1.0)
     canvas.stroke([(-50.0, -50.0), (-30.0, -20.0)], 2.0, INK)
@@ -83,5 +96,11 @@ def test_a_robot_without_a_drawing_is_refused() -> None:
         name = "unicycle"
         n_commands = 1
 
+    class Crashing(Unicycle):
+        def draw(self, observation: np.ndarray, *_: object) -> None:
+            raise ValueError(f"no wheel\nin {observation}")
+
     with pytest.raises(InvalidArgument, match="unicycle has no method `draw`"):
         draw_robot(Unicycle(), np.zeros(3))  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match=r"^unicycle\.draw: expected a picture, got ValueError: no wheel$"):
+        draw_robot(Crashing(), np.zeros(3))  # type: ignore[arg-type]

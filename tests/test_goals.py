@@ -455,6 +455,8 @@ def test_units_are_those_of_the_robot() -> None:
         ("avoid pole_angle above 1 rad x", "several joined by and, .*; got 'pole_angle above 1 rad x'"),
         ("drive x in 1..2 within 3 and x above 1", "within and weight at most once, .*got 'within 3 and x above 1'"),
         ("; ".join(["avoid pole_angle above 1 rad"] * 51), "at most 50"),
+        # Not -5 to 0.5.
+        ("avoid pole_angle outside -5...5 deg", "expected a region: .*got 'pole_angle outside -5 ... 5 deg'"),
     ],
 )
 def test_an_invalid_goal_is_reported_in_one_line(goal: str, message: str) -> None:

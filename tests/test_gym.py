@@ -323,6 +323,27 @@ class Listing(Drifter):
         return [state.x_m]
 
 
+@dataclass(frozen=True)
+class Counter(Drifter):
+    """Observes a whole number."""
+
+    name: ClassVar[str] = "counter"
+
+    def observe(self, state: Drawn) -> Any:
+        return jnp.round(jnp.stack([state.x_m])).astype(jnp.int32)
+
+
+def test_whole_numbers_are_observed_as_the_space_has_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(REGISTRY, "_registered", {**REGISTRY.kinds, "counter": Counter})
+    env = gymnasium.make("Animat/Robot-v0", robot="counter").unwrapped
+    envs = gymnasium.make_vec("Animat/Robot-v0", num_envs=3, robot="counter")
+    for of, action in ((env, np.int64(0)), (envs, np.zeros(3, np.int64))):
+        assert of.reset(seed=0)[0] in of.observation_space  # type: ignore[attr-defined]
+        observations = of.step(action)[0]  # type: ignore[attr-defined]
+        assert observations in of.observation_space  # type: ignore[attr-defined]
+        assert (observations == np.round(observations)).all()
+
+
 def test_a_robot_of_your_own_keeps_every_bit_of_its_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(REGISTRY, "_registered", {**REGISTRY.kinds, "drifter": Drifter})
     env = gymnasium.make("Animat/Robot-v0", robot="drifter")

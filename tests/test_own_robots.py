@@ -157,6 +157,7 @@ def test_in_memory_they_are_trained_and_act(tmp_path: Path) -> None:
     [
         ({"observe": lambda self, state: jnp.stack([state.x_m] * 2)}, r"observe: .*shape \(1,\), got shape \(2,\)"),
         ({"observe": lambda self, state: state.x_m}, r"observe: .*shape \(1,\), got shape \(\)"),
+        ({"observe": lambda self, state: jnp.stack([state.x_m + 1j])}, "observe: expected one number .* got complex64"),
         ({"observe": lambda self, state: jnp.stack([state.x_m / 0])}, "NaN or infinite ones in an observation"),
         ({"observe": lambda self, state: jnp.stack([state.y])}, "observe: expected it to run .* AttributeError"),
         ({"reset": lambda self, key: At(jnp.float32(jnp.nan))}, "NaN or infinite ones in a state"),
@@ -308,7 +309,7 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
         (lambda x: 0.5, "expected 25 commands from -1 to 1, got 0.5"),
         (lambda x: x, "expected 25 commands from -1 to 1"),
         (
-            lambda x: -x / 100,
+            lambda x: -x / (x + 100),
             "expected commands that never fall as the response rises, got -0 at 0 Hz and -0.0",
         ),
         (
@@ -320,6 +321,8 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
             lambda x: x * 0 + isinstance(x, np.ndarray),
             "expected the same command for a single response as in an array, 1, got 0",
         ),
+        # A line without its ends, which only a response far above the largest measured one shows.
+        (lambda x: (x - 6) / 12, "expected 25 commands from -1 to 1, got "),
         (lambda x: x * np.nan, "expected 25 commands from -1 to 1"),
         (lambda x: x.command, "expected commands, got AttributeError"),
     ],

@@ -334,6 +334,35 @@ def test_an_observation_spec_that_raises_ends_in_a_line(package: Path, capsys: A
     assert not (package / "study").exists()
 
 
+@pytest.mark.parametrize(
+    ("attribute", "words"),
+    [
+        # A method in place of a property.
+        ("def return_range(self): return 0.0, 20.0", "return_range: expected two numbers, .* got TypeError"),
+        ("return_range = (20.0, 0.0)", r"return_range: expected two numbers, .* got \(20.0, 0.0\)"),
+        ("return_range = (0.0, float('nan'))", "return_range: expected two numbers, .* got .*nan"),
+        ("return_range = property(lambda self: 1 / 0)", "return_range: expected two numbers, .* ZeroDivisionError"),
+        ("def caveats(self): return 'slippery'", "caveats: expected a tuple of strings, got 'slippery'"),
+        ("def caveats(self): return (1,)", r"caveats: expected a tuple of strings, got \(1,\)"),
+        ("def caveats(self): return 1 / 0", "caveats: expected a tuple of strings, got ZeroDivisionError"),
+        ("paper_iterations = None", "paper_iterations: expected a whole number from 1 to .*, got None"),
+        ("paper_iterations = 1e5", "paper_iterations: expected a whole number from 1 to .*, got 100000.0"),
+        ("n_commands = []", r"n_commands: expected a whole number from 1 to 64, got \[\]"),
+    ],
+)
+def test_what_a_robot_may_leave_out_is_checked_too(attribute: str, words: str, package: Path, capsys: Any) -> None:
+    at = written(package, ("    def observe(self, state):", f"    {attribute}\n\n    def observe(self, state):"))
+    training = ["train", at, "--recordings", "no-such-folder"]
+    goal = ["--goal", "drive x in -1..1 m"]
+    live = ["live", at, "--culture", "virtual", "--out", "live"]
+    for command in (["robots", at], training, [*training, *goal], live, [*live, *goal]):
+        assert main(command) == 1
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 1 and re.match(f"animat: Rover.{words}", said[0]), command
+    with pytest.raises(InvalidArgument, match=words):
+        gymnasium.make("animat:Animat/Robot-v0", robot=at)
+
+
 def test_it_is_a_gymnasium_environment_and_is_drawn_where_it_can_be(package: Path) -> None:
     env = gymnasium.make("animat:Animat/Robot-v0", robot=ROVER, gain_m=0.2)
     observation, _ = env.reset(seed=1)

@@ -95,8 +95,8 @@ class Environment(abc.ABC, Generic[RobotState]):
         return self.robot.observation_spec
 
     def observe(self, state: State) -> Float[Array, " observations"]:
-        """What a policy sees, in the units of `observation_spec`."""
-        return self.robot.observe(state.robot)
+        """What a policy sees, in the units of `observation_spec`; float32, of whatever type a user's robot makes it."""
+        return jnp.asarray(self.robot.observe(state.robot), jnp.float32)
 
     def reset(self, key: PRNGKeyArray) -> State:
         """Start an episode."""

@@ -74,6 +74,8 @@ class Live(StimulationOptions):
         from animat.live.shadowing import live
         from animat.progress import Bar
         from animat.recordings.reading import read_recordings
+        from animat.registry import is_ours
+        from animat.robots.checking import check_robot
         from animat.robots.registry import robot_named
         from animat.stimulation.protocol import Protocol
         from animat.training.specification import Training
@@ -90,6 +92,8 @@ class Live(StimulationOptions):
         speed = (30.0 if simulated else 1.0) if self.speed is None else self.speed
         timetable = Timetable(self.interval_min, self.duration_min, speed)
         robot = robot_named(self.robot)
+        if not is_ours(robot):
+            check_robot(robot)
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         training = Training(
             robot,

@@ -18,7 +18,7 @@ class Robots(Command):
     """Robots to list, such as cartpole or my_package.robots:Rover; default: all registered robots"""
 
     def run(self) -> dict[str, Any]:
-        from animat.errors import InvalidArgument
+        from animat.errors import AnimatError, InvalidArgument
         from animat.robots.registry import REGISTRY
 
         listed, unusable = {}, {}
@@ -28,7 +28,7 @@ class Robots(Command):
             except Exception as error:
                 # Another package's robot may raise anything. Unless it was named, the other robots are still listed.
                 message = f"{name}: expected a robot, got {type(error).__name__}: {error}"
-                refusal = error if isinstance(error, InvalidArgument) else InvalidArgument(message)
+                refusal = error if isinstance(error, AnimatError) else InvalidArgument(message)
                 if self.names:
                     raise refusal from error
                 unusable[name] = str(refusal)

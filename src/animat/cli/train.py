@@ -122,7 +122,9 @@ class Train(SimulatorOptions, JobOptions):
         from animat.coding.decoder import expect_fit
         from animat.coding.mapping import mapping_named
         from animat.goals.robot import with_goal
+        from animat.registry import is_ours
         from animat.responses.readouts import ALL, DEFAULT_READOUTS, count_readouts, read_readouts
+        from animat.robots.checking import check_robot
         from animat.robots.registry import robot_named
         from animat.training.lessons import expect_lessons, read_lessons
         from animat.training.specification import Training
@@ -135,6 +137,8 @@ class Train(SimulatorOptions, JobOptions):
             if not parameters or not str(error).startswith(f"{self.robot}: "):
                 raise
             raise InvalidArgument(f"--parameters: {error}") from error
+        if not is_ours(robot):
+            check_robot(robot)
         robot = robot if self.goal is None else with_goal(robot, self.goal)
         usual = _PAPER if self.paper else _USUAL
         mapping = self.mapping or usual["mapping"]

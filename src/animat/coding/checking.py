@@ -12,7 +12,8 @@ from animat.coding.mapping import N_PERCENTILES, Mapping
 from animat.errors import InvalidArgument, first_line, shown
 from animat.lazy import jax
 
-_RESPONSES_HZ = np.linspace(0.0, 12.0, 25, dtype=np.float32)
+_RESPONSES_HZ = np.append(np.arange(0.0, 12.0, 0.5), 10_000.0).astype(np.float32)
+"""The last is far above all percentiles, as a burst may be in a closed loop."""
 _PERCENTILES_HZ = {
     "": np.linspace(1.0, 11.0, N_PERCENTILES, dtype=np.float32),
     " where all percentiles are equal": np.full(N_PERCENTILES, 6.0, np.float32),

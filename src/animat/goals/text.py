@@ -17,7 +17,7 @@ from animat.errors import InvalidArgument, did_you_mean, shown, within
 from animat.goals.goal import KINDS, Goal, Objective
 from animat.goals.region import Ball, Range
 
-_TOKEN = re.compile(r"\.\.|,|[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?|[^\W\d][^\s,;]*|\S")
+_TOKEN = re.compile(r"\.{2,}|,|[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?|[^\W\d][^\s,;]*|\S")
 _N = r"[-+]?\.?\d\S*"
 _RELATIONS = ("in", "outside", "above", "below", "around")
 _QUANTITY = rf"(?!(?:{'|'.join(_RELATIONS)}|and|within|weight) )[^\W\d]\S*"
@@ -25,7 +25,7 @@ _UNIT = r"(?: (?!(?:and|within|weight)$)(\S+))?"
 _BETWEEN = re.compile(rf"({_QUANTITY}) (in|outside) ({_N}) \.\. ({_N}){_UNIT}")
 _BEYOND = re.compile(rf"({_QUANTITY}) (above|below) ({_N}){_UNIT}")
 _AROUND = re.compile(rf"({_QUANTITY}(?: , {_QUANTITY})*) around ({_N}(?: , {_N})*) radius ({_N}){_UNIT}")
-"""The forms of a region's part, in which spaces separate words, numbers and signs."""
+"""The forms of a region's part, in which spaces separate words, numbers and signs; `...` is none of them."""
 _EXAMPLE = "avoid pole_angle outside -12..12 deg"
 
 

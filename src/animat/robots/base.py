@@ -37,6 +37,9 @@ Size = Annotated[Number, Field(ge=1e-9, le=1e9)]
 Amount = Annotated[Number, Field(ge=0, le=1e9)]
 """Types of a robot's parameters: a size is never 0."""
 
+MOST_ITERATIONS = 2_000_000_000
+"""Most iterations of a training: they are counted in 32 bits, with room for a last round of all environments."""
+
 MOST_AT_ONCE = 5_000_000
 """Most episodes side by side: each takes some 300 bytes."""
 

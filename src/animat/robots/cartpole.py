@@ -13,7 +13,7 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time
+from animat.robots.drawing import ACCENT, BODY, INK, PAPER, RAIL, Canvas, Picture, draw_over_time, fit
 from animat.robots.grid import Axis, Grid
 from animat.robots.registry import register_robot
 
@@ -220,9 +220,8 @@ class Cartpole(Robot[CartpoleState]):
         x, angle = float(observation[0]), float(observation[2])
         # Room for the pole to hang, if the limits allow it.
         below = pole if self.angle_limit_rad > math.pi / 2 else 0.1 * pole
-        scale = height_px / (pole + below + 2 * margin)
-        width_px = round(scale * 2 * (half_track + pole / 2 + margin))
-        canvas = Canvas(width_px, height_px, (width_px / 2, scale * (pole + margin)), scale)
+        scale, width_px, above_px = fit(2 * (half_track + pole / 2 + margin), pole + below + 2 * margin, height_px)
+        canvas = Canvas(width_px, height_px, (width_px / 2, above_px + scale * (pole + margin)), scale)
 
         cart_width, cart_height, thick = 0.3 * pole, 0.14 * pole, 0.045 * pole
         canvas.stroke([(-half_track, 0.0), (half_track, 0.0)], 0.02 * pole, RAIL)

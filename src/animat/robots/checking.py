@@ -13,7 +13,7 @@ import numpy as np
 
 from animat.errors import AnimatError, InvalidArgument, first_line, shown
 from animat.lazy import jax, jnp
-from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, Quantity, Robot
+from animat.robots.base import LARGEST_SCALE, LEAST_SCALE, LONGEST_EPISODE, MOST_ITERATIONS, Quantity, Robot
 from animat.robots.grid import Grid
 from animat.robots.host import Bodies, HostRobot
 
@@ -30,6 +30,10 @@ def check_robot(robot: Robot[Any]) -> None:
         _check_compiled(robot)
     if (value_grid := getattr(robot, "value_grid", None)) is not None:
         _expect_grid(f"{type(robot).__name__}.value_grid", value_grid)
+    expected = "a tuple of strings"
+    caveats = _call(what := f"{type(robot).__name__}.caveats", robot.caveats, expected=expected)
+    if not isinstance(caveats, tuple) or not all(isinstance(caveat, str) for caveat in caveats):
+        raise InvalidArgument(f"{what}: expected {expected}, got {shown(caveats)}")
 
 
 @lru_cache(maxsize=64)
@@ -136,6 +140,7 @@ def _expect_attributes(robot: Any) -> None:
         ("n_commands", 1, MOST_COMMANDS),
         ("noise_size", 0, 10_000),
         ("episode_limit", 1, LONGEST_EPISODE),
+        ("paper_iterations", 1, MOST_ITERATIONS),
     ):
         value = getattr(robot, name, None)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
@@ -154,6 +159,10 @@ def _expect_attributes(robot: Any) -> None:
                 f"{kind}.observation_spec: {quantity.name}: expected a scale from {LEAST_SCALE:g} to "
                 f"{LARGEST_SCALE:g}, got {quantity.scale:g}; use another unit"
             )
+    expected = "two numbers, the lowest and the highest return of an episode"
+    limits = _call(f"{kind}.return_range", lambda: list(map(float, robot.return_range)), expected=expected)
+    if len(limits) != 2 or not limits[0] <= limits[1]:
+        raise InvalidArgument(f"{kind}.return_range: expected {expected}, got {shown(robot.return_range)}")
     try:
         hash(robot)
         json.dumps(dataclasses.asdict(robot))  # type: ignore[call-overload]
@@ -182,6 +191,8 @@ def _expect_shape(what: str, value: Any, shape: tuple[int, ...], expected: str, 
         raise InvalidArgument(f"{what}: expected {expected}, shape {shape}, got {shown(value)}") from error
     if array.shape != shape:
         raise InvalidArgument(f"{what}: expected {expected}, shape {shape}, got shape {array.shape}")
+    if jnp.iscomplexobj(array):
+        raise InvalidArgument(f"{what}: expected {expected}, got {array.dtype}")
     if dtype is bool and array.dtype != bool:
         raise InvalidArgument(f"{what}: expected {expected}, got {array.dtype}")
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, first_line
 from animat.lazy import Axes
 from animat.robots.base import Robot, capability
 
@@ -28,6 +28,9 @@ TRAIL: Colour = (150, 178, 214)
 
 _FINER = 4
 """How many times larger than its final size a picture is drawn."""
+
+WIDEST = 4.0
+"""Most times that a picture is wider than it is tall: a long track would fill the memory."""
 
 DONE, FAILED, AIM, EDGE = "#0072B2", "#D55E00", "#009E73", "#8C8C8C"
 """Colours in figures of paths (Okabe-Ito): episodes that ended well or not, where they should end, and limits."""
@@ -54,16 +57,30 @@ def draw_robot(
         red, green, blue from 0 to 255.
 
     Raises:
-        InvalidArgument: for a robot without such a method, or if it does not return a picture.
+        InvalidArgument: for a robot without such a method, or if it raises or does not return a picture.
     """
     if robot.n_commands > 1:
         command = np.broadcast_to(command, robot.n_commands)
-    drawn = capability(robot, "draw")(np.asarray(observation, np.float64), command, earlier, height_px)
+    draw = capability(robot, "draw")
+    try:
+        drawn = draw(np.asarray(observation, np.float64), command, earlier, height_px)
+    except Exception as error:
+        # Anything may go wrong in a user's robot.
+        raise InvalidArgument(f"{robot.name}.draw: expected a picture, got {first_line(error)}") from error
     picture = np.asarray(drawn)
     if picture.shape[2:] != (3,) or picture.dtype != np.uint8:
         got = f"{picture.dtype} of shape {picture.shape}"
         raise InvalidArgument(f"{robot.name}.draw: expected uint8 of shape (height, width, 3), got {got}")
     return picture
+
+
+def fit(width: float, height: float, height_px: int) -> tuple[float, int, float]:
+    """How to show a rectangle: pixels per unit, the width of the picture, and the space left above the rectangle (px).
+
+    The rectangle fills the picture, unless that would be too wide.
+    """
+    scale = height_px * min(1 / height, WIDEST / width)
+    return scale, round(scale * width), (height_px - scale * height) / 2
 
 
 def draw_over_time(
@@ -108,8 +125,8 @@ class Canvas:
         self._origin_px, self._scale = _FINER * np.array(origin_px) - 0.5, _FINER * px_per_unit
 
     def stroke(self, points: Sequence[Point], width: float, colour: Colour) -> None:
-        """A line through the points with round ends; a single point is a disc."""
-        self._draw.line([self._to_px(point) for point in points], colour, round(width * self._scale))
+        """A line through the points with round ends, however thin; a single point is a disc."""
+        self._draw.line([self._to_px(point) for point in points], colour, max(1, round(width * self._scale)))
         for point in points:
             self.disc(point, width / 2, colour)
 

@@ -14,7 +14,21 @@ from animat.errors import InvalidArgument
 from animat.lazy import Array, Axes, jnp
 from animat.records import Number, record
 from animat.robots.base import Amount, Iterations, Quantity, Robot, Size, Transition, Uniforms
-from animat.robots.drawing import ACCENT, AIM, BODY, DONE, EDGE, FAILED, GOAL, GOAL_FILL, INK, TRAIL, Canvas, Picture
+from animat.robots.drawing import (
+    ACCENT,
+    AIM,
+    BODY,
+    DONE,
+    EDGE,
+    FAILED,
+    GOAL,
+    GOAL_FILL,
+    INK,
+    TRAIL,
+    Canvas,
+    Picture,
+    fit,
+)
 from animat.robots.grid import Axis, Grid
 from animat.robots.motion import cost_of_distance, within_half_a_turn
 from animat.robots.registry import register_robot
@@ -176,8 +190,8 @@ class Navigation(Robot[NavigationState]):
         x, y, heading = (float(value) for value in observation)
         width_m, height_m = self.arena_width_m, self.arena_height_m
         margin = 0.06 * height_m
-        scale = height_px / (height_m + 2 * margin)
-        canvas = Canvas(round(scale * (width_m + 2 * margin)), height_px, (scale * margin, scale * margin), scale)
+        scale, width_px, above_px = fit(width_m + 2 * margin, height_m + 2 * margin, height_px)
+        canvas = Canvas(width_px, height_px, (scale * margin, above_px + scale * margin), scale)
         line, size = 0.008 * height_m, 0.03 * height_m
 
         goal = (self.goal_x_m, self.goal_y_m)

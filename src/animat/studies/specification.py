@@ -17,11 +17,11 @@ from animat.goals.robot import with_goal
 from animat.records import Flag, Number, Positive, Seed, Share, Whole, read_record, record
 from animat.registry import is_ours, place_of
 from animat.responses.readouts import count_readouts, readouts_named
-from animat.robots.base import MOST_AT_ONCE, Robot
+from animat.robots.base import MOST_AT_ONCE, MOST_ITERATIONS, Robot
 from animat.robots.registry import REGISTRY, robot_named
 from animat.studies.source import LISTED, Source
 from animat.training.lessons import Lesson, expect_lessons
-from animat.training.settings import MOST_ITERATIONS, SAC, Policies
+from animat.training.settings import SAC, Policies
 
 MOST_TRAINED = 20_000
 """Policies of all arms on all robots: each is a file, and five are a job."""

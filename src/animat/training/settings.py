@@ -13,8 +13,6 @@ LEARNER = 2
 """Revision of the learner, raised with every change that changes trained policies. 2: exploration."""
 MOST_POLICIES = 1_000
 Policies = Annotated[Whole, Field(ge=1, le=MOST_POLICIES)]
-MOST_ITERATIONS = 2_000_000_000
-"""Iterations are counted in 32 bits, with room for a last round of all environments."""
 PulseCost = Annotated[Number, Field(ge=0, le=1e6)]
 """Cost of an electrode pulse, in the units of the reward."""
 FORMER = {

@@ -19,11 +19,11 @@ from animat.goals.robot import body_and_goal, without_goal
 from animat.neurons.timeline import SimulatorTimeline
 from animat.records import Flag, Number, Positive, Seed, Whole, read_record
 from animat.registry import is_ours
-from animat.robots.base import Robot
+from animat.robots.base import MOST_ITERATIONS, Robot
 from animat.robots.host import HostRobot
 from animat.robots.registry import register_robot, robot_named
 from animat.training.lessons import EPISODES, MOST_EPISODES, Lesson, expect_lessons
-from animat.training.settings import MOST_ITERATIONS, SAC, Policies, PulseCost
+from animat.training.settings import SAC, Policies, PulseCost
 from animat.wrappers import Delivery, NeuralObservation, ShuffledDelivery, TrialCosts
 
 Percentiles = Literal["moving", "first"]
