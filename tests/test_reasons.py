@@ -264,6 +264,26 @@ def test_commands_that_all_differ_by_little_are_a_reason_together(monkeypatch: p
     assert len(named(0.1)) <= 3 and len(named(0.0)) <= binom.isf(1e-4, 20, LEVEL)
 
 
+def test_commands_without_any_variance_are_compared_too() -> None:
+    """As where every response passes all thresholds: it was a division by zero."""
+
+    def ones(sums: CommandSums) -> CommandSums:
+        return CommandSums(sums.presented, sums.presented[..., None] * 1.0)
+
+    varied = session(1)
+    commanded, bootstraps = varied.predicted.commanded, varied.predicted.commanded_bootstraps
+    predicted = varied.predicted._replace(commanded=ones(commanded), commanded_bootstraps=ones(bootstraps))
+
+    def named(command: float) -> list[str]:
+        of_session = replace(varied.session, command=np.full_like(varied.session.command, command))
+        found = reasons(replace(varied, predicted=predicted, session=of_session))
+        return [finding.message for finding in found if finding.name == "answers"]
+
+    assert named(1.0) == []
+    (message,) = named(0.9375)
+    assert message.startswith("commands are lower than predicted for the same conditions, by 0.062 +- 0.000")
+
+
 def test_of_two_readouts_the_one_that_differs_is_named() -> None:
     def on_halves(left: Evidence, right: Evidence) -> Evidence:
         each = [evidence.session for evidence in (left, right)]

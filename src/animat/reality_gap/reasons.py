@@ -211,8 +211,8 @@ def _offset(evidence: Evidence, conditions: Int64[np.ndarray, " conditions"], le
         # Bootstrap simulators have percentiles of their own, which keep the mean of all commands in place.
         independent = np.array([commands[rows, d].var() for rows in of_each]) / recorded
         error = math.sqrt(between**2 + max(float(np.nanvar(bootstrapped @ shares)), float(shares**2 @ independent)))
-        p = 2 * student.sf(abs(offset) / error, episodes - 1)
-        if p < level and abs(offset) >= max(LEAST_OFFSET, abs(most)):
+        # Without a quotient, as the error is 0 where each condition always leads to the same command.
+        if abs(offset) >= max(LEAST_OFFSET, abs(most)) and abs(offset) > student.isf(level / 2, episodes - 1) * error:
             most = offset
             message = (
                 f"commands{f' on {name}' if len(names) > 1 else ''} are {'higher' if offset > 0 else 'lower'} than "
