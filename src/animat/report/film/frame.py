@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from functools import cache
 
@@ -189,12 +190,15 @@ def _round_up(value: float) -> float:
     return math.ceil(value / unit) * unit
 
 
+@cache
 def _shortened(text: str, size: int) -> str:
     """The text, or as much of it as there is room for left of the strips, with an ellipsis."""
-    most_px = _LEFT - 28
-    while _font(size).getlength(text) > most_px:
-        text = f"{text[:-2]}…"
-    return text
+    font, most_px = _font(size), _LEFT - 28
+    if font.getlength(text) <= most_px:
+        return text
+    # The label of a large set of electrodes has thousands of characters.
+    n_fitting = bisect_right(range(len(text)), most_px, key=lambda n: font.getlength(f"{text[:n]}…"))
+    return f"{text[: n_fitting - 1]}…"
 
 
 @cache
