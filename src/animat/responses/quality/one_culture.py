@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool
 
 from animat.errors import in_min
 from animat.recordings.findings import Finding
@@ -40,13 +39,11 @@ def series_findings(series: Sequence[Responses]) -> Iterator[Finding]:
 
 
 def _different(tables: Sequence[Channels]) -> int:
-    """The most channels of any of these tables that are not in all of the others."""
-    in_all = [np.all([_is_in(table, other) for other in tables], axis=0) for table in tables]
-    return max((int(np.count_nonzero(~each)) for each in in_all), default=0)
+    """The most channels of any of these tables that are not in all of them.
 
-
-def _is_in(table: Channels, other: Channels) -> Bool[np.ndarray, " channels"]:
-    """Whether each channel of a table is in another: by electrode if it is known of all, otherwise by label."""
-    knows = all(np.all(each.electrode != UNKNOWN) for each in (table, other))
-    one, two = (each.electrode if knows else each.label for each in (table, other))
-    return np.isin(one, two)
+    They are compared by electrode if it is known of all, otherwise by label.
+    """
+    knows = all(np.all(table.electrode != UNKNOWN) for table in tables)
+    names = [table.electrode if knows else table.label for table in tables]
+    in_all = set.intersection(*(set(each.tolist()) for each in names)) if names else set()
+    return max((sum(name not in in_all for name in each.tolist()) for each in names), default=0)
