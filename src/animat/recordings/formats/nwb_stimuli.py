@@ -26,7 +26,7 @@ COLUMNS = {
     "stimulus_presentation": ("presentation",),
 }
 ELECTRODES = ("electrode_ids", "electrode_id", "electrodes", "electrode")
-NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "tags_index", "timeseries", "timeseries_index")
+NO_STIMULUS_COLUMNS = ("id", "start_time", "stop_time", "tags", "timeseries")
 """Columns that any table of intervals may have."""
 APART_S = 0.001
 _BLOCK = 2**20
@@ -93,11 +93,14 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
     for name in ELECTRODES:
         if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
             columns["stimulus_electrodes"] = electrodes
-            used |= {name, f"{name}_index"}
+            used.add(name)
             break
     known = COLUMNS | {"stimulus_electrodes": ELECTRODES}
     missing = [name for column, names in known.items() if column not in columns for name in names]
-    findings += left_out_findings("columns", [n for n in file.names(at) if n not in used], f"/{at}", missing)
+    present = file.names(at)
+    # The index of a ragged column is part of it.
+    used |= {f"{name}_index" for name in present}
+    findings += left_out_findings("columns", [n for n in present if n not in used], f"/{at}", missing)
     if "stimulus_frequency_hz" in columns:
         frequency = columns["stimulus_frequency_hz"].astype(np.float64)
         columns["stimulus_frequency_hz"] = np.where(frequency > 0, frequency, np.nan)
@@ -189,9 +192,9 @@ def _of_series(file: Hdf5File, at: str) -> Column:
 def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
     """The samples at which a stimulus leaves 0, for the first time in 1 ms.
 
-    If most samples are exactly 0, every other one is away from it. Otherwise the stimulus was measured, with noise, and
-    away is more than half of its largest magnitude. Samples are read in blocks, as they may be as many as the
-    recording's.
+    If most samples are exactly 0, away from it is more than a hundredth of its largest magnitude: a converter from
+    analog to digital is off by a step or two now and then. Otherwise there is more noise, and it is more than half.
+    Samples are read in blocks, as they may be as many as the recording's.
     """
     dataset = file.dataset(at)
     if dataset.ndim != 1 or dataset.dtype.kind not in "iufb" or dataset.size > 8 * (file.path.stat().st_size + 10**6):
@@ -208,7 +211,7 @@ def _onsets(file: Hdf5File, at: str, rate_hz: float) -> Column:
         largest, n_zeros = max(largest, float(np.max(block))), n_zeros + int(np.count_nonzero(block == 0))
     if not largest > 0:
         return np.empty(0)
-    least = 0.0 if n_zeros > len(dataset) / 2 else largest / 2
+    least = largest / (100 if n_zeros > len(dataset) / 2 else 2)
     samples = np.concatenate([np.flatnonzero(magnitude(b) > least) + b for b in blocks])
     return np.asarray(samples[np.diff(samples, prepend=-(2**62)) > APART_S * rate_hz])
 
