@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import cache
 
@@ -197,8 +197,8 @@ def _shortened(text: str, size: int) -> str:
     if font.getlength(text) <= most_px:
         return text
     # The label of a large set of electrodes has thousands of characters.
-    n_fitting = bisect_right(range(len(text)), most_px, key=lambda n: font.getlength(f"{text[:n]}…"))
-    return f"{text[: n_fitting - 1]}…"
+    first_too_long = bisect_left(range(len(text)), True, key=lambda n: font.getlength(f"{text[:n]}…") > most_px)
+    return f"{text[: first_too_long - 1]}…"
 
 
 @cache
