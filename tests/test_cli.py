@@ -763,6 +763,8 @@ def test_inspect_refuses_its_options_before_the_files(
         ("train --mapping none --recordings .", "--recordings: expected none without neurons, got ."),
         ("train --mapping none --bins 5", "--bins: expected none without neurons, got 5"),
         ("train --mapping none --window-ms 2 20.5", "--window-ms: expected none without neurons, got 2 20.5"),
+        ("train --mapping none --percentiles first", "--percentiles: expected none without neurons, got first"),
+        ("train --mapping none --duration-min 5", "--duration-min: expected none without neurons, got 5"),
         ("train --mapping none --simulator memory", "--simulator: expected none without neurons, got memory"),
         ("record --culture replay", "--recordings: expected some for --culture replay, got none"),
         ("record --recordings .", "--recordings: expected none for --culture virtual, got 1"),

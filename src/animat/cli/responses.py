@@ -97,8 +97,11 @@ class SimulatorOptions(ResponseOptions):
                 raise InvalidArgument(f"{option.name}: expected none {where}, got {_typed(value)}")
 
 
-_OF_SIMULATORS = ("conditions", "window_ms", "burst_threshold", "simulator", "bins", "range_hz", "allow", "at_min")
-"""Options that choose simulators, or how they are made."""
+_OF_SIMULATORS = (
+    *("conditions", "window_ms", "burst_threshold", "allow"),
+    *("simulator", "bins", "range_hz", "at_min", "duration_min", "percentiles"),
+)
+"""Options that choose simulators, or how they are made and used."""
 
 
 def _typed(value: Any) -> str:
