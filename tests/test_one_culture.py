@@ -188,6 +188,10 @@ def test_a_policy_knows_its_culture_and_another_one_is_reported(tmp_path: Path) 
     minutes = enumerate(({"subject_id": "c1"}, {"subject_id": "c1", "chip_id": "7"}))
     of_both = fit_timeline(responses_of(*(named(10.0 * i, names) for i, names in minutes)))
     assert of_both.culture == RecordedCulture(names=(("subject_id", "c1"), ("chip_id", "7")))
+    # Of another culture, whose finding was allowed, nothing is taken over.
+    others = enumerate(({"subject_id": "c1"}, {"subject_id": "c2", "chip_id": "7"}))
+    of_two = fit_timeline(responses_of(*(named(10.0 * i, names) for i, names in others)))
+    assert of_two.culture == of_c1.culture
     # Policies of earlier versions do not state it.
     assert said(replace(policy, provenance={})) == []
     assert not [each for each in timeline_differences(policy, of_c1) if each.name == "other-culture"]

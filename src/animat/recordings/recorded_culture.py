@@ -72,6 +72,7 @@ def culture_of_series(cultures: Iterable[RecordedCulture | None]) -> RecordedCul
     known = [culture for culture in cultures if culture is not None]
     if not known:
         return None
+    known = [culture for culture in known if not known[0].difference(culture)]
     values: dict[str, str] = {}
     for culture in known:
         values = dict(culture.names) | values
