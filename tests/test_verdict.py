@@ -39,10 +39,10 @@ def test_it_says_which_controls_are_not_outperformed() -> None:
     assert said.count("worse") == 1
     # Where every episode reaches the limit no return is larger.
     equal = str(Verdict.of(np.full(20, 120.0), {"equal": np.full(20, 120.0)}))
-    assert "their return is larger in 50 % of the pairs of episodes, ties half)" in equal
+    assert "their return is larger in 50 % of the pairs of episodes, ties counting half)" in equal
     every = str(Verdict.of(policies, {"worse": policies - 9}))
     assert every.startswith("the policies outperform every control (p < 0.01; ")
-    assert every.endswith("larger in at least 100 % of the pairs of episodes, ties half)")
+    assert every.endswith("larger in at least 100 % of the pairs of episodes, ties counting half)")
 
 
 def test_too_few_episodes_are_not_taken_for_no_difference() -> None:

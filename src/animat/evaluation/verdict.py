@@ -73,7 +73,7 @@ class Verdict:
         few = {name: each for name, each in self.controls.items() if not each.has_enough_episodes}
         not_outperformed = [
             f"{name} (p = {each.p:.2g}; {'they are worse: ' if is_worse(each.p, each.wins) else ''}their return is "
-            f"larger in {100 * each.wins:.0f} % of the pairs of episodes, ties half)"
+            f"larger in {100 * each.wins:.0f} % of the pairs of episodes, ties counting half)"
             for name, each in self.controls.items()
             if not each.is_outperformed and each.has_enough_episodes
         ]
@@ -91,6 +91,6 @@ class Verdict:
             least = min(each.wins for each in self.controls.values())
             parts.append(
                 f"the policies outperform every control (p < {OUTPERFORMED_P:g}; their return is larger in at least "
-                f"{100 * least:.0f} % of the pairs of episodes, ties half)"
+                f"{100 * least:.0f} % of the pairs of episodes, ties counting half)"
             )
         return "; ".join(parts)

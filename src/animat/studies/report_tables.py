@@ -203,7 +203,7 @@ def heuristic_table(rows: Sequence[HeuristicComparison]) -> Table:
             ("the policies", "outcome"),
         ],
         note="p: Mann-Whitney over episodes, two-sided. Pairs won: share of pairs of episodes in which the policies' "
-        "return is larger, ties half. Highlighted: learning did no better than the heuristic policy.",
+        "return is larger, ties counting half. Highlighted: learning did no better than the heuristic policy.",
         beside="tables/heuristic.csv",
         marked=tuple(i for i, row in enumerate(rows) if row.outcome == NOT),
     )
