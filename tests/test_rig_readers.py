@@ -337,7 +337,7 @@ def test_other_nwb_columns_with_other_values_than_ours(
     recording = read_recording(tmp_path / "a.nwb")
     assert recording.stimuli.time_s.tolist() == pytest.approx([0.0, 0.2, 0.4])
     if read is None:
-        left_out = f"unknown columns of /stimulus/presentation/stimuli were left out: {column} (known, but not with"
+        left_out = f"columns of /stimulus/presentation/stimuli were left out: {column} (cannot have such values)"
         assert found(recording)["columns-left-out"].startswith(left_out)
         assert np.isnan(recording.stimuli.frequency_hz).all()
         assert recording.stimuli.presentation.tolist() == [0, 1, 2]
@@ -592,7 +592,7 @@ def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list
     recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
     assert recording.stimuli.electrodes.tolist() == read
     left_out = found(recording).get("columns-left-out", "")
-    assert left_out.endswith("electrodes (known, but not with such values)") == ("north" in words)
+    assert left_out.endswith("electrodes (cannot have such values)") == ("north" in words)
 
 
 @pytest.mark.parametrize("of_another_table", [False, True])
@@ -622,7 +622,7 @@ def test_electrodes_by_row_of_the_electrodes_table_have_its_numbers(tmp_path: Pa
     assert recording.channels.electrode.tolist() == [20]
     if of_another_table:
         assert np.all(recording.stimuli.electrodes == UNKNOWN)
-        assert found(recording)["columns-left-out"].endswith("left out: electrodes (known, but not with such values)")
+        assert found(recording)["columns-left-out"].endswith("left out: electrodes (cannot have such values)")
     else:
         assert recording.stimuli.electrodes.tolist() == [[10, UNKNOWN], [20, 30], [UNKNOWN, UNKNOWN]]
 

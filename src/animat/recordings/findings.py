@@ -46,17 +46,21 @@ class Finding:
 def left_out_findings(
     what: str, names: Sequence[str], file: str = "", missing: Sequence[str] = ()
 ) -> tuple[Finding, ...]:
-    """The finding on unknown keys or columns of a file, if any, each with the missing one whose name is similar."""
+    """The finding on keys or columns of a file that are unknown, or missing as they cannot be read, if there are any.
+
+    Each unknown one is listed with the missing one whose name is similar.
+    """
     if not names:
         return ()
     listed = ", ".join(_left_out(name, missing) for name in names)
-    message = f"unknown {what}{f' of {file}' if file else ''} were left out: {listed}"
+    kind = what if any(name in missing for name in names) else f"unknown {what}"
+    message = f"{kind}{f' of {file}' if file else ''} were left out: {listed}"
     return (Finding(f"{what}-left-out", "note", message, float(len(names))),)
 
 
 def _left_out(name: str, missing: Sequence[str]) -> str:
     if name in missing:
-        return f"{name} (known, but not with such values)"
+        return f"{name} (cannot have such values)"
     near = did_you_mean(name, missing)
     return f"{name} ({near[2:]})" if near else name
 
