@@ -18,7 +18,7 @@ from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.recordings.conversion import Origin, convert_recording
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
-from animat.recordings.recorded_culture import RecordedCulture
+from animat.recordings.recorded_culture import RecordedCulture, names_in
 from animat.recordings.recording import Channels, Recording
 from animat.responses.quality.one_culture import series_findings
 from animat.responses.responses import Responses
@@ -93,6 +93,8 @@ def test_chips_wells_and_subjects_are_read_from_files(tmp_path: Path) -> None:
     again = read_recording(tmp_path / "named.nwb")
     assert again.culture == converted.culture
     assert again.culture == RecordedCulture(names=(("subject_id", "culture-7"), *read.culture.names))
+    for nameless in ("unknown", "Unknown", "N/A", " "):
+        assert names_in({"subject_id": nameless, "chip_id": "chip 7"}) == (("chip_id", "chip 7"),)
     write_nwb(synthetic_recording(1, patterns=5, channels=16), tmp_path / "unnamed.nwb")
     assert read_recording(tmp_path / "unnamed.nwb").culture == RecordedCulture("synthetic", 1)
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+from animat.records import Flag, Whole, record
 
 NAMES = ("subject_id", "cell_batch_id", "chip_id", "well", "system_id")
 """Keys of a provenance by which a device or a file identifies the culture, and what it is on."""
 UNKNOWN_SUBJECT_ID = "unknown"
 """NWB requires a subject; this is an unknown one's name."""
+_NAMELESS = ("", UNKNOWN_SUBJECT_ID, "n/a", "na", "nan")
+"""What programs write where there is no name, in small letters."""
 _KINDS = {
     "virtual": "virtual culture",
     "replay": "replay of recordings",
@@ -20,7 +24,7 @@ _SEEDED = ("virtual", "synthetic")
 """Of these, cultures of different seeds are different ones; a CL1's seed only draws its patterns."""
 
 
-@dataclass(frozen=True)
+@record
 class RecordedCulture:
     """The culture that was recorded.
 
@@ -32,8 +36,8 @@ class RecordedCulture:
     """
 
     kind: str | None = None
-    seed: int | None = None
-    is_simulated: bool = False
+    seed: Whole | None = None
+    is_simulated: Flag = False
     names: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
@@ -64,7 +68,7 @@ class RecordedCulture:
 def names_in(provenance: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
     """The entries of a provenance that identify the culture."""
     known = ((name, provenance.get(name, "")) for name in NAMES)
-    return tuple((name, value) for name, value in known if value not in ("", UNKNOWN_SUBJECT_ID))
+    return tuple((name, value) for name, value in known if value.strip().lower() not in _NAMELESS)
 
 
 def culture_of_series(cultures: Iterable[RecordedCulture | None]) -> RecordedCulture | None:
