@@ -536,6 +536,38 @@ def test_few_episodes_give_intervals_as_wide_as_they_have_to_be(episodes: int) -
     assert 175 <= covered <= 199
 
 
+def test_episodes_with_the_same_start_count_together() -> None:
+    """Starts differ by far more than what follows them, and the four policies of a round have the same one."""
+    rng, covered = np.random.default_rng(8), np.zeros(2, np.int64)
+    row = Row("p", "", np.zeros(9), np.zeros(9), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    turn = np.repeat(np.arange(5), 4)
+    for _ in range(200):
+        measured = rng.normal(0.0, 30.0, 5)[turn] + rng.normal(0.0, 10.0, 20)
+        gaps = [replace(row, measured=measured, turn=of).gap for of in (turn, None)]
+        covered += [gap.low <= 0 <= gap.high for gap in gaps]
+    # 190 of 200, standard deviation 3.1; as if all twenty were independent, about 130.
+    assert 175 <= covered[0] <= 199
+    assert covered[1] < 150
+    # One start says nothing of others; each episode with its own is as without.
+    assert replace(row, measured=measured, turn=np.zeros(20, np.int64)).gap.high == np.inf
+    assert replace(row, measured=measured, turn=np.arange(20)).gap == gaps[1]
+
+
+@pytest.mark.parametrize("robot", [Shuttle(episode_limit=5), Cartpole(episode_limit=5)])
+@pytest.mark.usefixtures("few_bootstraps")
+def test_rows_know_which_episodes_have_the_same_start(
+    tmp_path: Path, series: list[Responses], robot: Robot[Any]
+) -> None:
+    policies = {f"p{i}": policy_of(i, series, robot=robot) for i in range(2)}
+    with FakeCulture() as culture:
+        gap = run_policies(policies, culture, Calibration.of_series(series), tmp_path / "s", episodes=3)
+    turns = [None if row.turn is None else row.turn.tolist() for row in gap.rows[:3]]
+    # Agents take turns in a new order each round; the cartpole has one start only.
+    assert turns == ([None] * 3 if isinstance(robot, Cartpole) else [[0, 0, 1, 1, 2, 2], [0, 1, 2], [0, 1, 2]])
+    drawn = [episode for episode in gap.session.episodes if episode.agent in policies]
+    assert all(one.start == other.start for one, other in zip(drawn[::2], drawn[1::2], strict=True))
+
+
 @pytest.mark.long
 def test_a_prediction_is_more_certain_with_more_recorded_responses() -> None:
     rng, widths = np.random.default_rng(3), []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from animat.columns import align_columns
 from animat.evaluation.controls import Control
@@ -46,17 +46,16 @@ def intervention_table(
 
     The session's rows have the policies first; without a complete episode of theirs it is empty.
     """
-    usual_returns = rows[0].measured
-    if not len(usual_returns):
+    if not len(rows[0].measured):
         return ()
     measured = {row.name: row for row in rows if len(row.measured)}
-    lost = _lost(usual_returns, with_ideal)
+    lost = _lost(rows[0], with_ideal, None)
     table = [
         Intervention("its simulator", "as predicted", False, float(rows[0].predicted.mean()), rows[0].gap),
         Intervention(ideal.name, ideal.meaning, False, float(with_ideal.mean()), lost),
     ]
     for row in (measured[name] for name in MEASURED if name in measured):
-        lost = _lost(usual_returns, row.measured)
+        lost = _lost(rows[0], row.measured, row.turn)
         table.append(Intervention(row.name, row.meaning, True, float(row.measured.mean()), lost))
     return tuple(table)
 
@@ -75,12 +74,11 @@ def intervention_lines(policies: Row, table: Sequence[Intervention]) -> list[str
     ]
 
 
-def _lost(usual: Float64[np.ndarray, " episodes"], changed: Float64[np.ndarray, " others"]) -> Interval:
-    """Difference of means, with its interval over episodes (`resampled_means`); infinite with fewer than two."""
-    value = float(usual.mean() - changed.mean())
-    if min(len(usual), len(changed)) < 2:
+def _lost(usual: Row, changed: Float64[np.ndarray, " others"], turn: Int64[np.ndarray, " others"] | None) -> Interval:
+    """Difference of means, with its interval over episodes (`resampled_means`); infinite where they are too few."""
+    value, rng = float(usual.measured.mean() - changed.mean()), np.random.default_rng(0)
+    one, other = resampled_means(usual.measured, rng, usual.turn), resampled_means(changed, rng, turn)
+    if one is None or other is None:
         return Interval(value, -np.inf, np.inf, CONFIDENCE)
-    rng = np.random.default_rng(0)
-    drawn = resampled_means(usual, rng) - resampled_means(changed, rng)
-    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.quantile(one - other, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Interval(value, float(low), float(high), CONFIDENCE)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from animat.evaluation.statistics import CONFIDENCE, Interval
 from animat.evaluation.verdict import EpisodeComparison
@@ -30,6 +30,8 @@ class Row:
         comparison: of the policies' measured returns with these; None for the policies, and if either has none.
         met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without a goal,
             and without complete episodes.
+        turn: which of its agent's episodes each measured one is, where starts are drawn: in the same turn all agents
+            have the same start; None where all episodes start alike.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Row:
     late: float
     comparison: EpisodeComparison | None = None
     met: dict[str, Any] = field(default_factory=dict)
+    turn: Int64[np.ndarray, " measured"] | None = None
 
     @property
     def prediction(self) -> Interval:
@@ -55,14 +58,14 @@ class Row:
     def gap(self) -> Interval:
         """Mean measured less mean predicted return; its interval is over bootstrap recordings and measured episodes.
 
-        Its ends are infinite with fewer than two measured episodes. Responses are drawn as if they were independent:
+        Episodes of the same turn are drawn together. The ends are infinite with fewer than two measured episodes, or
+        turns. Responses are drawn as if they were independent:
         drift between recording and loop is not in the interval, and shows as a gap.
         """
         value = self.measured.mean() - self.predicted.mean()
-        if len(self.measured) < 2:
+        measured = resampled_means(self.measured, rng := np.random.default_rng(0), self.turn)
+        if measured is None:
             return Interval(float(value), -np.inf, np.inf, CONFIDENCE)
-        rng = np.random.default_rng(0)
-        measured = resampled_means(self.measured, rng)
         return bootstrap_interval(value, measured - rng.choice(self.bootstrap_means, len(measured)))
 
     @property
@@ -117,21 +120,32 @@ def bootstrap_interval(value: float, drawn: Float64[np.ndarray, " draws"]) -> In
 
 
 def resampled_means(
-    returns: Float64[np.ndarray, " episodes"], rng: np.random.Generator
-) -> Float64[np.ndarray, " resamples"]:
+    returns: Float64[np.ndarray, " episodes"],
+    rng: np.random.Generator,
+    turn: Int64[np.ndarray, " episodes"] | None = None,
+) -> Float64[np.ndarray, " resamples"] | None:
     """Means of bootstrap samples of returns, spread as far as Student's t is beyond the normal distribution.
 
     From a few episodes, the usual percentile interval contains the true mean too rarely: from two half of the time.
+    Episodes of different agents with the same start are as easy, or as hard: all of them are drawn, or none.
 
     Args:
-        returns: at least two.
+        returns: of complete episodes.
+        turn: as in a `Row`.
+
+    Returns:
+        None for fewer than two episodes, or turns.
 
     Source: the expanded percentile interval of Hesterberg 2015, doi:10.1080/00031305.2015.1089789.
     """
     from scipy.stats import norm, t
 
-    n, level = len(returns), (1 + CONFIDENCE) / 2
+    of = np.unique(np.arange(len(returns)) if turn is None else turn, return_inverse=True)[1]
+    total, count = np.bincount(of, returns), np.bincount(of)
+    n, level = len(count), (1 + CONFIDENCE) / 2
+    if n < 2:
+        return None
     often = rng.multinomial(n, np.full(n, 1 / n), _RESAMPLES)
     spread = np.sqrt(n / (n - 1)) * t.ppf(level, n - 1) / norm.ppf(level)
     mean = returns.mean()
-    return np.asarray(mean + spread * (often @ returns / n - mean))
+    return np.asarray(mean + spread * (often @ total / (often @ count) - mean))

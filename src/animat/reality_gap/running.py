@@ -300,6 +300,8 @@ def _rows(
 ) -> tuple[Row, ...]:
     goal_outcomes, of_trials = outcomes(loop.robot, session), electrode_pulses(loop.conditions, loop.pulses)
     unstimulated = {agent.name for agent in agents if agent.delivery == "silent"}
+    of_agents = {agent.name: [each.number for each in session.episodes if each.agent == agent.name] for agent in agents}
+    is_drawn = len({episode.start for episode in session.episodes}) > 1
 
     def row(name: str, meaning: str, of: Sequence[str]) -> Row:
         episodes = [episode for episode in session.episodes if episode.agent in of]
@@ -323,6 +325,7 @@ def _rows(
             bursts=sum(each.bursts for each in episodes) / trials,
             late=sum(each.late for each in episodes) / trials,
             met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
+            turn=np.array([of_agents[each.agent].index(each.number) for each in whole], np.int64) if is_drawn else None,
         )
 
     policies = row("policies" if len(names) > 1 else names[0], "as trained", names)
