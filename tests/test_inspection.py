@@ -28,7 +28,7 @@ from animat.responses.psth import post_stimulus_histogram
 from animat.responses.quality.responses import _difference
 from animat.responses.responses import Responses
 from animat.stimulation.stimulus import Stimuli
-from synthetic_recordings import SyntheticCulture
+from synthetic_recordings import SyntheticCulture, synthetic_recording
 from test_responses import names, recording
 
 
@@ -450,3 +450,15 @@ def test_a_recording_without_stimuli_can_be_drawn(tmp_path: Path) -> None:
         "x-raster.png"
     ]
     assert "not usable" in inspection_text(inspect_recording(source))
+
+
+@pytest.mark.parametrize("is_row", [True, False])
+def test_sites_in_a_row_or_a_column_have_room_in_the_figure_of_the_array(is_row: bool) -> None:
+    source = synthetic_recording(1, patterns=5, channels=32)
+    along_um, nothing = 17.5 * np.arange(32), np.zeros(32)
+    x_um, y_um = (along_um, nothing) if is_row else (nothing, along_um)
+    figure = draw_array(replace(source, channels=replace(source.channels, x_um=x_um, y_um=y_um)))
+    axes = figure.axes[0]
+    # A twentieth of the length on each side of the row.
+    thin = axes.get_ylim() if is_row else axes.get_xlim()
+    assert np.ptp(thin) == pytest.approx(along_um[-1] / 10)

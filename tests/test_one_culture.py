@@ -95,6 +95,7 @@ def test_chips_wells_and_subjects_are_read_from_files(tmp_path: Path) -> None:
     assert again.culture == RecordedCulture(names=(("subject_id", "culture-7"), *read.culture.names))
     for nameless in ("unknown", "Unknown", "N/A", " "):
         assert names_in({"subject_id": nameless, "chip_id": "chip 7"}) == (("chip_id", "chip 7"),)
+    assert names_in({"subject_id": "dish\n A "}) == (("subject_id", "dish A"),)
     write_nwb(synthetic_recording(1, patterns=5, channels=16), tmp_path / "unnamed.nwb")
     assert read_recording(tmp_path / "unnamed.nwb").culture == RecordedCulture("synthetic", 1)
 
@@ -119,7 +120,7 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     train = ["train", "cartpole", "--recordings", str(folder), "--out", str(tmp_path / "policies")]
     assert main(train) == 1
     words = (
-        f"expected recordings of one culture, got one of {name} first (at 0 min) and one of {name} second (at 10 min); "
+        f"expected recordings of one culture, got {name} first (at 0 min) and {name} second (at 10 min); "
         "leave out all but one culture's"
     )
     error = capsys.readouterr().err

@@ -152,7 +152,7 @@ def test_channels_that_fire_faster_than_neurons_can() -> None:
 def test_recordings_of_two_simulated_cultures_are_not_one_series(tmp_path: Path) -> None:
     one, other = (synthetic_recording(seed, patterns=20, channels=32, start_min=10.0 * seed) for seed in (1, 2))
     with pytest.raises(
-        UnusableData, match=r"one of synthetic culture 1 .* and one of synthetic culture 2 .* --allow several-cultures"
+        UnusableData, match=r"got synthetic culture 1 .* and synthetic culture 2 .* --allow several-cultures"
     ):
         extract_series([one, other])
     assert len(extract_series([one, other], allow=["several-cultures"])) == 2

@@ -582,7 +582,8 @@ def test_the_figure_has_the_whole_name_of_its_file(known: Validation, name: str)
         (["--conditions", "all"], "conditions: expected two or more, so that there is something to predict from"),
         (
             ["--conditions", "frequency:5,7"],
-            "condition 7 Hz: no stimulus; leave it out or choose other conditions (--conditions)",
+            "condition 7 Hz: no stimulus whose response window lies in the recording; leave it out or choose other "
+            "conditions (--conditions)",
         ),
         (["--seed", "-1"], "--seed: expected 0 or more, got -1"),
     ],

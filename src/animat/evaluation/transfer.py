@@ -48,7 +48,7 @@ def other_calibration(trained: Presentation | None, predicting: Presentation | N
     """A warning if the presentation in the predicting recording differs from that in the training recordings."""
     if predicting is not None and predicting != trained:
         message = (
-            f"the prediction is from a recording presented {predicting}, the policies' recordings were "
+            f"the prediction is from a recording presented {predicting}; the presentation in the policies' was "
             f"{trained or 'unknown'}"
         )
         yield Finding("other-calibration", "warning", message)

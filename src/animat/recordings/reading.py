@@ -199,5 +199,5 @@ def first_bytes(path: Path) -> bytes:
     with as_invalid_file(path), expect_plain_file(path).open("rb") as file:
         begin = file.read(4096)
     if not begin:
-        raise InvalidFile(f"{path}: expected a recording (NWB, NPZ or CSV), got an empty file")
+        raise InvalidFile(f"{path}: expected a recording, got an empty file")
     return begin

@@ -67,8 +67,9 @@ class RecordedCulture:
 
 def names_in(provenance: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
     """The entries of a provenance that identify the culture."""
-    known = ((name, provenance.get(name, "")) for name in NAMES)
-    return tuple((name, value) for name, value in known if value.strip().lower() not in _NAMELESS)
+    # Spaces at the ends, which nobody sees, and line breaks do not make another name.
+    known = ((name, " ".join(provenance.get(name, "").split())) for name in NAMES)
+    return tuple((name, value) for name, value in known if value.lower() not in _NAMELESS)
 
 
 def culture_of_series(cultures: Iterable[RecordedCulture | None]) -> RecordedCulture | None:

@@ -35,6 +35,11 @@ def draw_array(recording: Recording) -> Figure:
     highest_hz = float(np.quantile(rate_hz[known], 0.98)) if np.any(known) else 1.0
     colours: dict[str, Any] = {"c": rate_hz[known], "vmin": 0, "vmax": max(highest_hz, 1e-9), "cmap": "cividis"}
     drawn = axes.scatter(*places_um, s=9, linewidths=0, **colours)
+    # Sites in a row, or in a column, would have axes without a width.
+    margin_um = max(width_um, height_um) / 20
+    if np.any(known) and min(width_um, height_um) < margin_um:
+        (left, right), (bottom, top) = ((of.min() - margin_um, of.max() + margin_um) for of in places_um)
+        axes.set(xlim=(left, right), ylim=(bottom, top))
     included = ", stimulated time included" if len(stimuli) else ""
     bar = figure.colorbar(drawn, ax=axes, shrink=0.7, extend="max")
     bar.set_label(f"firing rate{included} (Hz)", fontsize=8)

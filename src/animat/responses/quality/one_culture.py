@@ -20,8 +20,8 @@ def series_findings(series: Sequence[Responses]) -> Iterator[Finding]:
         if one.culture and other.culture and (difference := one.culture.difference(other.culture)):
             of_one, of_other = difference
             message = (
-                f"expected recordings of one culture, got one of {of_one} (at {in_min(one.start_min)}) and one of "
-                f"{of_other} (at {in_min(other.start_min)}); leave out all but one culture's"
+                f"expected recordings of one culture, got {of_one} (at {in_min(one.start_min)}) and {of_other} (at "
+                f"{in_min(other.start_min)}); leave out all but one culture's"
             )
             yield Finding("several-cultures", "refuse", message)
             break

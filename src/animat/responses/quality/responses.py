@@ -214,7 +214,8 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
         n_all = int(np.count_nonzero(responses.condition == i))
         n = len(responses.rates_of(i))
         if not n:
-            what = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)" if n_all else "no stimulus"
+            none = "no stimulus whose response window lies in the recording"
+            what = f"{n_all} stimuli, all of them bursts (--burst-threshold 1 keeps them)" if n_all else none
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
