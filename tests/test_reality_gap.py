@@ -536,6 +536,7 @@ def test_few_episodes_give_intervals_as_wide_as_they_have_to_be(episodes: int) -
     assert 175 <= covered <= 199
 
 
+@pytest.mark.oracle
 def test_episodes_with_the_same_start_count_together() -> None:
     """Starts differ by far more than what follows them, and the four policies of a round have the same one."""
     rng, covered = np.random.default_rng(8), np.zeros(2, np.int64)
@@ -553,7 +554,9 @@ def test_episodes_with_the_same_start_count_together() -> None:
     assert replace(row, measured=measured, turn=np.arange(20)).gap == gaps[1]
 
 
-@pytest.mark.parametrize("robot", [Shuttle(episode_limit=5), Cartpole(episode_limit=5)])
+@pytest.mark.parametrize(
+    "robot", [Shuttle(episode_limit=5), pytest.param(Cartpole(episode_limit=5), marks=pytest.mark.oracle)]
+)
 @pytest.mark.usefixtures("few_bootstraps")
 def test_rows_know_which_episodes_have_the_same_start(
     tmp_path: Path, series: list[Responses], robot: Robot[Any]

@@ -241,6 +241,7 @@ def test_commands_of_nine_thresholds_show_what_the_median_alone_does_not() -> No
         assert of_nine["answers"].value == pytest.approx(2 * of_each.sum() / 9, abs=0.15)
 
 
+@pytest.mark.oracle
 def test_commands_that_all_differ_by_little_are_a_reason_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each condition by less than is reported of one alone: thresholds that are too low, or too high."""
     here = sys.modules[__name__]
