@@ -375,16 +375,22 @@ class FakeClock:
         self.time_s = max(self.time_s, time_s)
 
 
-@pytest.mark.parametrize("on_late", ["continue", "stop"])
-def test_a_backend_that_answers_late(tmp_path: Path, on_late: str) -> None:
-    clock = FakeClock()
+def late_by(clock: FakeClock) -> Callable[[FakeCulture, Observed], Observed]:
+    """A fault: the answer comes a quarter of a second late."""
 
     def late(culture: FakeCulture, observed: Observed) -> Observed:
         clock.time_s += observed.duration_s + 0.25
         return observed
 
+    return late
+
+
+@pytest.mark.parametrize("on_late", ["continue", "stop"])
+def test_a_backend_that_answers_late(tmp_path: Path, on_late: str) -> None:
+    clock = FakeClock()
+
     loop = loop_of(robot=Navigation(episode_limit=20), real_time=True, on_late=on_late)
-    with FakeCulture(fault=late, at=8) as culture:
+    with FakeCulture(fault=late_by(clock), at=8) as culture:
         session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1, clock=clock)
         was_late = [tick.number for tick in session.ticks if tick.late_s > 0]
         # Delivery 0 is the pause: number 8 is tick 7, and tick 8 is the one that comes late.
@@ -408,15 +414,11 @@ def test_a_backend_that_answers_late(tmp_path: Path, on_late: str) -> None:
 def test_where_nothing_is_delivered_no_pulse_is_late(tmp_path: Path, how: str) -> None:
     clock = FakeClock()
 
-    def late(culture: FakeCulture, observed: Observed) -> Observed:
-        clock.time_s += observed.duration_s + 0.25
-        return observed
-
     rest = Condition("no electrode", 0.0, frequencies_hz=(20.0,), electrodes=RESTING)
     conditions = {"silent": CONDITIONS, "resting": (rest,)}[how]
     agent = Agent("one", "", OneCondition(0), "silent" if how == "silent" else "chosen")
     loop = loop_of(conditions=conditions, real_time=True, on_late="stop")
-    with FakeCulture(fault=late, at=3) as culture:
+    with FakeCulture(fault=late_by(clock), at=3) as culture:
         session = run_session(culture, loop, [agent], tmp_path, episodes=1, clock=clock)
     assert session.ending.by == "plan", session.ending
     assert session.outline.late == 0 and culture.pulses == 0

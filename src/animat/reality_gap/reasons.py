@@ -157,8 +157,9 @@ def answers(evidence: Evidence) -> Finding | None:
     from differences between episodes; v: that on the simulator, r its error from bootstrap simulators. Neither error is
     smaller than that of equally many independent responses, if each were -1 or +1 (Agresti and Coull 1998).
 
-    If no condition differs by itself, the same test is made of all commands together, each less v of its condition: a
-    task that is hard to control can be lost by thresholds that are too low or too high by little.
+    If no condition differs by itself, all commands are tested together, each less v of its condition, with the error of
+    equally many independent ones as they vary in the session: a task that is hard to control can be lost by thresholds
+    that are too low or too high by little.
     """
     from scipy.stats import t as student
 
