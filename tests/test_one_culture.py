@@ -137,6 +137,37 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     assert inspected["together"][0]["value"] is None
 
 
+@pytest.mark.parametrize(
+    "start_min, frequencies_hz, words",
+    [
+        (10.0, None, None),
+        (0.0, None, "start_min: expected recordings at different minutes, got two at 0 min"),
+        (10.0, (5.0, 20.0), "conditions: expected the same in all recordings, got 5 Hz, 10 Hz, 20 Hz, 40 Hz, 80 Hz at"),
+    ],
+)
+def test_inspect_reports_what_training_refuses(
+    start_min: float,
+    frequencies_hz: tuple[float, ...] | None,
+    words: str | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stimulated = {} if frequencies_hz is None else {"frequencies_hz": frequencies_hz}
+    folder = tmp_path / "recordings"
+    write_nwb(named(0.0, {}), folder / "first.nwb")
+    second = synthetic_recording(1, patterns=20, channels=32, start_min=start_min, **stimulated)
+    write_nwb(second, folder / "second.nwb")
+    # It is no fault of one recording, and they may be meant apart: the status is 0.
+    assert main(["inspect", str(folder), "--json"]) == 0
+    together = json.loads(capsys.readouterr().out.splitlines()[-1])["together"]
+    assert [finding["name"] for finding in together] == ([] if words is None else ["not-a-series"])
+    if words is not None:
+        assert words in together[0]["message"]
+        train = ["train", "cartpole", "--recordings", str(folder), "--out", str(tmp_path / "policies")]
+        assert main(train) == 1
+        assert ("both start at 0 min" if start_min == 0.0 else words) in capsys.readouterr().err
+
+
 def test_other_channels_are_found_by_electrode_and_otherwise_by_label() -> None:
     first = named(0.0, {})
     n, electrode = len(first.channels), first.channels.electrode
