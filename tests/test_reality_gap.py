@@ -810,6 +810,14 @@ class TestCommand:
         assert f"use `animat recover {session}`; choose another folder" in capsys.readouterr().err
         assert [file.name for file in session.iterdir()] == ["session.log"]
 
+    def test_a_stop_file_of_before_is_refused_before_a_culture_is_opened(
+        self, folder: Path, capsys: pytest.CaptureFixture[str], never_opened: None
+    ) -> None:
+        (folder / "session").mkdir()
+        (folder / "session" / "STOP").touch()
+        assert self.command(folder) == 1
+        assert "STOP: expected none yet, as it ends a session: remove it first" in capsys.readouterr().err
+
     def test_a_recording_that_could_not_be_written_is_an_error(
         self, folder: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -20,7 +20,8 @@ from typing import Any
 import pytest
 
 from animat.closed_loop.session import Session, read_session
-from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
+from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.tick import STOP_FILE
 from animat.errors import AnimatError, InvalidArgument
 from animat.watch.serving import watching
 from watching import OWN, PORT, TOKEN, asked, session_in

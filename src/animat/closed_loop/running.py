@@ -27,8 +27,8 @@ from animat.closed_loop.log import LogWriter, Record
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.outline import Outline
 from animat.closed_loop.session import Session, expect_no_session
-from animat.closed_loop.session_data import LOG_FILE, STOP_FILE
-from animat.closed_loop.tick import Ending
+from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.tick import STOP_FILE, Ending
 from animat.closed_loop.timing import Clock, drop_real_time_priority, real_time_priority
 from animat.ctrl_c import KILLS, handled
 from animat.cultures.base import Culture
@@ -99,11 +99,8 @@ def run_session(
     if unknown := sorted({*(predicted or {})} - {agent.name for agent in agents}):
         raise InvalidArgument(f"predicted: expected names of agents, got {', '.join(unknown)}")
     expect_no_session(folder)
-    stop_file = Path(folder) / STOP_FILE
-    if stop_file.exists():
-        raise InvalidArgument(f"{stop_file}: expected none yet, as it ends a session: remove it first")
     turns = _put_sources_first(interleave(planned, np.random.default_rng([seed, 20])), agents)
-    driver = Driver(culture, loop, agents, turns, account or Account(), clock or Clock(), seed, stop_file)
+    driver = Driver(culture, loop, agents, turns, account or Account(), clock or Clock(), seed, Path(folder, STOP_FILE))
     file = Path(folder) / LOG_FILE
     # As it is read back from the log.
     header = json.loads(json.dumps(_header(driver, predicted or {})))

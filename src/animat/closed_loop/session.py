@@ -15,14 +15,14 @@ from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Log, open_file, read_log
 from animat.closed_loop.outline import Episode, Outline, count_electrode_pulses
 from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, TICKS_FILE, SessionData, expect_session_log
-from animat.closed_loop.tick import Ending, Tick, TickTable
-from animat.errors import InvalidArgument, InvalidFile, Mismatch, as_invalid_file
+from animat.closed_loop.tick import STOP_FILE, Ending, Tick, TickTable
+from animat.errors import InvalidArgument, InvalidFile, Mismatch
 from animat.folder_kinds import expect_no_other
-from animat.plain_file import expect_no_file, is_absent, is_folder
+from animat.plain_file import is_absent, is_folder
 from animat.progress import Progress
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recording import Recording
-from animat.writing import atomic_write, clear_away, exclusive_lock, is_unfinished
+from animat.writing import atomic_write, clear_away, exclusive_lock, expect_writable, is_unfinished
 
 _UPDATE_EVERY = 1000
 
@@ -162,23 +162,21 @@ def read_session(path: str | os.PathLike[str]) -> Session:
 
 
 def expect_no_session(folder: str | os.PathLike[str]) -> None:
-    """Make the folder of a new session.
+    """Check the folder of a new session, which may be missing.
 
     Raises:
-        InvalidArgument, Mismatch: if it holds a session, saying what to do with it, or other work.
-        InvalidFile: if it is a file, or cannot be made or written to.
+        InvalidArgument, Mismatch: if it holds a session, saying what to do with it, a file `STOP`, or other work.
+        InvalidFile: if it is a file, or cannot be written to.
     """
     folder = Path(folder)
-    expect_no_file(folder, "the session")
     if (folder / LOG_FILE).exists():
         state = f" that was killed or is still running: to write its recording, use `animat recover {folder}`"
         state = "" if (folder / RECORDING_FILE).exists() else state
         raise InvalidArgument(f"{folder / LOG_FILE}: expected no session, got one{state}; choose another folder")
+    if (folder / STOP_FILE).exists():
+        raise InvalidArgument(f"{folder / STOP_FILE}: expected none yet, as it ends a session: remove it first")
     expect_no_other(folder, "session")
-    with as_invalid_file(folder, "cannot be made"):
-        folder.mkdir(parents=True, exist_ok=True)
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InvalidFile(f"{folder}: cannot be written to: permission denied")
+    expect_writable(folder)
 
 
 def recover_session(path: str | os.PathLike[str], progress: Progress | None = None) -> Session:

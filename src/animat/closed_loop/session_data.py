@@ -23,8 +23,6 @@ from animat.tables import UNKNOWN
 LOG_FILE = "session.log"
 RECORDING_FILE = "session.nwb"
 TICKS_FILE = "ticks.csv"
-STOP_FILE = "STOP"
-"""In a session's folder: creating it, empty or not, ends the session as Ctrl-C does."""
 
 
 class SessionData:

@@ -11,6 +11,8 @@ from animat.closed_loop.header import Header
 
 Handled = Literal["used", "repeated", "skipped", "warm-up", "unfinished"]
 EndedBy = Literal["plan", "budget", "person", "culture", "hang", "lateness", "robot", "controller", "disk", "crash"]
+STOP_FILE = "STOP"
+"""In a session's folder: creating it, empty or not, ends the session as Ctrl-C does."""
 
 
 @dataclass(frozen=True)

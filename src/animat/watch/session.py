@@ -14,7 +14,8 @@ import numpy as np
 
 from animat.closed_loop.header import Header, read_header
 from animat.closed_loop.log import Record
-from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE, STOP_FILE
+from animat.closed_loop.session_data import LOG_FILE, RECORDING_FILE
+from animat.closed_loop.tick import STOP_FILE
 from animat.coding.mapping import Thresholds
 from animat.errors import InvalidArgument, InvalidFile, as_invalid_file
 from animat.progress import format_duration
