@@ -172,7 +172,7 @@ class Figures:
 
 
 def measure(seed: int, parameters: TissueParameters | None = None) -> Figures:
-    """All figures of one seed; about 1,100 s of culture."""
+    """All figures of one seed; some 9,000 s of culture."""
     parameters = parameters or TissueParameters()
     rig = Rig(seed, parameters)
     durations_s = network_bursts_s(rig)
