@@ -170,7 +170,7 @@ def answers(evidence: Evidence) -> Finding | None:
     conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
     responses, names = evidence.session.responses, evidence.session.responses.readouts.names
     tested = [(i, d) for i in conditions.tolist() for d in range(len(names))]
-    level = LEVEL / (len(tested) + len(names)) if tested else LEVEL
+    level = LEVEL / (len(tested) + len(names))
     differences, most = [], 0.0
     for i, d in tested:
         n, expected = measured.presented[:, i], float(predicted.commanded.mean[i, d])
@@ -234,7 +234,7 @@ def repetition(evidence: Evidence) -> Finding | None:
     session, names = evidence.session, evidence.session.responses.readouts.names
     responses, episodes = session.responses, len(session.returns)
     usable = ~responses.is_burst
-    if episodes < FEWEST_EPISODES or not usable.any():
+    if episodes < FEWEST_EPISODES:
         return None
     y = evidence.calibration.adjusted.of_responses(responses)
     for condition in range(len(responses.conditions)):
