@@ -49,6 +49,10 @@ def test_too_few_episodes_are_not_taken_for_no_difference() -> None:
     # With four and four even the clearest difference has p = 0.03; with six and six it has 0.005.
     four, six = Verdict.of([9.0] * 4, {"a": [0.0] * 4}), Verdict.of(np.arange(6) + 9.0, {"a": np.arange(6.0)})
     assert "4 episodes of the policies and 4 of a control are too few to show" in str(four)
+    # With equal returns the approximation gives p = 0.002, but one of 66 ways to choose two of twelve is as clear.
+    two = Verdict.of([9.0] * 10, {"a": [0.0] * 2})
+    assert two.controls["a"].p < 0.01 and two.not_outperformed == ("a",)
+    assert "10 episodes of the policies and 2 of a control are too few to show" in str(two)
     assert str(six).startswith("the policies outperform every control (p < 0.01; ")
     # The result for one control is reported even if another was broken off.
     both = Verdict.of(np.arange(20.0), {"broken off": [0.0], "better": np.arange(20) + 90.0})
