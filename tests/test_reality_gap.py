@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu
+from scipy.stats import mannwhitneyu, norm, t
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
@@ -41,6 +41,7 @@ from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
+from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
 from animat.recordings.findings import Finding, warnings_once
@@ -534,6 +535,12 @@ def test_few_episodes_give_intervals_as_wide_as_they_have_to_be(episodes: int) -
         covered += gap.low <= 0 <= gap.high
     # 190 of 200, standard deviation 3.1; of two episodes a bootstrap knows only three means.
     assert 175 <= covered <= 199
+    assert row.gap_sign == 0 and row.net is None
+    # The one that differs is drawn 0, 1, 2, ... times: the interval is as skewed as the returns are.
+    means = resampled_means(np.append(np.zeros(episodes - 1), float(episodes)), rng)
+    spread = np.sqrt(episodes / (episodes - 1)) * t.ppf(0.975, episodes - 1) / norm.ppf(0.975)
+    assert means is not None and means.min() == pytest.approx(1 - spread)
+    assert means.max() > 1 + (episodes - 2) * spread
 
 
 @pytest.mark.oracle

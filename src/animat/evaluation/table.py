@@ -185,8 +185,7 @@ class Evaluation:
             meaning = f"no score, as {reason} random actions"
         else:
             meaning = "score: (mean return - random) / (optimal return - random)"
-            changed = [row.name for row in self.rows if row.changed]
-            if changed:
+            if changed := [row.name for row in self.rows if row.changed]:
                 meaning += f"; none for {' and '.join(changed)}, whose optimum is different"
         lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
         if self.net_optimum is not None:
