@@ -299,8 +299,11 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
     np.testing.assert_allclose(rewards, found.returns)
     assert found.commanded.presented.sum() == len(ticks)
     np.testing.assert_allclose(found.commanded.total.sum(), sum(commands))
-    # What was presented in between is there too, as the culture may remember it.
-    assert len(found.responses.presentations[0].condition) == len(list(gap.session.ticks))
+    # What was presented in between is there too, as the culture may remember it; it rests before each episode.
+    every, (presented, place) = list(gap.session.ticks), found.responses.presentations
+    np.testing.assert_array_equal(presented.condition, [tick.delivered for tick in every])
+    np.testing.assert_array_equal(presented.is_rested, [tick.iteration == 0 for tick in every])
+    assert [every[row] for row in place] == ticks
 
 
 def test_controls_have_no_more_episodes_than_the_policies_but_five_each() -> None:
