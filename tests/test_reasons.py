@@ -201,8 +201,9 @@ def test_memory_is_no_reason_where_the_simulator_has_one() -> None:
     assert "memory" not in {f.name for f in reasons(session(1, rate_hz=remembering, calibration=knows))}
 
 
-def test_few_episodes_show_no_trend_and_no_difference_in_commands() -> None:
-    evidence = session(1, **CASES["answers"][0])
+@pytest.mark.parametrize("name", ["answers", "repetition", "trend"])
+def test_few_episodes_show_no_trend_no_repetition_and_no_difference_in_commands(name: str) -> None:
+    evidence = session(1, **CASES[name][0])
     answered = evidence.session
     kept = answered.episode < 7
     few = replace(
