@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -24,11 +25,21 @@ BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
 COMMANDS = re.findall(r"\.venv/bin/animat ([^\n&#`]+)", README)
 
 
+@cache
+def anchors_of(page: Path) -> set[str]:
+    """The anchors of its headings, as GitHub names them."""
+    prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_link_leads_somewhere(page: Path) -> None:
-    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
-    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    links = re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?[^)]*\)", page.read_text())
+    targets = [(page.parent / link if link else page, anchor) for link, anchor in links if "://" not in link]
+    missing = [target for target, _ in targets if not target.exists()]
     assert not missing
+    assert not [(target, anchor) for target, anchor in targets if anchor and anchor not in anchors_of(target)]
 
 
 def test_every_page_is_in_the_source_distribution() -> None:

@@ -55,6 +55,11 @@ def test_cultures_differ_by_what_is_known_of_both() -> None:
     assert RIGS[0].difference(RIGS[1]) == ("virtual culture 1", "virtual culture 2")
     assert RIGS[3].difference(RIGS[4]) == ("a MaxOne", "a CL1")
     assert RIGS[4].difference(RIGS[5]) == ("chip_id A", "chip_id B")
+    # A chip may move to another system; where the chip is not known, the system is all that tells cultures apart.
+    moved = RecordedCulture("cl1", names=(("chip_id", "A"), ("system_id", "t")))
+    assert RIGS[4].difference(moved) is None and moved.difference(RIGS[4]) is None
+    systems = [RecordedCulture("cl1", names=(("system_id", name),)) for name in "st"]
+    assert systems[0].difference(systems[1]) == ("system_id s", "system_id t")
     # A CL1's seed draws its patterns, and a replay responds from any recording.
     assert RecordedCulture("cl1", 1).difference(RecordedCulture("cl1", 2)) is None
     assert all(RecordedCulture("replay").difference(each) is None for each in RIGS)
@@ -135,6 +140,37 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
     assert inspected["unusable"] == []
     # They have a value, as those of each recording.
     assert inspected["together"][0]["value"] is None
+
+
+@pytest.mark.parametrize(
+    "start_min, frequencies_hz, words",
+    [
+        (10.0, None, None),
+        (0.0, None, "start_min: expected recordings at different minutes, got two at 0 min"),
+        (10.0, (5.0, 20.0), "conditions: expected the same in all recordings, got 5 Hz, 10 Hz, 20 Hz, 40 Hz, 80 Hz at"),
+    ],
+)
+def test_inspect_reports_what_training_refuses(
+    start_min: float,
+    frequencies_hz: tuple[float, ...] | None,
+    words: str | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stimulated = {} if frequencies_hz is None else {"frequencies_hz": frequencies_hz}
+    folder = tmp_path / "recordings"
+    write_nwb(named(0.0, {}), folder / "first.nwb")
+    second = synthetic_recording(1, patterns=20, channels=32, start_min=start_min, **stimulated)
+    write_nwb(second, folder / "second.nwb")
+    # It is no fault of one recording, and they may be meant apart: the status is 0.
+    assert main(["inspect", str(folder), "--json"]) == 0
+    together = json.loads(capsys.readouterr().out.splitlines()[-1])["together"]
+    assert [finding["name"] for finding in together] == ([] if words is None else ["not-a-series"])
+    if words is not None:
+        assert words in together[0]["message"]
+        train = ["train", "cartpole", "--recordings", str(folder), "--out", str(tmp_path / "policies")]
+        assert main(train) == 1
+        assert ("both start at 0 min" if start_min == 0.0 else words) in capsys.readouterr().err
 
 
 def test_other_channels_are_found_by_electrode_and_otherwise_by_label() -> None:

@@ -565,6 +565,27 @@ def test_the_interval_of_a_loss_is_that_of_two_means() -> None:
     assert alone.lost.low == -np.inf and alone.lost.high == np.inf
 
 
+@pytest.mark.parametrize("failing", [0.02, 0.2])
+def test_failures_that_were_missed_by_chance_are_in_the_interval(failing: float) -> None:
+    """Almost without an error of the prediction, and with episodes that end early as often as predicted."""
+    rng, covered = np.random.default_rng(7), 0
+    row = Row("p", "", np.zeros(9), np.zeros(9), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+
+    def returns(episodes: int) -> np.ndarray:
+        return np.where(rng.random(episodes) < failing, rng.uniform(-60.0, 110.0, episodes), 120.0)
+
+    for _ in range(100):
+        predicted = returns(1600)
+        row = replace(row, predicted=predicted, bootstrap_means=rng.normal(predicted.mean(), 0.1, 100))
+        gap = replace(row, measured=returns(20)).gap
+        covered += gap.low <= 0 <= gap.high
+    # At least 95 of 100, standard deviation 2.2; in two thirds of the sessions no episode fails at 2 %.
+    assert covered >= 89
+    # Far more failures than predicted still show.
+    lost = np.tile([120.0, -60.0], 10)
+    assert replace(row, measured=lost).gap.high < 0
+
+
 @pytest.mark.oracle
 def test_episodes_with_the_same_start_count_together() -> None:
     """Starts differ by far more than what follows them, and the four policies of a round have the same one."""

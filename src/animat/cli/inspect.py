@@ -43,7 +43,7 @@ class Inspect(ResponseOptions):
         from animat.responses.bursts import check_threshold
         from animat.responses.conditions import conditions_named
         from animat.responses.inspection import inspect_recording
-        from animat.responses.quality.one_culture import series_findings
+        from animat.responses.quality.one_culture import series_findings, unlike_finding
         from animat.responses.windows import DEFAULT_WINDOW_MS, check_window
         from animat.robots.registry import robot_named
 
@@ -95,7 +95,8 @@ class Inspect(ResponseOptions):
                 series.append((file, inspection.responses))
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
-            together = list(series_findings([responses for _, responses in series]))
+            of_files = [responses for _, responses in series]
+            together = [*unlike_finding(of_files), *series_findings(of_files)]
             if together:
                 print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")
             results["together"] = [{**finding.to_dict(), "value": finding.value} for finding in together]

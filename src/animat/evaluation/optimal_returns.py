@@ -62,7 +62,7 @@ def optimal_returns(
     Args:
         responses: of the recording; the simulator is the default one, a histogram of 20 bins. Conditions with fewer
             than 30 non-burst responses are left out, also for the random stimuli.
-        resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by at most 0.8.
+        resolution: of the optimum's grid (`best_returns`); the default moves the cartpole's optima by at most 1.1.
         episodes: of random stimuli, of the best coupling, and of the optimum's controller.
         resamples: of the responses, for the optimum's interval (`WellSampled.with_interval`).
         seed: decides every random draw.

@@ -118,7 +118,7 @@ def with_enough_samples(responses: Responses) -> tuple[Responses, tuple[str, ...
     """Responses to the conditions with 30 or more non-burst responses, and the other conditions, with their number.
 
     The best of several values is likely a lucky one, so a condition with three responses promises too much. With 30 or
-    more, nine of ten intervals contain the true optimum, with 10 three of four (docs/evidence/optimal-return.md).
+    more, nine of ten intervals contain the true optimum, with 10 four of five (docs/evidence/optimal-return.md).
 
     Raises:
         UnusableData: if no condition has that many.

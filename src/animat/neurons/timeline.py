@@ -23,8 +23,8 @@ from animat.neurons.simulator import EmpiricalSimulator, HistogramSimulator, Neu
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture, culture_of_series
 from animat.records import read_record
-from animat.responses.condition import Condition, stimulus_mismatch
-from animat.responses.quality.one_culture import series_findings
+from animat.responses.condition import Condition
+from animat.responses.quality.one_culture import series_findings, series_mismatch
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
@@ -160,20 +160,9 @@ def fit_timeline(
     ordered = sorted(series, key=lambda responses: responses.start_min)
     first = ordered[0]
     kind = kind or default_kind(first)
-    for other in ordered[1:]:
-        for name in ("conditions", "window_ms", "presentation", "readouts"):
-            if getattr(other, name) != getattr(first, name):
-                raise Mismatch(
-                    f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
-                    f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
-                )
-        if others := stimulus_mismatch(first.conditions, other.conditions):
-            raise Mismatch(f"conditions: {others} at {in_min(other.start_min)}")
+    if mismatch := series_mismatch(ordered):
+        raise Mismatch(mismatch)
     start_min = np.array([responses.start_min for responses in ordered], dtype=np.float64)
-    if np.any(np.diff(start_min) == 0):
-        twice = start_min[:-1][np.diff(start_min) == 0][0]
-        raise Mismatch(f"start_min: expected recordings at different minutes, got two at {in_min(twice)}")
-
     room = room_for(ordered)
     fitted = [fit_simulator(r, kind=kind, bins=bins, range_hz=range_hz, room=room) for r in ordered]
     fidelities = tuple(fidelity(r, simulator) for r, simulator in zip(ordered, fitted, strict=True))
@@ -199,12 +188,6 @@ def fit_timeline(
     return SimulatorTimeline(
         simulators, start_min, *same, fidelities, findings, how, tuple(ordered), first.readouts, culture
     )
-
-
-def _words(value: object) -> str:
-    if isinstance(value, tuple) and value and isinstance(value[0], Condition):
-        return ", ".join(condition.label for condition in value)
-    return ", ".join(value.names) if isinstance(value, Readouts) else str(value)
 
 
 def save_timeline(timeline: SimulatorTimeline, path: Path) -> Path:

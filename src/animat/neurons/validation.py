@@ -23,10 +23,10 @@ MARGINAL = "marginal"
 """The name of the baseline: the responses to all conditions in one distribution."""
 SMALL_DISTANCE, LARGE_DISTANCE = 0.1, 0.2
 """Of the transforms from uniform: with a threshold, a mean command is off by at most twice as much. On virtual cultures
-1 to 5, whose measured returns lie in the intervals of their predictions, the largest is 0.08."""
+1 to 5, whose measured returns lie in the intervals of their predictions, the largest is 0.07."""
 LARGE_DIFFERENCE = 0.15
-"""Between the recorded correlation of successive responses and the simulator's: on these cultures at most 0.07 with
-memory, and 0.30 to 0.41 without."""
+"""Between the recorded correlation of successive responses and the simulator's: on these cultures at most 0.05 with
+memory, and 0.31 to 0.44 without."""
 CERTAIN = 2.0
 """Standard errors by which one prediction must be better than another."""
 FREE_RUNS = 200

@@ -58,15 +58,19 @@ class Row:
     def gap(self) -> Interval:
         """Mean measured less mean predicted return; its interval is over bootstrap recordings and measured episodes.
 
-        Episodes of the same turn are drawn together. The ends are infinite with fewer than two measured episodes, or
-        turns. Responses are drawn as if they were independent:
-        drift between recording and loop is not in the interval, and shows as a gap.
+        Episodes of the same turn are drawn together. If measured episodes vary less than predicted ones, as when all
+        reach the limit, the interval is over as many predicted episodes instead: rare failures may have been missed.
+        The ends are infinite with fewer than two measured episodes, or turns. Responses are drawn as if they were
+        independent: drift between recording and loop is not in the interval, and shows as a gap.
         """
-        value = self.measured.mean() - self.predicted.mean()
-        measured = resampled_means(self.measured, rng := np.random.default_rng(0), self.turn)
-        if measured is None:
-            return Interval(float(value), -np.inf, np.inf, CONFIDENCE)
-        return bootstrap_interval(value, measured - rng.choice(self.bootstrap_means, len(measured)))
+        mean, expected = self.measured.mean(), self.predicted.mean()
+        drawn = resampled_means(self.measured, rng := np.random.default_rng(0), self.turn)
+        if drawn is None:
+            return Interval(float(mean - expected), -np.inf, np.inf, CONFIDENCE)
+        independent = len(self.measured if self.turn is None else np.unique(self.turn))
+        missed = expected - rng.choice(self.predicted, (len(drawn), independent)).mean(axis=1)
+        measured = mean + missed if missed.std() > drawn.std() else drawn
+        return bootstrap_interval(mean - expected, measured - rng.choice(self.bootstrap_means, len(drawn)))
 
     @property
     def net(self) -> float | None:

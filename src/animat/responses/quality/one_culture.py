@@ -1,17 +1,47 @@
-"""Whether the responses of several recordings are of one culture, read on the same channels."""
+"""Whether the responses of several recordings can be used together: of one culture, recorded and read alike."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from animat.errors import in_min
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Channels
+from animat.responses.condition import Condition, stimulus_mismatch
+from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
 from animat.tables import UNKNOWN
+
+
+def series_mismatch(series: Sequence[Responses]) -> str | None:
+    """How recordings differ that simulators in one timeline must share, or which two share a minute; None if nothing.
+
+    `series` is in the order of time.
+    """
+    first = series[0]
+    for other in series[1:]:
+        for name in ("conditions", "window_ms", "presentation", "readouts"):
+            if getattr(other, name) != getattr(first, name):
+                return (
+                    f"{name}: expected the same in all recordings, got {_words(getattr(first, name))} at "
+                    f"{in_min(first.start_min)} and {_words(getattr(other, name))} at {in_min(other.start_min)}"
+                )
+        if others := stimulus_mismatch(first.conditions, other.conditions):
+            return f"conditions: {others} at {in_min(other.start_min)}"
+    for one, other in pairwise(series):
+        if one.start_min == other.start_min:
+            return f"start_min: expected recordings at different minutes, got two at {in_min(one.start_min)}"
+    return None
+
+
+def unlike_finding(series: Sequence[Responses]) -> Iterator[Finding]:
+    """The finding on recordings with stimuli that cannot be in one timeline (`not-a-series`), in any order."""
+    stimulated = sorted((each for each in series if len(each)), key=lambda responses: responses.start_min)
+    if stimulated and (mismatch := series_mismatch(stimulated)):
+        yield Finding("not-a-series", "warning", f"animat train refuses these recordings together: {mismatch}")
 
 
 def series_findings(series: Sequence[Responses]) -> Iterator[Finding]:
@@ -47,3 +77,9 @@ def _different(tables: Sequence[Channels]) -> int:
     names = [table.electrode if knows else table.label for table in tables]
     in_all = set.intersection(*(set(each.tolist()) for each in names)) if names else set()
     return max((sum(name not in in_all for name in each.tolist()) for each in names), default=0)
+
+
+def _words(value: object) -> str:
+    if isinstance(value, tuple) and value and isinstance(value[0], Condition):
+        return ", ".join(condition.label for condition in value)
+    return ", ".join(value.names) if isinstance(value, Readouts) else str(value)
