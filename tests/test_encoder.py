@@ -201,6 +201,23 @@ def test_what_cannot_be_delivered_is_refused_in_one_line(condition: Condition, w
     assert str(error.value).startswith(words) and "\n" not in str(error.value)
 
 
+def test_trains_are_as_long_as_at_the_slowest_frequency() -> None:
+    """100 pulses at 0.1 Hz take 1,000 s, as long as a trial may; a condition may have several frequencies."""
+    conditions = a_condition(None, 20.0), a_condition(None, 50.0, 0.1)
+    assert Encoder(conditions, 100).pulses == 100
+    with pytest.raises(InvalidArgument, match=r"^pulses: expected trials of 1000 s at most, got 101 .* 1,010 s at 0.1"):
+        Encoder(conditions, 101)
+    with pytest.raises(InvalidArgument, match=r"^conditions: expected at least one, got none$"):
+        Encoder((), 100)
+
+
+def test_patterns_are_taken_where_electrodes_are_open() -> None:
+    """Those of the condition itself, or of the pulses before the last one."""
+    fixed, last = a_condition((SETS[0],)), a_condition((SETS[0],), only_last=True)
+    assert Encoder((fixed, a_condition(None)), 1).takes_patterns and Encoder((fixed, last), 2).takes_patterns
+    assert not Encoder((fixed, last), 1).takes_patterns and not Encoder((fixed,), 2).takes_patterns
+
+
 def of_the_fake(*rows: int, only_last: bool = False) -> tuple[Condition, ...]:
     """Some of the fake culture's patterns as conditions at 20 Hz."""
     patterns = FakeCulture().patterns.tolist()

@@ -197,6 +197,10 @@ def test_the_table_has_the_policies_and_every_control() -> None:
     assert plain["policies"] == {"a": plain["rows"][0]["mean_returns"][0], "b": plain["rows"][0]["mean_returns"][1]}
     for row in evaluation.rows:
         assert row.name in evaluation.to_text()
+    known = replace(evaluation, optimum=Optimum(1e3, 0.0, 1e3, 1.0, 1e3, 1.0, 100, 1000))
+    assert "score: (mean return - random) / (optimal return - random); none for silent and shuffled" in known.to_text()
+    # Random actions may be among those that a caller leaves out.
+    assert "no score, as there are no random actions" in replace(known, rows=known.rows[:1]).to_text()
 
 
 @pytest.mark.oracle

@@ -12,7 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from animat.coding.mapping import REGISTRY, Linear, Thresholds, mapping_named
+from animat.coding.mapping import (
+    REGISTRY,
+    Linear,
+    Thresholds,
+    mapping_from_data,
+    mapping_named,
+    mapping_to_data,
+    namespace_of,
+)
 from animat.errors import InvalidArgument
 
 NAMES = REGISTRY.names()
@@ -111,6 +119,7 @@ def test_numpy_and_jax_agree(mapping, percentiles, values) -> None:
     of_numpy = mapping.command(x, percentiles)
     assert isinstance(of_numpy, np.ndarray)
     assert of_numpy.shape == of_jax.shape == x.shape
+    assert namespace_of(x, percentiles) is np and namespace_of(x, jnp.asarray(percentiles)) is jnp
     # Half a unit in the last place for the division; thresholds agree to the bit once both are float32.
     np.testing.assert_allclose(of_jax, of_numpy.astype(np.float32), atol=0 if mapping != Linear() else 1e-6)
 
@@ -137,6 +146,8 @@ def test_every_tenth_of_the_responses_gets_its_own_level() -> None:
 def test_names_give_the_mapping_back(name: str) -> None:
     assert mapping_named(name).name == name
     assert mapping_named(name) == mapping_named(name)
+    # As the files of all commits have it.
+    assert mapping_to_data(mapping_named(name)) == name and mapping_from_data(name) == mapping_named(name)
     assert len({mapping_named(other) for other in NAMES}) == len(NAMES)
 
 

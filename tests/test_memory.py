@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
+from scipy.stats import rankdata
 
 import animat.gym  # noqa: F401
 from animat.cli.train import _memories
@@ -28,7 +29,7 @@ from animat.evaluation.rollouts import Constant, Uniform, networks_of, roll_out
 from animat.execution.training import train
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import Kind
-from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, fit_memory
+from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, fit_memory
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
@@ -259,6 +260,47 @@ def test_a_condition_of_few_responses_takes_nothing_from_the_others() -> None:
     slopes, expected = (np.asarray(each.toward)[:2, 1] for each in (simulator, whole))
     np.testing.assert_allclose(slopes, expected, rtol=0.35)
     assert np.all(np.isfinite(simulator.toward))
+
+
+@pytest.mark.parametrize("spread", [0.004, 0.06])
+def test_slopes_are_shrunk_as_far_as_conditions_are_alike(spread: float) -> None:
+    """Of 200 conditions, whose slopes are known; each slope alone has an error of about 0.02."""
+    rng = np.random.default_rng(1)
+    true = 0.06 + spread * rng.normal(size=(200, 2))
+    histories = rng.normal(size=(200, 100, 2))
+    ranks = np.einsum("crh,ch->cr", histories, true) + 0.2 * rng.normal(size=(200, 100))
+    designs = np.concatenate([histories, np.ones((200, 100, 1))], axis=2)
+    alone = np.array([np.linalg.lstsq(designs[c], ranks[c], rcond=None)[0][:2] for c in range(200)])
+    together = np.broadcast_to(alone.mean(axis=0), (200, 2))
+    of_shrunk, of_alone, of_together = (
+        np.mean((each - true) ** 2) for each in (_slopes(list(ranks), list(histories)), alone, together)
+    )
+    assert of_shrunk < 1.5 * of_together < 0.2 * of_alone if spread < 0.02 else of_shrunk < of_alone < 0.2 * of_together
+
+
+def test_of_exponents_as_good_as_the_best_the_largest_is_taken() -> None:
+    """Each response is left out in turn, and its rank predicted by the mean of its neighbours'."""
+    n = 600
+    responses = chain(n, after_low=(0.1, 0.2), after_high=(0.8, 0.9))
+    found, condition = fit_memory(responses).memory, responses.condition
+    rank = (rankdata(responses.rate_hz) - 0.5) / n
+    traces, means = [0.0], [rank[condition == c].mean() for c in (0, 1)]
+    for r, c in zip(rank, condition.tolist(), strict=True):
+        more = (1 - found.decay) * (r + found.weight * means[c]) / (1 + found.weight)
+        traces.append(found.decay * traces[-1] + more)
+    errors: dict[float, list[float]] = {exponent: [] for exponent in (0.5, 0.6, 0.7, 0.8, 0.9)}
+    for exponent, squares in errors.items():
+        for rows in (np.flatnonzero(condition == c) for c in (0, 1)):
+            in_order = rows[np.argsort(np.array(traces)[rows], kind="stable")]
+            k = round(len(rows) ** exponent)
+            for i, row in enumerate(in_order):
+                first = min(max(i - k // 2, 0), len(rows) - k - 1)
+                others = in_order[first : first + k + 1]
+                squares.append((rank[row] - (rank[others].sum() - rank[row]) / k) ** 2)
+    best = np.array(min(errors.values(), key=np.mean))
+    worse = {exponent: np.array(squares) - best for exponent, squares in errors.items()}
+    as_good = [exponent for exponent, by in worse.items() if by.mean() <= by.std() / np.sqrt(n)]
+    assert as_good == [0.5, 0.6] and found.neighbour_exponent == pytest.approx(0.6)
 
 
 def test_responses_that_are_all_the_same_have_no_slopes() -> None:

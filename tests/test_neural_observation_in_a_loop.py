@@ -33,7 +33,7 @@ from fake_culture import FakeCulture
 from test_closed_loop import loop_of
 from test_reality_gap import policy_of
 
-MEMORY = Memory(0.3, 0.5, 0.7, 1.0)
+MEMORY = Memory(0.3, 0.5, 0.7, 2.0)
 PROTOCOL = Protocol(order="mixed", patterns=8, trials=40, setup_s=0.1)
 SHORT = Cartpole(episode_limit=12)
 

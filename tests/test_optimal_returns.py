@@ -23,6 +23,7 @@ from animat.evaluation.optimum import Optimum, best_return, optimal_values
 from animat.evaluation.resampling import WellSampled, _coarse
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
 from animat.neurons.simulator import fit_histogram
+from animat.neurons.timeline import fit_timeline
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.responses.condition import Condition
@@ -31,6 +32,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.responses import Responses
 from animat.robots import Cartpole
 from animat.robots.grid import grid_for
+from animat.wrappers import ShuffledDelivery
 from synthetic_recordings import synthetic_recording
 
 ROBOT = Cartpole(episode_limit=60)
@@ -151,6 +153,15 @@ def test_conditions_left_out_leave_the_others_and_their_history_alone() -> None:
     assert set(kept.presentations[0].condition.tolist()) == {NO_CONDITION, 0, 1}
 
 
+def test_fixed_thresholds_stay_as_they_are_in_bootstraps() -> None:
+    first, last = answers([40] * 5, 1), replace(answers([40] * 5, 2, (1.0,) * 5), start_min=10.0)
+    timeline, again = fit_timeline([first, last], kind="histogram"), last.bootstrapped(np.random.default_rng(3))
+    for percentiles, of in (("first", first), ("moving", again)):
+        sampled = WellSampled.of(Animat(SHORT, Thresholds(1), 5), timeline, 10.0, percentiles)
+        expected = np.percentile(of.rate_hz, np.arange(0, 101, 10))
+        np.testing.assert_allclose(sampled.fit(again).percentiles, expected, rtol=1e-6)
+
+
 @pytest.mark.oracle
 @pytest.mark.parametrize("mapping", [Thresholds(1), Thresholds(9)])
 def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None:
@@ -159,10 +170,13 @@ def test_the_interval_is_within_what_returns_can_be(mapping: Thresholds) -> None
         responses = answers([30] * 5, 3, spread)
         best = best_return(environment, fit_histogram(responses), resolution=0.25, episodes=0)
         sampled = WellSampled(environment, fit_histogram(responses), responses, (), fit_histogram)
-        known = sampled.with_interval(best, resolution=0.25, resamples=8)
-        assert known.interval is not None
+        known, once = (sampled.with_interval(best, resolution=0.25, resamples=n).interval for n in (8, 1))
+        assert known is not None and once is not None
         # The pole falls in the first iteration, or never.
-        assert -100 <= known.interval.low <= best.value <= known.interval.high <= SHORT.episode_limit
+        assert -100 <= known.low <= best.value <= known.high <= SHORT.episode_limit
+        # Where conditions do not differ significantly, chance alone may have made them differ.
+        shuffled = best_return(ShuffledDelivery(environment), fit_histogram(responses), resolution=0.25, episodes=0)
+        assert (once.low < shuffled.value + 0.1) == (len(set(spread)) == 1)
 
 
 @pytest.mark.oracle

@@ -81,6 +81,12 @@ def test_a_session_takes_its_pauses_and_what_is_presented() -> None:
     longer_s = total_s + 3 * (3 + 6 / 5 + 6 / 80)
     assert longer.planned_min == pytest.approx(longer_s / 60)
     assert longer.budget_min == pytest.approx(longer_s / 60 * 94 / (4 * 94 + 36))
+    # Of two pulses each, without a warm-up: 90 trials, and twelve in the settling.
+    twice = outlook(replace(loop, pulses=2, warm_up=0, settling=1), calibration, [(1, plan[0][1], True)], account, 15.0)
+    twice_s = 3 + 2 * (10 / 5 + 80 / 80) + 3 + 2 * (6 / 5 + 6 / 80)
+    assert twice.planned_min == pytest.approx(twice_s / 60)
+    assert twice.budget_min == pytest.approx(twice_s / 60 * 94 / (2 * 90 + 2 * 12))
+    assert outlook(loop, calibration, plan[1:], account, 15.0).budget_min == math.inf
 
 
 def test_the_outlook_is_one_line() -> None:
@@ -92,6 +98,8 @@ def test_the_outlook_is_one_line() -> None:
     )
     assert str(Outlook(26.2, (24.0, -9.0), 20.0)).endswith("the plan is longer: ask for fewer --episodes")
     assert "in 24 min (0 min at the earliest)" in str(Outlook(26.2, (24.0, -9.0), 20.0))
+    # The likely time counts, not the earliest.
+    assert str(Outlook(20.0, (24.0, -9.0), math.inf)).endswith("beyond which adaptive thresholds may not help")
     assert str(Outlook(26.2, (-5.0, -9.0), math.inf)) == (
         "the session is planned for about 26 min of the culture's time; at the drift of the recordings the median "
         "response had already changed by 25 % 5 min ago, beyond which adaptive thresholds may not help; use newer "

@@ -308,6 +308,8 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
     [
         (lambda x: 0.5, "expected 25 commands from -1 to 1, got 0.5"),
         (lambda x: x, "expected 25 commands from -1 to 1"),
+        # A little above 1, at the largest response only.
+        (lambda x: x / 9_900, "expected 25 commands from -1 to 1, got "),
         (
             lambda x: -x / (x + 100),
             "expected commands that never fall as the response rises, got -0 at 0 Hz and -0.0",

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu
+from scipy.stats import mannwhitneyu, norm, t
 
 from animat.cli import main
 from animat.closed_loop.adaptive import AdaptiveThresholds
@@ -28,10 +28,11 @@ from animat.cultures.kinds import culture_of, pulse_for, recorded_culture
 from animat.cultures.observed import Observed
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
+from animat.evaluation.controls import Control
 from animat.evaluation.coupling import Coupling
 from animat.evaluation.heuristic import HeuristicPolicy, heuristic_policy
 from animat.evaluation.optimum import best_return
-from animat.evaluation.rollouts import networks_of, roll_out
+from animat.evaluation.rollouts import Uniform, networks_of, roll_out
 from animat.evaluation.table import evaluate
 from animat.evaluation.verdict import EpisodeComparison
 from animat.neurons.history_tracker import HistoryState
@@ -40,7 +41,9 @@ from animat.neurons.simulator import NeuronSimulator, fit_empirical, pooled_perc
 from animat.neurons.synthetic import LABELS, MEANS_HZ
 from animat.neurons.timeline import fit_timeline
 from animat.reality_gap import Calibration, RealityGap, Row, check_policies, run_policies
+from animat.reality_gap.interventions import intervention_table
 from animat.reality_gap.predicting import EPISODES, ROLL_OUTS, roll_out_seed
+from animat.reality_gap.row import resampled_means
 from animat.reality_gap.running import planned_episodes
 from animat.reality_gap.session_responses import read_responses
 from animat.recordings.findings import Finding, warnings_once
@@ -298,8 +301,11 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
     np.testing.assert_allclose(rewards, found.returns)
     assert found.commanded.presented.sum() == len(ticks)
     np.testing.assert_allclose(found.commanded.total.sum(), sum(commands))
-    # What was presented in between is there too, as the culture may remember it.
-    assert len(found.responses.presentations[0].condition) == len(list(gap.session.ticks))
+    # What was presented in between is there too, as the culture may remember it; it rests before each episode.
+    every, (presented, place) = list(gap.session.ticks), found.responses.presentations
+    np.testing.assert_array_equal(presented.condition, [tick.delivered for tick in every])
+    np.testing.assert_array_equal(presented.is_rested, [tick.iteration == 0 for tick in every])
+    assert [every[row] for row in place] == ticks
 
 
 def test_controls_have_no_more_episodes_than_the_policies_but_five_each() -> None:
@@ -534,6 +540,29 @@ def test_few_episodes_give_intervals_as_wide_as_they_have_to_be(episodes: int) -
         covered += gap.low <= 0 <= gap.high
     # 190 of 200, standard deviation 3.1; of two episodes a bootstrap knows only three means.
     assert 175 <= covered <= 199
+    assert [replace(row, measured=np.full(n, x)).gap_sign for n, x in ((0, 0.0), (5, -3.0), (5, 3.0))] == [0, -1, 1]
+    # The one that differs is drawn 0, 1, 2, ... times: the interval is as skewed as the returns are.
+    means = resampled_means(np.append(np.zeros(episodes - 1), float(episodes)), rng)
+    spread = np.sqrt(episodes / (episodes - 1)) * t.ppf(0.975, episodes - 1) / norm.ppf(0.975)
+    assert means is not None and means.min() == pytest.approx(1 - spread)
+    assert means.max() > 1 + (episodes - 2) * spread
+
+
+def test_the_interval_of_a_loss_is_that_of_two_means() -> None:
+    rng = np.random.default_rng(7)
+    measured, others = rng.normal(10.0, 3.0, 60), rng.normal(4.0, 6.0, 40)
+    policies = Row("p", "", np.zeros(9), np.zeros(9), measured, 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    ideal = Control("ideal actuator", "", Uniform())
+    rows = policies, replace(policies, name="silent", measured=others), replace(policies, name="random")
+    simulator, actuator, silent = intervention_table(rows, ideal, others)
+    half = 1.96 * np.sqrt(measured.var(ddof=1) / 60 + others.var(ddof=1) / 40)
+    for lost in (actuator.lost, silent.lost):
+        assert lost.value == pytest.approx(measured.mean() - others.mean())
+        assert (lost.low, lost.high) == pytest.approx((lost.value - half, lost.value + half), abs=0.1 * half)
+    assert (simulator.is_measured, actuator.is_measured, silent.is_measured) == (False, False, True)
+    assert intervention_table((replace(policies, measured=np.zeros(0)),), ideal, others) == ()
+    (alone,) = intervention_table((policies, replace(rows[1], measured=others[:1])), ideal, others)[2:]
+    assert alone.lost.low == -np.inf and alone.lost.high == np.inf
 
 
 @pytest.mark.parametrize("failing", [0.02, 0.2])

@@ -42,6 +42,8 @@ def test_complete_separation_of_ten_and_ten() -> None:
     k = 9 * ((1 - share) / (2 - share) + share / (1 + share))
     assert 1 - share == pytest.approx(1.959964**2 * share * (1 + k) / 100, abs=1e-5)
     assert 0.5 < compared.effect.low < 0.7
+    turned = compare(np.arange(10) + 100, np.arange(10)).effect
+    assert (turned.low, turned.value) == (-1, -1) and turned.high == pytest.approx(-compared.effect.low)
     assert not compared.ties
     json.dumps(asdict(compared))
 
@@ -181,10 +183,13 @@ def test_refusals_name_the_argument() -> None:
         compare([], [1.0])
     with pytest.raises(InvalidArgument, match="second"):
         compare([1.0], [float("nan")])
+    with pytest.raises(InvalidArgument, match=r"first: expected one number per sample, .* got shape \(1, 2\)"):
+        compare([[1.0, 2.0]], [1.0])
     with pytest.raises(InvalidArgument, match="p:"):
         holm({"a": 1.5})
     with pytest.raises(InvalidArgument, match="u:"):
         p_of_u(101, 10, 10)
+    assert p_of_u(100, 10, 10) == p_of_u(0, 10, 10)
 
 
 def test_the_interval_ends_where_the_numbers_can_be_no_larger() -> None:

@@ -91,6 +91,7 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         np.asarray(timeline.at(0.0).percentiles),
         adaptive_from=AdjustedRanks.of(responses, fit_empirical(responses)),
         burst_threshold=0.95,
+        on_burst="skip",
         warm_up=1,
         readouts=timeline.readouts,
     )
@@ -142,13 +143,18 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
     assert "command" not in table[0]
 
     # Each condition's commands, as the reasons of a gap ask.
-    read = read_responses(session, loop, ["random"])
-    used = [tick for tick in session.ticks if tick.handled == "used" and tick.agent == "random"]
-    np.testing.assert_array_equal(read.command, [tick.command for tick in used])
-    np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in used])
+    names = "random", "constant", "heuristic"
+    read = read_responses(session, loop, names)
+    acted = [tick for tick in session.ticks if tick.handled != "warm-up" and tick.agent in names]
+    used, delivered = np.array([(tick.handled == "used", tick.delivered) for tick in acted]).T
+    assert 0 < used.sum() < len(acted)
+    np.testing.assert_array_equal(read.moved, used)
+    of_each = [tick.command if tick.handled == "used" else (np.nan, np.nan) for tick in acted]
+    np.testing.assert_array_equal(read.command, of_each)
+    np.testing.assert_array_equal(read.responses.read_hz, [tick.readout_hz for tick in acted])
     commanded = read.commanded.summed(0)
     for i in range(5):
-        of_condition = np.array([t.delivered == i for t in used])
+        of_condition = (delivered == i) & (used == 1)
         assert commanded.presented[i] == of_condition.sum()
         np.testing.assert_allclose(commanded.total[i], read.command[of_condition].sum(axis=0))
 

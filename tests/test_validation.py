@@ -300,11 +300,17 @@ def test_a_free_run_remembers_its_own_answers() -> None:
     ranked = Ranked(halves.first)
     (traces, left), loads = ranked.recorded(simulator.memory), ranked.loads(simulator.memory.load_s).every
     assert simulator.load_s > 0
-    runs = free_runs(simulator, predict(simulator, halves), 3, np.random.default_rng(7))
-    places = place[halves.rows]
+    prediction, places = predict(simulator, halves), place[halves.rows]
+    runs = free_runs(simulator, prediction, 3, np.random.default_rng(7))
     since = places[0]
     uniforms = np.random.default_rng(7).random((n - since, 3), np.float32)
     answer_at = jax.jit(simulator.answer_at)
+    # What is predicted is what many draws after the recorded history come to.
+    draws = jax.vmap(jax.vmap(simulator.answer_at, (None, 0, None, None)), (0, None, 0, 0))
+    evenly = (np.arange(2000, dtype=np.float32) + 0.5) / 2000
+    drawn_hz = np.asarray(draws(every[places], evenly, *(x[places].astype(np.float32) for x in (traces, loads)))[0])
+    shares = np.stack([(drawn_hz == value).mean(axis=1) for value in halves.values_hz], axis=1)
+    np.testing.assert_allclose(prediction.probability, shares, atol=2e-3)
     for k in range(3):
         trace, expected = traces[since], np.full(n, np.nan)
         for p in range(since, n):

@@ -180,11 +180,12 @@ class Evaluation:
         if self.optimum.left_out:
             meaning = "no score, as the optimal return leaves out conditions that the rows use"
         elif not self.rows[0].changed and self.score(self.rows[0]) is None:
-            meaning = "no score, as the optimal return is not above that of random actions"
+            has_random = any(row.name == "random" for row in self.rows)
+            reason = "the optimal return is not above that of" if has_random else "there are no"
+            meaning = f"no score, as {reason} random actions"
         else:
             meaning = "score: (mean return - random) / (optimal return - random)"
-            changed = [row.name for row in self.rows if row.changed]
-            if changed:
+            if changed := [row.name for row in self.rows if row.changed]:
                 meaning += f"; none for {' and '.join(changed)}, whose optimum is different"
         lines = [f"  {self.optimum.to_text()}", f"  {meaning}"]
         if self.net_optimum is not None:

@@ -32,8 +32,8 @@ class EpisodeComparison(NamedTuple):
 
     @property
     def is_outperformed(self) -> bool:
-        """Whether the policies' returns are larger than the control's."""
-        return self.p < OUTPERFORMED_P and self.wins > 0.5
+        """Whether the policies' returns are larger than the control's, in enough episodes to show it."""
+        return self.p < OUTPERFORMED_P and self.wins > 0.5 and self.has_enough_episodes
 
     @property
     def has_enough_episodes(self) -> bool:

@@ -190,8 +190,8 @@ def _find_memory(ranked: Ranked) -> Memory:
 
     if is_as_good(NO_MEMORY, _CERTAIN):
         return NO_MEMORY
-    alike = [memory for memory in errors if memory[:2] == best[:2] and memory.neighbour_exponent < 1]
-    found = max((memory for memory in alike if is_as_good(memory, 1.0)), key=lambda each: each.neighbour_exponent)
+    alike = [memory for memory in errors if memory[:2] == best[:2] and is_as_good(memory, 1.0)]
+    found = max(alike, key=lambda memory: memory.neighbour_exponent)
     return found._replace(load_s=_LOAD_S if _has_load(ranked, found) else 0.0)
 
 

@@ -147,13 +147,12 @@ def predict(simulator: NeuronSimulator, halves: Halves) -> Prediction:
         counts = np.asarray(simulator.counts)
         table = halves.read(np.asarray(simulator.values_hz))
         of_condition = [_shares(x[:n], values_hz) for x, n in zip(table, counts, strict=True)]
-    elif isinstance(simulator, HistogramSimulator | JointHistogramSimulator):
+    else:
+        assert isinstance(simulator, HistogramSimulator | JointHistogramSimulator)
         counts = np.array([len(halves.first_of(c)) for c in range(simulator.n_conditions)])
         own = ... if halves.readout is None else halves.readout
         cumulatives, edges_hz = np.asarray(simulator.cumulative)[own], np.asarray(simulator.edges_hz)[own]
         of_condition = [np.diff(_below(each, edges_hz, values_hz[1:]), prepend=0, append=1) for each in cumulatives]
-    else:
-        raise TypeError(f"simulator: expected a histogram, empirical or memory simulator, got {type(simulator)}")
     return Prediction(halves, np.stack(of_condition)[halves.condition], counts[halves.condition].astype(np.float64))
 
 

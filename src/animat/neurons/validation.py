@@ -288,12 +288,10 @@ def correlations(responses: Responses) -> Float64[np.ndarray, "2 pairs"]:
     """
     from scipy.stats import rankdata
 
-    halves = halved(responses, 0)
-    rows = ~responses.is_burst & np.isin(np.arange(len(responses)), halves.rows)
-    of_halves = []
+    halves, of_halves = halved(responses, 0), []
     for read_hz, condition in (
         (halves.first.read_hz[~halves.first.is_burst], halves.first.condition[~halves.first.is_burst]),
-        (responses.read_hz[rows], responses.condition[rows]),
+        (responses.read_hz[halves.rows], halves.condition),
     ):
         of_condition = [rankdata(read_hz[condition == c], axis=0) for c in range(len(responses.conditions))]
         upper = np.triu_indices(read_hz.shape[1], 1)

@@ -109,7 +109,7 @@ def trend(evidence: Evidence) -> Finding | None:
 
     session = evidence.session
     responses, time_s, episodes = session.responses, session.responses.time_s, len(session.returns)
-    if time_s is None or episodes < FEWEST_EPISODES:
+    if time_s is None:
         return None
     with_time = kendalltau(np.arange(episodes), session.returns, alternative="less" if evidence.gap < 0 else "greater")
     if not with_time.pvalue < LEVEL:
@@ -170,7 +170,7 @@ def answers(evidence: Evidence) -> Finding | None:
     conditions = np.flatnonzero((measured.presented.sum(axis=0) >= 20) & (predicted.commanded.presented > 0))
     responses, names = evidence.session.responses, evidence.session.responses.readouts.names
     tested = [(i, d) for i in conditions.tolist() for d in range(len(names))]
-    level = LEVEL / (len(tested) + len(names)) if tested else LEVEL
+    level = LEVEL / (len(tested) + len(names))
     differences, most = [], 0.0
     for i, d in tested:
         n, expected = measured.presented[:, i], float(predicted.commanded.mean[i, d])
@@ -234,8 +234,6 @@ def repetition(evidence: Evidence) -> Finding | None:
     session, names = evidence.session, evidence.session.responses.readouts.names
     responses, episodes = session.responses, len(session.returns)
     usable = ~responses.is_burst
-    if episodes < FEWEST_EPISODES or not usable.any():
-        return None
     y = evidence.calibration.adjusted.of_responses(responses)
     for condition in range(len(responses.conditions)):
         of = responses.condition == condition
