@@ -92,6 +92,25 @@ def test_a_response_is_read_after_the_last_pulse_of_its_presentation() -> None:
     assert responses.presentation == Presentation("mixed", 2)
 
 
+def test_trials_are_kept_with_bursts_and_rests_also_where_they_have_no_condition() -> None:
+    # Times are sums of powers of two. A second without a pulse is not yet a rest, and a trial's own pulses are none.
+    pulses_s, trials = [1, 1.125, 2.125, 3.1875, 4.0, 4.75, 5.5], [0, 0, 1, 2, 3, 3, 3]
+    spikes = [(t + 0.005, channel) for t, n in ((1.125, 1), (2.125, 2), (5.5, 1)) for channel in range(n)]
+    given = recording(spikes, pulses_s, frequency_hz=[5, 5, np.nan, 5, 5, 5, 5], presentation=trials)
+    responses = extract_responses(given, burst_threshold=0.25)
+    presented, place = responses.presentations
+    assert presented.condition.tolist() == [0, -1, 0, 0] and place.tolist() == [0, 2, 3]
+    assert presented.is_rested.tolist() == [True, False, True, False]
+    assert presented.is_burst.tolist() == [False, True, False, False]
+
+
+def test_a_window_that_ends_with_the_recording_counts_however_times_are_rounded() -> None:
+    assert 1.12 + 0.01 > 1.13
+    for duration_s, n in ((1.13, 2), (1.13 - 2e-9, 1)):
+        responses = extract_responses(recording([(1.125, 0)], [0.5, 1.12], duration_s=duration_s))
+        assert responses.rate_hz.tolist() == pytest.approx([0, 31.25][:n])
+
+
 def test_the_median_and_the_shares_above_it() -> None:
     responses = Responses(
         condition=np.array([0, 0, 0, 1, 1, 1]),
