@@ -149,6 +149,8 @@ def test_a_window_that_is_none_is_refused(window_ms: tuple[float, float]) -> Non
 def test_a_window_may_be_a_list_or_an_array() -> None:
     for window_ms in ([2, 10], np.array([2.0, 10.0])):
         assert extract_responses(recording([], [1]), window_ms=window_ms).window_ms == (2.0, 10.0)  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match="window_ms: expected two numbers of milliseconds, start and end, got"):
+        extract_responses(recording([], [1]), window_ms=(2, 10, 20))  # type: ignore[arg-type]
 
 
 def test_a_recording_without_channels_is_refused() -> None:
