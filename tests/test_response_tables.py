@@ -71,7 +71,9 @@ def test_a_table_has_the_responses_of_the_recording_that_it_was_counted_in(
     np.testing.assert_array_equal(ours.active_ratio[:n], theirs.active_ratio)
     np.testing.assert_array_equal(ours.condition[:n], theirs.condition)
     np.testing.assert_array_equal(ours.last_hz[1:n] == 0, theirs.last_hz[1:] == 0)
-    by_times = [extract_responses(source, ByInterval((10.0, 40.0)), window_ms).condition for source in (table, recording)]
+    by_times = [
+        extract_responses(source, ByInterval((10.0, 40.0)), window_ms).condition for source in (table, recording)
+    ]
     assert set(by_times[1].tolist()) == {0, 1}
     np.testing.assert_array_equal(by_times[0][: len(by_times[1])], by_times[1])
     assert (ours.by, ours.burst_threshold) == (theirs.by, theirs.burst_threshold)

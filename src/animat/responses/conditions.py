@@ -94,7 +94,7 @@ class ByInterval(Conditions):
         if not self.values_hz:
             raise InvalidArgument("interval: expected at least one frequency in Hz, got none; write interval:5,10")
         _check_frequencies("interval", self.values_hz)
-        if not (math.isfinite(self.tolerance) and self.tolerance > 0):
+        if not 0 < self.tolerance < math.inf:
             raise InvalidArgument(f"interval: expected a tolerance above 0 %, got {100 * self.tolerance:g} %")
 
     def __str__(self) -> str:
@@ -279,7 +279,7 @@ def _frequency(value_hz: float) -> Condition:
 
 def _check_frequencies(name: str, values_hz: tuple[float, ...]) -> None:
     for value_hz in values_hz:
-        if not (math.isfinite(value_hz) and value_hz > 0):
+        if not 0 < value_hz < math.inf:
             raise InvalidArgument(f"{name}: expected positive frequencies in Hz, got {value_hz:g}")
     # Those that differ by rounding only are the same condition.
     if len(distinct(np.array(values_hz, np.float64))) < len(values_hz):
