@@ -172,6 +172,14 @@ def test_the_noise_is_estimated_from_the_median(samples: int) -> None:
     expected = np.median(np.abs(looked_at - middle), axis=1) / 0.6745
     # Of an even number of values, the upper of the two middle ones instead of their mean.
     np.testing.assert_allclose(median_noise_uv(voltage), expected, rtol=1e-6 if looked_at.shape[1] % 2 else 2e-3)
+    # What is blanked does not count, whatever is in it, and 9 % of the samples are too few.
+    is_blank = np.arange(samples) >= samples * np.array([[0.9], [0.2], [0.11], [0.09]])
+    of_each = [
+        np.median(np.abs(row[~blank] - np.median(row[~blank]))) for row, blank in zip(voltage, is_blank, strict=True)
+    ]
+    voltage[is_blank] = 1000.0
+    np.testing.assert_allclose(median_noise_uv(voltage, is_blank)[:3], np.array(of_each[:3]) / 0.6745, rtol=0.03)
+    assert np.isnan(median_noise_uv(voltage, is_blank)[3])
 
 
 # --- artefacts -------------------------------------------------------------------------------------------------------
