@@ -390,8 +390,21 @@ def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(f
     assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1
 
 
+@pytest.mark.parametrize("chunk_s", [0.1, 0.3])
+def test_channels_are_counted_once_at_each_pulse_wherever_pieces_begin(chunk_s: float) -> None:
+    voltage, _ = noisy(2, 1.0)
+    pulses = np.arange(0.2, 0.98, 0.0125)
+    for start in np.rint(pulses * RATE_HZ).astype(int):
+        voltage[start : start + 50, 0] = 32_000
+    source = RawTraces.from_array(voltage, channels(2), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(source, pulses, Detection(chunk_s=chunk_s))
+    assert {finding.name: finding.value for finding in found.findings}["saturated-channels"] == 0.5
+
+
 def test_an_amplifier_that_is_mostly_saturated_is_blanked_wherever_pieces_begin() -> None:
     voltage, truth = noisy(4, 20.0)
+    # At rest it is at -2 mV, which is as far from 0 as what it saturates at.
+    voltage -= 20_000
     pulses = np.arange(1.03, 19.0, 0.2)
     is_railed = np.zeros(len(voltage), dtype=bool)
     for start_s in pulses[2:30:5]:

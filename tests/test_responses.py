@@ -268,6 +268,17 @@ def test_a_response_put_into_poisson_spikes_is_found() -> None:
     assert f"use --window-ms {found.start_ms:g} {found.end_ms:g}" in outside.message
 
 
+def test_a_response_of_few_spikes_is_found_in_wider_bins() -> None:
+    rng = np.random.default_rng(4)
+    plain = poisson(rng, rate_hz=0.2, n_channels=50, duration_s=100)
+    stimulus_s = plain.stimuli.time_s[::2]
+    # 10 spikes a second are 10 in each bin of 5 ms, and one after each of 198 stimuli makes 33 more in six bins.
+    evoked = np.column_stack([stimulus_s + rng.uniform(0.022, 0.052, len(stimulus_s)), np.zeros(len(stimulus_s))])
+    spikes = np.vstack([np.column_stack([plain.spike_times_s, plain.spike_channels]), evoked])
+    found = find_response(recording(spikes, stimulus_s, 50, 100))
+    assert found is not None and (found.start_ms, found.end_ms) == (22, 52)
+
+
 def test_histogram_bins_add_up_to_the_window() -> None:
     source = poisson(np.random.default_rng(3), 20, 10, 20)
     histogram = post_stimulus_histogram(source, -20, 50, 1)
