@@ -192,7 +192,11 @@ def test_a_bad_table_is_refused_in_one_line_that_names_the_file(case: str, tmp_p
         ("response_window_ms", ["two", "ten"], r"response_window_ms: expected start and end in ms, got <U3 \(2,\)"),
         ("response_window_ms", [2j, 10], r"response_window_ms: expected start and end in ms, got complex128 \(2,\)"),
         ("response_window_ms", [2, 5, 10], r"response_window_ms: expected start and end in ms, got int64 \(3,\)"),
-        ("response_count", [1, 0], r"response_count: expected numbers of shape \(stimuli, channels\), got int64 \(2,\)"),
+        (
+            "response_count",
+            [1, 0],
+            r"response_count: expected numbers of shape \(stimuli, channels\), got int64 \(2,\)",
+        ),
         ("stimulus_time_s", 1.0, r"stimulus_time_s: expected one column of times in seconds, got shape \(\)"),
     ],
 )

@@ -279,6 +279,22 @@ def test_a_response_of_few_spikes_is_found_in_wider_bins() -> None:
     assert found is not None and (found.start_ms, found.end_ms) == (22, 52)
 
 
+def test_responses_are_sought_after_pulses_that_no_other_follows_soon() -> None:
+    rng = np.random.default_rng(5)
+    first_s = np.arange(1.0, 41.0)
+    spikes_s = np.sort(rng.uniform(0, 42, 250 * 42))
+    # Pulses in pairs 0.1 s apart: the first of each evokes spikes after 5 ms, the second after 30 ms.
+    evoked_s = [first_s + lag_s for lag_s in (*rng.uniform(0.005, 0.015, 15), *rng.uniform(0.130, 0.140, 15))]
+    every_s = np.concatenate([spikes_s, *evoked_s])
+    spikes = np.column_stack([every_s, rng.integers(0, 50, len(every_s))])
+    pairs_s = np.sort(np.concatenate([first_s, first_s + 0.1]))
+    found = find_response(recording(spikes, pairs_s, 50, 42))
+    assert found is not None and (found.start_ms, found.end_ms) == pytest.approx((30, 40), abs=1.5)
+    # There is no time for a response between most pulses of these trains.
+    trains_s = (first_s[:15, None] + 0.004 * np.arange(10)).ravel()
+    assert find_response(recording(spikes, trains_s, 50, 42)) is None
+
+
 def test_histogram_bins_add_up_to_the_window() -> None:
     source = poisson(np.random.default_rng(3), 20, 10, 20)
     histogram = post_stimulus_histogram(source, -20, 50, 1)
@@ -288,6 +304,8 @@ def test_histogram_bins_add_up_to_the_window() -> None:
     spikes = np.rint(responses.rate_hz * 0.008 * 10).sum()
     assert histogram.count[inside].sum() == spikes
     assert np.mean(histogram.rate_hz[inside]) == pytest.approx(responses.rate_hz.mean())
+    wider = post_stimulus_histogram(source, -20, 50, 2)
+    np.testing.assert_allclose(wider.rate_hz, histogram.rate_hz.reshape(-1, 2).mean(axis=1))
     with pytest.raises(InvalidArgument, match="bin_ms"):
         post_stimulus_histogram(source, bin_ms=0)
     with pytest.raises(InvalidArgument, match="from_ms"):
