@@ -256,7 +256,6 @@ def _with_stimuli(
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]
     presented = np.repeat(of, np.diff(last, prepend=-1))
-    presented[last] = NO_CONDITION  # Leaves the pulses before the last one.
     described = []
     for i, condition in enumerate(conditions):
         rows = last[of == i]
@@ -266,9 +265,9 @@ def _with_stimuli(
         if electrodes == ():
             sets = {frozenset(row) - {UNKNOWN} for row in stimuli.electrodes[rows].tolist()}
             electrodes = () if frozenset() in sets else tuple(sorted(tuple(sorted(one)) for one in sets))
-        before = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
+        delivered = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
         ours = {frozenset(one) - {NOTHING} for one in electrodes or ()}
-        only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in before)
+        only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in delivered)
         described.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
     return Assignment(index, tuple(described))
 
