@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -537,7 +538,7 @@ def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> 
     )
 
 
-def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False) -> Path:
+def write_trials(path: Path, electrodes: list[Any] | None, stimuli: bool = False) -> Path:
     import pynwb
 
     start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
@@ -586,9 +587,14 @@ def test_tables_that_may_be_stimuli_are_listed_if_none_is_named_like_stimuli(tmp
         (["7", "7 9", ""], [[7, -1], [7, 9], [-1, -1]]),
         (["7,9", "8", "9"], [[7, 9], [8, -1], [9, -1]]),
         (["7", "north", "9"], [[-1], [-1], [-1]]),
+        ([7, -1, 9], [[7], [-1], [9]]),
+        ([[7, 9], [8, -1], [9, 7]], [[7, 9], [8, -1], [9, 7]]),
+        ([7, -5, 9], [[7], [-1], [9]]),
     ],
 )
-def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
+def test_electrodes_of_each_stimulus_are_read_as_in_csv(
+    words: list[Any], read: list[list[int]], tmp_path: Path
+) -> None:
     recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
     assert recording.stimuli.electrodes.tolist() == read
     left_out = found(recording).get("columns-left-out", "")
