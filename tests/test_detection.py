@@ -279,6 +279,20 @@ def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
     assert 5.0 <= cleaned.longest_ms[0] <= 5.5
 
 
+def test_a_blank_is_a_straight_line_between_its_sides() -> None:
+    trace = np.zeros((2, 4000), np.float32)
+    trace[1, 2000:] = 50.0
+    settings = Detection(blank_ms=(0.5, 1.5))
+    # Far from rest only by half of the noise: nothing to fit.
+    cleaned = without_artefacts(trace, np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, settings)
+    assert np.flatnonzero(cleaned.is_blank[1]).tolist() == list(range(1990, 2030))
+    line_uv = np.interp(np.arange(4000), [1989, 2030], [0.0, 50.0])
+    np.testing.assert_allclose(cleaned.voltage_uv, [np.zeros(4000), line_uv], atol=1e-3)
+    none = Detection(blank_ms=(0.0, 0.0))
+    unchanged = without_artefacts(trace.copy(), np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, none)
+    assert np.array_equal(unchanged.voltage_uv, trace) and not unchanged.is_blank.any()
+
+
 @pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("step_uv", [0.195, 6.3, 12.6])
 def test_the_negative_peak_of_a_spike_in_coarse_steps_is_no_saturation(amplitude: float, step_uv: float) -> None:
