@@ -14,6 +14,7 @@ import pytest
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
+from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
@@ -107,6 +108,48 @@ def test_maxwell_only_recorded_channels_count_and_spikes_elsewhere_are_counted(t
     assert recording.channels.label.tolist() == ["3", "9"]
     assert recording.spike_times_s.tolist() == [0.5]
     assert "2 of 3 spikes are on channels without a routed electrode" in found(recording)["spikes-not-routed"]
+
+
+def test_maxwell_frames_that_are_missing_are_counted_and_the_clock_starts_with_the_first(tmp_path: Path) -> None:
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5], [9]), recorded=[9])
+    with h5py.File(path, "r+") as file:
+        groups = file["wells/well000/rec0000/groups"]
+        whole = groups["routed/frame_nos"][:]
+        del groups["routed/frame_nos"]
+        groups["routed/frame_nos"] = np.delete(whole, np.s_[100:400])
+        groups["shorter/channels"], groups["shorter/frame_nos"] = np.array([3], "<u4"), whole[50:1000]
+    recording = read_recording(path)
+    assert (recording.spike_times_s.tolist(), recording.start_s, recording.duration_s) == ([0.5], 0.0, 10.0)
+    (lost,) = (each for each in recording.findings if each.name == "frames-lost")
+    assert (lost.value, lost.severity) == (300.0, "warning") and lost.message.startswith("300 frames (0.015 s) are")
+
+
+def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_path: Path) -> None:
+    for words, pattern in (("frequency 5", [3, 8, 3]), ("pattern 1", [1, 1, 1])):
+        events = event_table([0.1, 0.2, 0.3], [words] * 3)
+        events["eventid"] = [3, 8, 3]
+        given = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
+        recording = read_recording(write_maxwell(tmp_path / f"{words}.h5", **given))
+        assert recording.stimuli.pattern.tolist() == pattern
+        assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
+
+
+def test_what_is_in_the_text_of_some_pulses_only_is_not_guessed() -> None:
+    def columns(*pulses: dict[str, Any]) -> dict[str, Any]:
+        read = stimulus_columns([json.dumps(pulse) for pulse in pulses])
+        return {name: value if isinstance(value, str | int) else value.tolist() for name, value in read.items()}
+
+    # A trial ends where its number changes.
+    assert columns({"presentation": 7}, {"presentation": 3}, {"presentation": 3}) == {
+        "stimulus_presentation": [0, 1, 1]
+    }
+    assert columns({"presentation": 7}, {}, {"presentation": 3}) == {}
+    assert columns({"presentation": 7}, {"presentation": 7}) == {}
+    assert columns({"pattern": 2.5}, {"pattern": 3}) == {"stimulus_pattern": [UNKNOWN, 3]}
+    # Of several pulses it must be known which are a trial.
+    trials = [{"order": "mixed", "pulses": pulses} for pulses in (1, 5)]
+    assert columns(trials[0], trials[0]) == {"presentation_order": "mixed", "presentation_pulses": 1}
+    assert columns(trials[1], trials[1]) == columns(*trials) == columns() == {}
 
 
 def test_maxwell_is_read_without_groups_or_mapping(tmp_path: Path) -> None:
