@@ -14,6 +14,7 @@ import pytest
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
+from animat.recordings.formats.cl1_layout import SITES
 from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
@@ -128,7 +129,7 @@ def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_pat
     for words, pattern in (("frequency 5", [3, 8, 3]), ("pattern 1", [1, 1, 1])):
         events = event_table([0.1, 0.2, 0.3], [words] * 3)
         events["eventid"] = [3, 8, 3]
-        given = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
+        given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
         recording = read_recording(write_maxwell(tmp_path / f"{words}.h5", **given))
         assert recording.stimuli.pattern.tolist() == pattern
         assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
@@ -263,6 +264,17 @@ def test_cl1_ground_and_reference_count_neither_in_files_nor_in_animats_own_reco
     assert recording.channels.electrode[recording.spike_channels].tolist() == [1, 62]
     said = found(recording)["spikes-not-on-electrodes"]
     assert said.startswith("4 of 6 spikes are on channels 0 (ground), 4 (reference), 63 (ground)")
+
+
+def test_cl1_channels_are_as_many_as_the_file_says_or_have_spikes(tmp_path: Path) -> None:
+    path = write_cl1(tmp_path / "a.h5", spikes=[(5, 1), (9, 30)], stims=[(7, 2)])
+    for stated, channels in ((32, range(32)), (20, range(31)), (0, SITES), (10**6, SITES)):
+        with h5py.File(path, "r+") as file:
+            file.attrs["channel_count"] = stated
+        recording = read_recording(path)
+        assert recording.channels.electrode.tolist() == list(channels)
+        assert recording.channels.electrode[recording.spike_channels].tolist() == [1, 30]
+        assert ("channel-count-missing" in found(recording)) == (channels is SITES)
 
 
 def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
