@@ -172,6 +172,14 @@ def test_the_noise_is_estimated_from_the_median(samples: int) -> None:
     expected = np.median(np.abs(looked_at - middle), axis=1) / 0.6745
     # Of an even number of values, the upper of the two middle ones instead of their mean.
     np.testing.assert_allclose(median_noise_uv(voltage), expected, rtol=1e-6 if looked_at.shape[1] % 2 else 2e-3)
+    # What is blanked does not count, whatever is in it, and 9 % of the samples are too few.
+    is_blank = np.arange(samples) >= samples * np.array([[0.9], [0.2], [0.11], [0.09]])
+    of_each = [
+        np.median(np.abs(row[~blank] - np.median(row[~blank]))) for row, blank in zip(voltage, is_blank, strict=True)
+    ]
+    voltage[is_blank] = 1000.0
+    np.testing.assert_allclose(median_noise_uv(voltage, is_blank)[:3], np.array(of_each[:3]) / 0.6745, rtol=0.03)
+    assert np.isnan(median_noise_uv(voltage, is_blank)[3])
 
 
 # --- artefacts -------------------------------------------------------------------------------------------------------
@@ -269,6 +277,20 @@ def test_a_saturated_channel_is_blanked_until_it_moves_again() -> None:
     assert not cleaned.is_blank[0, 2030:].any()
     assert (cleaned.saturated.tolist(), np.abs(cleaned.voltage_uv[1]).max() < 100) == ([1], True)
     assert 5.0 <= cleaned.longest_ms[0] <= 5.5
+
+
+def test_a_blank_is_a_straight_line_between_its_sides() -> None:
+    trace = np.zeros((2, 4000), np.float32)
+    trace[1, 2000:] = 50.0
+    settings = Detection(blank_ms=(0.5, 1.5))
+    # Far from rest only by half of the noise: nothing to fit.
+    cleaned = without_artefacts(trace, np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, settings)
+    assert np.flatnonzero(cleaned.is_blank[1]).tolist() == list(range(1990, 2030))
+    line_uv = np.interp(np.arange(4000), [1989, 2030], [0.0, 50.0])
+    np.testing.assert_allclose(cleaned.voltage_uv, [np.zeros(4000), line_uv], atol=1e-3)
+    none = Detection(blank_ms=(0.0, 0.0))
+    unchanged = without_artefacts(trace.copy(), np.array([2000]), np.full(2, 100.0, np.float32), RATE_HZ, none)
+    assert np.array_equal(unchanged.voltage_uv, trace) and not unchanged.is_blank.any()
 
 
 @pytest.mark.parametrize("amplitude", [1.0, 2.0, 5.0])
@@ -382,8 +404,20 @@ def test_who_is_saturated_over_several_pulses_is_blanked_wherever_pieces_begin(f
     assert np.count_nonzero(np.abs(on_it[:, None] - truth[1][None, :]).min(axis=1) > 10) <= 1
 
 
+def test_channels_are_counted_once_at_each_pulse_wherever_pieces_begin() -> None:
+    voltage, _ = noisy(2, 0.7)
+    pulses = np.arange(0.2, 0.68, 0.0125)
+    for start in np.rint(pulses * RATE_HZ).astype(int):
+        voltage[start : start + 50, 0] = 32_000
+    source = RawTraces.from_array(voltage, channels(2), RATE_HZ, uv_per_step=0.1)
+    found = detect_spikes(source, pulses, Detection(chunk_s=0.1))
+    assert {finding.name: finding.value for finding in found.findings}["saturated-channels"] == 0.5
+
+
 def test_an_amplifier_that_is_mostly_saturated_is_blanked_wherever_pieces_begin() -> None:
     voltage, truth = noisy(4, 20.0)
+    # At rest it is at -2 mV, which is as far from 0 as what it saturates at.
+    voltage -= 20_000
     pulses = np.arange(1.03, 19.0, 0.2)
     is_railed = np.zeros(len(voltage), dtype=bool)
     for start_s in pulses[2:30:5]:

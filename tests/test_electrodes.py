@@ -76,17 +76,19 @@ def test_recording_sites_pass_the_threshold_and_have_the_highest_rates() -> None
 
 def test_with_a_spacing_the_best_neighbour_is_kept() -> None:
     scan = scanned(SMALL)
-    rule = SelectionRule(**(vars(RULE) | {"spacing_um": 30.0, "signal_to_noise": 4.0}))
-    selection = select_electrodes(SMALL, scan, rule)
     ratio = scan.signal_to_noise
     distance_um = SMALL.distance_um(scan.electrode, scan.electrode)
-    best = [e for e in range(200) if ratio[e] >= 4 and ratio[e] == ratio[distance_um[e] <= 30.0].max()]
-    assert selection.passed == len(best)
-    assert set(selection.recording.tolist()) <= set(best)
+    # Electrodes are 20 um apart: the four nearest, with the diagonal ones, and those within two rows or columns.
+    for spacing_um in (20.0, 30.0, 45.0):
+        few = {"spacing_um": spacing_um, "signal_to_noise": 4.0, "stimulation_sites": 1, "patterns": 1}
+        rule = SelectionRule(**(vars(RULE) | few | {"pattern_size": 1, "recording_sites": 60}))
+        selection = select_electrodes(SMALL, scan, rule)
+        best = [e for e in range(200) if ratio[e] >= 4 and ratio[e] == ratio[distance_um[e] <= spacing_um].max()]
+        assert selection.passed == len(best)
+        assert selection.recording.tolist() == best
     tie = scanned(SMALL, amplitude_uv=np.full(200, 50.0))
-    few = SelectionRule(**(vars(rule) | {"stimulation_sites": 1, "patterns": 1, "pattern_size": 1}))
     # All alike: the first number stays, its neighbours go.
-    assert select_electrodes(SMALL, tie, few).passed == 1
+    assert select_electrodes(SMALL, tie, rule).recording.tolist() == [0]
 
 
 def test_stimulation_sites_are_large_and_look_excitatory() -> None:
@@ -105,6 +107,12 @@ def test_the_excitatory_score_is_soft() -> None:
     assert score[0] < 0.03
     assert score[-1] > 0.97
     assert score[np.argmin(np.abs(times - 0.35))] == pytest.approx(0.5, abs=0.05)
+    # 0.1 ms more than 0.35 ms is two of its widths of 0.05 ms, and 0.15 ms one and a half of 0.1 ms.
+    longer = scanned(SMALL, trough_to_peak_ms=np.full(n, 0.45), recovery_ms=np.full(n, 0.5))
+    np.testing.assert_allclose(longer.excitatory_score, 1 / (1 + math.exp(-(2 + 1.5) / 2)))
+    noise_uv = np.resize([0.5, 0.0, 4.0], n)
+    quiet = scanned(SMALL, amplitude_uv=np.full(n, 30.0), noise_uv=noise_uv)
+    assert quiet.signal_to_noise[:3].tolist() == [60, 0, 7.5]
     silent = scanned(SMALL, amplitude_uv=np.full(n, np.nan), trough_to_peak_ms=np.full(n, np.nan))
     assert not np.any(silent.excitatory_score)
     assert not np.any(silent.signal_to_noise)
@@ -188,7 +196,11 @@ def test_a_selection_is_saved_and_read(tmp_path: Path) -> None:
         (tmp_path / "bad.json").write_text(content)
         with pytest.raises(InvalidFile, match=r"bad.json: selection(\.\w+)?: expected"):
             Selection.load(tmp_path / "bad.json")
+    first, second = selection.stimulation[:2].tolist()
+    silent = next(electrode for electrode in range(200) if electrode not in selection.stimulation)
     for name, value, words in (
+        ("patterns", [[first, silent]], f"selection.patterns: expected stimulation sites only, got electrode {silent}"),
+        ("patterns", [[first], [first, second]], "selection.patterns: expected the same number of electrodes in each"),
         ("stimulation", [1, 1], "selection.stimulation: expected each electrode once"),
         ("patterns", [[7, 900]], "electrode: expected numbers from 0 to 199"),
         ("recording", [-5], "selection.recording: expected at least 0"),

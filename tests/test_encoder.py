@@ -55,6 +55,9 @@ def test_a_condition_describes_its_stimuli_in_the_recording() -> None:
         ("10 Hz", (10.0,), None, False),
     ]
     assert description(ByInterval((10.0,)).assign(stimuli).conditions) == [("10 Hz", (10.0,), None, False)]
+    # Where the frequency of some is not known, none is stated.
+    some = table([5, np.nan, 10], [[2, 1], [1, 2], [3, 4, 5]])
+    assert [each.frequencies_hz for each in ByPattern().assign(some).conditions] == [(), (10.0,)]
     assert description(All().assign(stimuli).conditions) == [("all", (5.0, 10.0), None, False)]
 
 

@@ -275,6 +275,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a pulse without order": ({"presentation_pulses": 1}, "presentation_order: expected 'blocked' or 'mixed'"),
     "pulses without order": ({"presentation_pulses": 5}, "stimulus_presentation: required to know which 5"),
+    "half a pulse": ({"presentation_pulses": 2.5}, "presentation_pulses: expected a whole number, got 2.5"),
     "unknown order": ({"presentation_order": "shuffled"}, "order: expected 'blocked' or 'mixed', got 'shuffled'"),
     "order as a number": ({"presentation_order": 1}, "presentation_order: expected text, got 1"),
     "a rate as text": ({"sampling_rate_hz": "fast"}, "sampling_rate_hz: expected a number, got 'fast'"),
@@ -409,11 +410,12 @@ def test_spikes_without_stimuli_are_read_and_reported(tmp_path: Path) -> None:
 
 def test_unusual_headers_and_decimal_commas_are_read_and_reported(tmp_path: Path) -> None:
     spikes = "Time (s); CHANNEL;\n0,0031;17;\n1,5;21;\n;;\n"
-    recording = read_recording(csv(tmp_path, spikes, "Time [s]\tFrequency-Hz\n0,25\t5\n0,5\t12,5\n"))
+    recording = read_recording(csv(tmp_path, spikes, "Time [s]\tFrequency-Hz\n0,25\t5\n0,5\t12,5\n0,75\t\n"))
     assert recording.spike_times_s.tolist() == [0.0031, 1.5]
     assert recording.channels.label.tolist() == ["17", "21"]
-    assert recording.stimuli.time_s.tolist() == [0.25, 0.5]
-    assert recording.stimuli.frequency_hz.tolist() == [5.0, 12.5]
+    assert recording.stimuli.time_s.tolist() == [0.25, 0.5, 0.75]
+    np.testing.assert_array_equal(recording.stimuli.frequency_hz, [5.0, 12.5, np.nan])
+    assert recording.provenance["stimuli"] == "a_stimuli.csv"
     read_as = said(recording)["headers-read-as"]
     assert "'Time (s)' of a_spikes.csv is read as time_s" in read_as
     assert "'Frequency-Hz' of a_stimuli.csv is read as frequency_hz" in read_as

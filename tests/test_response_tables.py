@@ -71,11 +71,18 @@ def test_a_table_has_the_responses_of_the_recording_that_it_was_counted_in(
     np.testing.assert_array_equal(ours.active_ratio[:n], theirs.active_ratio)
     np.testing.assert_array_equal(ours.condition[:n], theirs.condition)
     np.testing.assert_array_equal(ours.last_hz[1:n] == 0, theirs.last_hz[1:] == 0)
+    by_times = [
+        extract_responses(source, ByInterval((10.0, 40.0)), window_ms).condition for source in (table, recording)
+    ]
+    assert set(by_times[1].tolist()) == {0, 1}
+    np.testing.assert_array_equal(by_times[0][: len(by_times[1])], by_times[1])
     assert (ours.by, ours.burst_threshold) == (theirs.by, theirs.burst_threshold)
     assert [c.label for c in ours.conditions] == [c.label for c in theirs.conditions]
     assert (ours.window_ms, ours.start_min, ours.n_channels) == (window_ms, 20.0, 24)
     names = {f.name: f.severity for f in ours.findings}
     assert names["spike-times-unknown"] == "warning"
+    n_missing = np.count_nonzero(np.delete(values, 5, axis=1) == 0) if form == "long" else 0
+    assert sum(f.value or 0 for f in table.findings if f.name == "pairs-missing") == n_missing
     assert not {"dead-window", "response-time", "artefact-spikes", "window-assumed"} & set(names)
 
 
@@ -184,13 +191,19 @@ def test_a_bad_table_is_refused_in_one_line_that_names_the_file(case: str, tmp_p
     [
         ("response_window_ms", ["two", "ten"], r"response_window_ms: expected start and end in ms, got <U3 \(2,\)"),
         ("response_window_ms", [2j, 10], r"response_window_ms: expected start and end in ms, got complex128 \(2,\)"),
+        ("response_window_ms", [2, 5, 10], r"response_window_ms: expected start and end in ms, got int64 \(3,\)"),
+        (
+            "response_count",
+            [1, 0],
+            r"response_count: expected numbers of shape \(stimuli, channels\), got int64 \(2,\)",
+        ),
         ("stimulus_time_s", 1.0, r"stimulus_time_s: expected one column of times in seconds, got shape \(\)"),
     ],
 )
 def test_a_bad_npz_table_is_refused_by_the_name_of_its_key(
     key: str, value: object, message: str, tmp_path: Path
 ) -> None:
-    np.savez(tmp_path / "a.npz", response_count=[[1, 0], [0, 0]], **{key: value})
+    np.savez(tmp_path / "a.npz", **{"response_count": [[1, 0], [0, 0]], key: value})  # type: ignore[arg-type]
     with pytest.raises(InvalidFile, match=rf"a\.npz: {message}"):
         read_source(tmp_path / "a.npz")
 

@@ -92,6 +92,25 @@ def test_a_response_is_read_after_the_last_pulse_of_its_presentation() -> None:
     assert responses.presentation == Presentation("mixed", 2)
 
 
+def test_trials_are_kept_with_bursts_and_rests_also_where_they_have_no_condition() -> None:
+    # Times are sums of powers of two. A second without a pulse is not yet a rest, and a trial's own pulses are none.
+    pulses_s, trials = [1, 1.125, 2.125, 3.1875, 4.0, 4.75, 5.5], [0, 0, 1, 2, 3, 3, 3]
+    spikes = [(t + 0.005, channel) for t, n in ((1.125, 1), (2.125, 2), (5.5, 1)) for channel in range(n)]
+    given = recording(spikes, pulses_s, frequency_hz=[5, 5, np.nan, 5, 5, 5, 5], presentation=trials)
+    responses = extract_responses(given, burst_threshold=0.25)
+    presented, place = responses.presentations
+    assert presented.condition.tolist() == [0, -1, 0, 0] and place.tolist() == [0, 2, 3]
+    assert presented.is_rested.tolist() == [True, False, True, False]
+    assert presented.is_burst.tolist() == [False, True, False, False]
+
+
+def test_a_window_that_ends_with_the_recording_counts_however_times_are_rounded() -> None:
+    assert 1.12 + 0.01 > 1.13
+    for duration_s, n in ((1.13, 2), (1.13 - 2e-9, 1)):
+        responses = extract_responses(recording([(1.125, 0)], [0.5, 1.12], duration_s=duration_s))
+        assert responses.rate_hz.tolist() == pytest.approx([0, 31.25][:n])
+
+
 def test_the_median_and_the_shares_above_it() -> None:
     responses = Responses(
         condition=np.array([0, 0, 0, 1, 1, 1]),
@@ -130,6 +149,8 @@ def test_a_window_that_is_none_is_refused(window_ms: tuple[float, float]) -> Non
 def test_a_window_may_be_a_list_or_an_array() -> None:
     for window_ms in ([2, 10], np.array([2.0, 10.0])):
         assert extract_responses(recording([], [1]), window_ms=window_ms).window_ms == (2.0, 10.0)  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match="window_ms: expected two numbers of milliseconds, start and end, got"):
+        extract_responses(recording([], [1]), window_ms=(2, 10, 20))  # type: ignore[arg-type]
 
 
 def test_a_recording_without_channels_is_refused() -> None:
@@ -247,6 +268,33 @@ def test_a_response_put_into_poisson_spikes_is_found() -> None:
     assert f"use --window-ms {found.start_ms:g} {found.end_ms:g}" in outside.message
 
 
+def test_a_response_of_few_spikes_is_found_in_wider_bins() -> None:
+    rng = np.random.default_rng(4)
+    plain = poisson(rng, rate_hz=0.2, n_channels=50, duration_s=100)
+    stimulus_s = plain.stimuli.time_s[::2]
+    # 10 spikes a second are 10 in each bin of 5 ms, and one after each of 198 stimuli makes 33 more in six bins.
+    evoked = np.column_stack([stimulus_s + rng.uniform(0.022, 0.052, len(stimulus_s)), np.zeros(len(stimulus_s))])
+    spikes = np.vstack([np.column_stack([plain.spike_times_s, plain.spike_channels]), evoked])
+    found = find_response(recording(spikes, stimulus_s, 50, 100))
+    assert found is not None and (found.start_ms, found.end_ms) == (22, 52)
+
+
+def test_responses_are_sought_after_pulses_that_no_other_follows_soon() -> None:
+    rng = np.random.default_rng(5)
+    first_s = np.arange(1.0, 41.0)
+    spikes_s = np.sort(rng.uniform(0, 42, 250 * 42))
+    # Pulses in pairs 0.1 s apart: the first of each evokes spikes after 5 ms, the second after 30 ms.
+    evoked_s = [first_s + lag_s for lag_s in (*rng.uniform(0.005, 0.015, 15), *rng.uniform(0.130, 0.140, 15))]
+    every_s = np.concatenate([spikes_s, *evoked_s])
+    spikes = np.column_stack([every_s, rng.integers(0, 50, len(every_s))])
+    pairs_s = np.sort(np.concatenate([first_s, first_s + 0.1]))
+    found = find_response(recording(spikes, pairs_s, 50, 42))
+    assert found is not None and (found.start_ms, found.end_ms) == pytest.approx((30, 40), abs=1.5)
+    # There is no time for a response between most pulses of these trains.
+    trains_s = (first_s[:15, None] + 0.004 * np.arange(10)).ravel()
+    assert find_response(recording(spikes, trains_s, 50, 42)) is None
+
+
 def test_histogram_bins_add_up_to_the_window() -> None:
     source = poisson(np.random.default_rng(3), 20, 10, 20)
     histogram = post_stimulus_histogram(source, -20, 50, 1)
@@ -256,6 +304,8 @@ def test_histogram_bins_add_up_to_the_window() -> None:
     spikes = np.rint(responses.rate_hz * 0.008 * 10).sum()
     assert histogram.count[inside].sum() == spikes
     assert np.mean(histogram.rate_hz[inside]) == pytest.approx(responses.rate_hz.mean())
+    wider = post_stimulus_histogram(source, -20, 50, 2)
+    np.testing.assert_allclose(wider.rate_hz, histogram.rate_hz.reshape(-1, 2).mean(axis=1))
     with pytest.raises(InvalidArgument, match="bin_ms"):
         post_stimulus_histogram(source, bin_ms=0)
     with pytest.raises(InvalidArgument, match="from_ms"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 from animat.cultures.devices.cl1 import CL1Culture
 from animat.errors import InvalidArgument, InvalidFile
 from animat.recordings.conversion import read_traces
+from animat.recordings.formats.cl1_layout import SITES
+from animat.recordings.formats.stimulus_text import stimulus_columns
 from animat.recordings.formats.traces import open_traces
 from animat.recordings.quality import recording_findings
 from animat.recordings.reading import read_recording
@@ -106,6 +109,48 @@ def test_maxwell_only_recorded_channels_count_and_spikes_elsewhere_are_counted(t
     assert recording.channels.label.tolist() == ["3", "9"]
     assert recording.spike_times_s.tolist() == [0.5]
     assert "2 of 3 spikes are on channels without a routed electrode" in found(recording)["spikes-not-routed"]
+
+
+def test_maxwell_frames_that_are_missing_are_counted_and_the_clock_starts_with_the_first(tmp_path: Path) -> None:
+    path = write_maxwell(tmp_path / "a.h5", mapping=TABLE, spikes=spike_table([0.5], [9]), recorded=[9])
+    with h5py.File(path, "r+") as file:
+        groups = file["wells/well000/rec0000/groups"]
+        whole = groups["routed/frame_nos"][:]
+        del groups["routed/frame_nos"]
+        groups["routed/frame_nos"] = np.delete(whole, np.s_[100:400])
+        groups["shorter/channels"], groups["shorter/frame_nos"] = np.array([3], "<u4"), whole[50:1000]
+    recording = read_recording(path)
+    assert (recording.spike_times_s.tolist(), recording.start_s, recording.duration_s) == ([0.5], 0.0, 10.0)
+    (lost,) = (each for each in recording.findings if each.name == "frames-lost")
+    assert (lost.value, lost.severity) == (300.0, "warning") and lost.message.startswith("300 frames (0.015 s) are")
+
+
+def test_maxwell_events_without_patterns_in_their_text_have_their_number(tmp_path: Path) -> None:
+    for words, pattern in (("frequency 5", [3, 8, 3]), ("pattern 1", [1, 1, 1])):
+        events = event_table([0.1, 0.2, 0.3], [words] * 3)
+        events["eventid"] = [3, 8, 3]
+        given: dict[str, Any] = {"mapping": TABLE, "spikes": spike_table([0.5], [9]), "events": events, "recorded": [9]}
+        recording = read_recording(write_maxwell(tmp_path / f"{words}.h5", **given))
+        assert recording.stimuli.pattern.tolist() == pattern
+        assert ("stimulus_pattern" in recording.provenance) == (words == "frequency 5")
+
+
+def test_what_is_in_the_text_of_some_pulses_only_is_not_guessed() -> None:
+    def columns(*pulses: dict[str, Any]) -> dict[str, Any]:
+        read = stimulus_columns([json.dumps(pulse) for pulse in pulses])
+        return {name: value if isinstance(value, str | int) else value.tolist() for name, value in read.items()}
+
+    # A trial ends where its number changes.
+    assert columns({"presentation": 7}, {"presentation": 3}, {"presentation": 3}) == {
+        "stimulus_presentation": [0, 1, 1]
+    }
+    assert columns({"presentation": 7}, {}, {"presentation": 3}) == {}
+    assert columns({"presentation": 7}, {"presentation": 7}) == {}
+    assert columns({"pattern": 2.5}, {"pattern": 3}) == {"stimulus_pattern": [UNKNOWN, 3]}
+    # Of several pulses it must be known which are a trial.
+    trials = [{"order": "mixed", "pulses": pulses} for pulses in (1, 5)]
+    assert columns(trials[0], trials[0]) == {"presentation_order": "mixed", "presentation_pulses": 1}
+    assert columns(trials[1], trials[1]) == columns(*trials) == columns() == {}
 
 
 def test_maxwell_is_read_without_groups_or_mapping(tmp_path: Path) -> None:
@@ -219,6 +264,17 @@ def test_cl1_ground_and_reference_count_neither_in_files_nor_in_animats_own_reco
     assert recording.channels.electrode[recording.spike_channels].tolist() == [1, 62]
     said = found(recording)["spikes-not-on-electrodes"]
     assert said.startswith("4 of 6 spikes are on channels 0 (ground), 4 (reference), 63 (ground)")
+
+
+def test_cl1_channels_are_as_many_as_the_file_says_or_have_spikes(tmp_path: Path) -> None:
+    path = write_cl1(tmp_path / "a.h5", spikes=[(5, 1), (9, 30)], stims=[(7, 2)])
+    for stated, channels in ((32, range(32)), (20, range(31)), (0, SITES), (10**6, SITES)):
+        with h5py.File(path, "r+") as file:
+            file.attrs["channel_count"] = stated
+        recording = read_recording(path)
+        assert recording.channels.electrode.tolist() == list(channels)
+        assert recording.channels.electrode[recording.spike_channels].tolist() == [1, 30]
+        assert ("channel-count-missing" in found(recording)) == (channels is SITES)
 
 
 def test_cl1_without_stream_stimuli_or_spikes(tmp_path: Path) -> None:
@@ -537,7 +593,7 @@ def test_units_of_other_nwb_are_out_of_order_only_within_one(tmp_path: Path) -> 
     )
 
 
-def write_trials(path: Path, electrodes: list[str] | None, stimuli: bool = False) -> Path:
+def write_trials(path: Path, electrodes: list[Any] | None, stimuli: bool = False) -> Path:
     import pynwb
 
     start = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC)
@@ -586,9 +642,14 @@ def test_tables_that_may_be_stimuli_are_listed_if_none_is_named_like_stimuli(tmp
         (["7", "7 9", ""], [[7, -1], [7, 9], [-1, -1]]),
         (["7,9", "8", "9"], [[7, 9], [8, -1], [9, -1]]),
         (["7", "north", "9"], [[-1], [-1], [-1]]),
+        ([7, -1, 9], [[7], [-1], [9]]),
+        ([[7, 9], [8, -1], [9, 7]], [[7, 9], [8, -1], [9, 7]]),
+        ([7, -5, 9], [[7], [-1], [9]]),
     ],
 )
-def test_electrodes_as_text_are_read_as_in_csv(words: list[str], read: list[list[int]], tmp_path: Path) -> None:
+def test_electrodes_of_each_stimulus_are_read_as_in_csv(
+    words: list[Any], read: list[list[int]], tmp_path: Path
+) -> None:
     recording = read_recording(write_trials(tmp_path / "a.nwb", words, stimuli=True))
     assert recording.stimuli.electrodes.tolist() == read
     left_out = found(recording).get("columns-left-out", "")

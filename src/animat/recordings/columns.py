@@ -255,7 +255,7 @@ def _in_time(
 
 def count_out_of_order(times_s: Float64[np.ndarray, " events"]) -> int:
     """How many times are earlier than any time listed before them, not only the one just before."""
-    return int(np.count_nonzero(times_s < np.maximum.accumulate(times_s))) if len(times_s) else 0
+    return int(np.count_nonzero(times_s < np.maximum.accumulate(times_s)))
 
 
 def unsorted_finding(events: str, early: int, n: int) -> Finding:

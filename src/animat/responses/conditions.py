@@ -94,7 +94,7 @@ class ByInterval(Conditions):
         if not self.values_hz:
             raise InvalidArgument("interval: expected at least one frequency in Hz, got none; write interval:5,10")
         _check_frequencies("interval", self.values_hz)
-        if not (math.isfinite(self.tolerance) and self.tolerance > 0):
+        if not 0 < self.tolerance < math.inf:
             raise InvalidArgument(f"interval: expected a tolerance above 0 %, got {100 * self.tolerance:g} %")
 
     def __str__(self) -> str:
@@ -256,7 +256,6 @@ def _with_stimuli(
     last = np.flatnonzero(stimuli.is_last_of_presentation)
     of = index[last]
     presented = np.repeat(of, np.diff(last, prepend=-1))
-    presented[last] = NO_CONDITION  # Leaves the pulses before the last one.
     described = []
     for i, condition in enumerate(conditions):
         rows = last[of == i]
@@ -266,9 +265,9 @@ def _with_stimuli(
         if electrodes == ():
             sets = {frozenset(row) - {UNKNOWN} for row in stimuli.electrodes[rows].tolist()}
             electrodes = () if frozenset() in sets else tuple(sorted(tuple(sorted(one)) for one in sets))
-        before = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
+        delivered = np.unique(stimuli.electrodes[presented == i], axis=0).tolist() if electrodes else []
         ours = {frozenset(one) - {NOTHING} for one in electrodes or ()}
-        only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in before)
+        only_last = any(frozenset(row) - {UNKNOWN} not in ours for row in delivered)
         described.append(replace(condition, frequencies_hz=known_hz, electrodes=electrodes, only_last=only_last))
     return Assignment(index, tuple(described))
 
@@ -279,7 +278,7 @@ def _frequency(value_hz: float) -> Condition:
 
 def _check_frequencies(name: str, values_hz: tuple[float, ...]) -> None:
     for value_hz in values_hz:
-        if not (math.isfinite(value_hz) and value_hz > 0):
+        if not 0 < value_hz < math.inf:
             raise InvalidArgument(f"{name}: expected positive frequencies in Hz, got {value_hz:g}")
     # Those that differ by rounding only are the same condition.
     if len(distinct(np.array(values_hz, np.float64))) < len(values_hz):

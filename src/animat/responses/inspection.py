@@ -18,7 +18,7 @@ from animat.responses.extraction import extract_responses
 from animat.responses.network_bursts import NetworkBursts, find_network_bursts
 from animat.responses.psth import ResponseTime, find_response, spontaneous_rate
 from animat.responses.responses import Responses
-from animat.responses.windows import DEFAULT_WINDOW_MS, count_spikes
+from animat.responses.windows import DEFAULT_WINDOW_MS
 from animat.tables import briefly
 
 Verdict = Literal["usable", "usable with care", "not usable"]
@@ -156,22 +156,18 @@ def inspect_recording(
         Mismatch: for a window that differs from a table's.
     """
     responses = extract_responses(recording, by, window_ms, burst_threshold)
-    stimuli, read = recording.stimuli, recording.stimuli.is_last_of_presentation
+    stimuli, (presented, _) = recording.stimuli, responses.presentations
+    # Of all channels in one window.
+    window_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3 * responses.n_channels
     bursts = response = None
     rate_hz = duration_s = math.nan
     if isinstance(recording, ResponseTable):
         # What takes times of spikes is not known.
-        kind, is_counted = "table", recording.kind == "count"
-        n_spikes = int(recording.values.sum()) if is_counted else None
-        width_s = (responses.window_ms[1] - responses.window_ms[0]) * 1e-3
-        spikes = recording.values[read].sum(axis=1) * (1.0 if is_counted else width_s)
+        kind, n_spikes = "table", int(recording.values.sum()) if recording.kind == "count" else None
         if recording.has_times and len(stimuli):
             duration_s = float(np.ptp(stimuli.time_s))
     else:
         kind, n_spikes, duration_s = "recording", len(recording.spike_times_s), recording.duration_s
-        times_s = stimuli.time_s[read]
-        times_s = times_s[times_s + window_ms[1] * 1e-3 <= recording.stop_s + 1e-9]
-        spikes = count_spikes(recording, times_s + window_ms[0] * 1e-3, times_s + window_ms[1] * 1e-3)
         rate_hz = spontaneous_rate(recording, after_ms=window_ms[1])[0] / len(recording.channels)
         if not len(stimuli):
             bursts = find_network_bursts(recording)
@@ -182,10 +178,10 @@ def inspect_recording(
         name=name or recording.provenance.get("source", kind),
         n_spikes=n_spikes,
         n_stimuli=len(stimuli),
-        n_trials=int(np.count_nonzero(read)),
+        n_trials=int(np.count_nonzero(stimuli.is_last_of_presentation)),
         duration_s=duration_s,
         by_default=by is None,
-        mean_spikes_per_stimulus=float(np.mean(spikes)) if len(spikes) else math.nan,
+        mean_spikes_per_stimulus=float(np.mean(presented.rate_hz)) * window_s if len(presented.rate_hz) else math.nan,
         spontaneous_rate_hz=rate_hz,
         response=response,
         responses=responses,

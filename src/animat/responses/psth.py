@@ -93,7 +93,7 @@ def spontaneous_rate(recording: Recording, after_ms: float = 0.0) -> tuple[float
         return math.nan, 0.0
     settled_s = np.concatenate([[recording.start_s], times_s[:-1] + max(_SETTLED_MS, after_ms) * 1e-3])
     to_s = times_s - _ARTEFACT_MS * 1e-3
-    from_s = np.maximum(np.maximum(settled_s, recording.start_s), to_s - _QUIET_MS * 1e-3)
+    from_s = np.maximum(settled_s, to_s - _QUIET_MS * 1e-3)
     quiet = to_s > from_s
     quiet_s = float(np.sum((to_s - from_s)[quiet]))
     n_spikes = int(count_spikes(recording, from_s[quiet], to_s[quiet]).sum())

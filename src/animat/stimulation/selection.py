@@ -163,7 +163,7 @@ def select_electrodes(
             raise InvalidArgument(f"{name}: expected 1 to {most} on the {array.name}, got {sites}")
     ratio = scan.signal_to_noise
     passed = np.flatnonzero((ratio >= rule.signal_to_noise) & (scan.rate_hz > 0))
-    if rule.spacing_um > 0 and len(passed):
+    if rule.spacing_um > 0:
         passed = passed[_is_best_nearby(array, scan.electrode[passed], ratio[passed], rule.spacing_um)]
     if len(passed) < rule.stimulation_sites:
         best = f"; the best ratio is {ratio.max():.1f}" if len(ratio) else ""

@@ -161,8 +161,6 @@ def _blank(
     For a channel that stays saturated beyond it (`is_held`), the line stays at the mean before.
     """
     for stop in np.unique(until).tolist():
-        if stop <= start:
-            continue
         chosen = np.flatnonzero(until == stop)
         sides = voltage_uv[chosen, max(start - 10, 0) : start], voltage_uv[chosen, stop : stop + 10]
         ends_uv = [side.mean(axis=1) for side in sides if side.shape[1]] or [np.zeros(len(chosen), np.float32)]

@@ -143,7 +143,7 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
             return None
     if dataset.dtype.kind not in "iu":
         return None
-    values = file.read(at).astype(np.int64)
+    values = np.maximum(file.read(at).astype(np.int64), UNKNOWN)
     if file.attribute(at, "neurodata_type") == "DynamicTableRegion":
         if (numbers := _electrodes_in_rows(file, at, values)) is None:
             return None
