@@ -437,6 +437,7 @@ def test_units_are_those_of_the_robot() -> None:
         ("avoid pole_angle above 1e999 rad", "finite"),
         ("reach pole_angle above 1 rad and pole_angle below 0 rad", "an empty region"),
         ("drive pole_angle outside 0..1 deg and pole_angle in 0.2..0.5 deg", "an empty region"),
+        ("drive pole_angle outside 0..1 deg and pole_angle in 0..1 deg", "an empty region"),
         ("avoid pole_angle above 1 rad weight 1e308", "weight: expected at most"),
         ("reach pole_angle, cart_position around 0, 0 radius 1 m", "expected a quantity in rad"),
         ("reach cart_position, cart_position around 0 radius 1 m", "a centre of 2 numbers"),
