@@ -142,9 +142,8 @@ def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_pat
 
 
 def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path: Path) -> None:
-    leftovers = [
-        tmp_path / name for name in (".p1.safetensors.ab.partial.safetensors", ".training.json.ab.partial.json")
-    ]
+    names = ("p1.safetensors", "training.json", "assessments.csv")
+    leftovers = [tmp_path / f".{name}.ab.partial{Path(name).suffix}" for name in names]
     for leftover in leftovers:
         leftover.write_bytes(b"half of it")
     # Another training may be writing this one just now.
