@@ -524,6 +524,16 @@ def test_networks_of_another_build_are_refused(tmp_path: Path) -> None:
     refused(resaved(tmp_path, {name: array.astype(np.float32) for name, array in empty.items()}), "three layers")
     refused(resaved(tmp_path, {"more": np.zeros(3, np.float32)}), "expected a policy's arrays", "more")
     refused(resaved(tmp_path, {"scales": np.full(4, 1e-40, np.float32)}), "scales")
+    for shape in ((5,), (2, 4), (1, 2, 5)):
+        refused(resaved(tmp_path, {"assessments": np.zeros(shape)}), "assessments: expected rows of five")
+
+
+def test_only_policies_with_neurons_see_their_history_state_which_numpy_may_say(tmp_path: Path) -> None:
+    seeing = {**layers(0, 6, 8, 8, 5), "scales": np.ones(6, np.float32), "neural_observation": np.True_}
+    replace(through_neurons(), **seeing).save(tmp_path / "p0.safetensors")
+    assert Policy.load(tmp_path / "p0.safetensors").neural_observation is True
+    with pytest.raises(InvalidArgument, match="neural_observation: expected only with a mapping, got no mapping"):
+        replace(two_forces(), **(seeing | layers(0, 6, 8, 8, 2)))
 
 
 def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:
