@@ -336,8 +336,14 @@ def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     assert study.minutes_of(study.arm("9 thresholds"), 0.0, 140.0) == {140.0: 100}
     assert study.minutes_of(study.arm("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
     assert study.optimum_minutes(0.0, 140.0) == [0.0, 140.0]
-    control = Arm("c", shadowing=False, delivery="shuffled")
-    assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
+    for other in (Arm("c", shadowing=False, delivery="shuffled"), Arm("c", shadowing=False, trained=False)):
+        assert study.minutes_of(other, 0.0, 140.0) == {140.0: 100}
+    # Of several comparisons at a minute, as many episodes as the longest takes.
+    arms = Arm("a", shadowing=False), Arm("b")
+    takes = {"first": (0.0, 30), "longest": (0.0, 300), "last": (140.0, 20), "shortest": (140.0, 10)}
+    compared = tuple(Compared(name, "a", "b", at_min=at, episodes=n) for name, (at, n) in takes.items())
+    several = Study(arms=arms, comparisons=compared, episodes=50)
+    assert [several.minutes_of(arm, 0.0, 140.0) for arm in arms] == [{0.0: 300, 140.0: 20}] * 2
 
 
 SCORED = Score(
