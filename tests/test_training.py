@@ -266,7 +266,15 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
         arrays = dict(kept)
     last = max((name for name in arrays if name.startswith("leaf")), key=lambda name: int(name[4:]))
     fewer = {name: array for name, array in arrays.items() if name != last}
-    for others in (fewer, arrays | {last: arrays[last][..., None]}, arrays | {"leaf0": arrays["leaf0"].astype(float)}):
+    of_another_version = (
+        fewer,
+        arrays | {last: arrays[last][..., None]},
+        arrays | {"leaf0": arrays["leaf0"].astype(float)},
+        arrays | {"done": arrays["done"] + 1},
+        arrays | {"done": 0 * arrays["done"], "curve": arrays["curve"][:0]},
+        arrays | {"curve": arrays["curve"][..., :-1]},
+    )
+    for others in of_another_version:
         np.savez(checkpoint, **others)
         with pytest.raises(InvalidFile, match=r"as this version of animat writes it, of .*: rm '"):
             train_group(group, checkpoint, stop, checkpoint_s=0.0)
