@@ -29,7 +29,9 @@ from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
+from animat.studies.figure_tables import write_paths
 from animat.studies.optima import FindOptima, read_optima
+from animat.studies.paths import Paths
 from animat.studies.pictures import _courses, _minutes_in_training
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
@@ -183,6 +185,21 @@ def test_means_and_errors_of_arms_and_controls_are_those_counted_by_hand(tmp_pat
     # Its controller misses the value by more than the grid's error; without a grid there is neither.
     errors = [_optimum_error(each) for each in (optimum, replace(optimum, monte_carlo=20.1), None)]
     assert errors == [5.0, 0.5, None] and _optimum_error(replace(optimum, grid_error=None)) is None
+
+
+@pytest.mark.parametrize(
+    ("shape", "heads", "cells"),
+    [((), ["command"], ["", "0.5", "-1.0"]), ((2,), ["command_1", "command_2"], [",", "0.5,-1.0", "0.25,0.0"])],
+)
+def test_paths_have_a_column_for_each_command(
+    tmp_path: Path, shape: tuple[int, ...], heads: list[str], cells: list[str]
+) -> None:
+    # The second episode has ended after one iteration; what follows is meaningless.
+    commands = np.resize([0.5, -1.0, 0.25, 0.0], (2, 2, *shape))
+    recorded = Paths(np.zeros((2, 3, 1)), commands, np.array([2, 1]))
+    lines = write_paths(tmp_path, "rover", ["x"], {"a": recorded}).read_text().splitlines()
+    assert lines[0] == ",".join(["arm,policy,iteration,x", *heads])
+    assert lines[1:4] == [f"a,p0,{i},0.0,{cell}" for i, cell in enumerate(cells)] and len(lines) == 6
 
 
 def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_are_json(tmp_path: Path) -> None:
