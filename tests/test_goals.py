@@ -199,14 +199,14 @@ class Walker(Robot[Walk]):
 
 
 @pytest.mark.parametrize(
-    "goal",
+    ("goal", "away"),
     [
-        "reach at above 8.5; avoid at below 1.5",
-        "drive at in 5.5..7.5; avoid at above 8.5",
-        "maximize at above 3; drive at above 6",
+        ("reach at above 8.5; avoid at below 1.5", lambda at: 8.5 - at),
+        ("drive at in 5.5..7.5; avoid at above 8.5", lambda at: np.maximum(5.5 - at, at - 7.5)),
+        ("maximize at above 3; drive at above 6", lambda at: 6 - at),
     ],
 )
-def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -> None:
+def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str, away: Any) -> None:
     robot, learner, limit = with_goal(Walker(), goal), SAC(discount=0.95), 30
     places, commands = np.arange(11), (-1.0, 0.0, 1.0)
     states = jax.vmap(lambda at: robot.started(Walk(at)))(jnp.asarray(places, jnp.float32))
@@ -239,6 +239,8 @@ def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -
     plain, with_shaping = q_values(False), q_values(True)
     potential = np.asarray(jax.vmap(robot.potential)(states))
     np.testing.assert_allclose(with_shaping, plain - potential, atol=1e-4)
+    # One of two objectives has it: 3 / 2 for each scale of 5 that the robot is away, up to the first.
+    np.testing.assert_allclose(potential, -1.5 * np.clip(away(places) / 5, 0, 1), atol=1e-6)
     assert np.ptp(potential) > 1
     # What is best, or as good, stays so.
     best = plain >= plain.max(axis=1, keepdims=True) - 1e-4
