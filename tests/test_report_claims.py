@@ -346,6 +346,24 @@ def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     assert [several.minutes_of(arm, 0.0, 140.0) for arm in arms] == [{0.0: 300, 140.0: 20}] * 2
 
 
+@pytest.mark.parametrize(
+    ("at", "settled"), [(None, 40), (-30, 0), (5, 0), (6, 10), (26, 40), (70, 40), (-31, None), (71, None)]
+)
+def test_a_comparison_is_made_on_the_nearest_recording_up_to_the_longest_interval_away(
+    at: float | None, settled: float | None
+) -> None:
+    # Of two as near the earlier one; the longest interval is 30 min.
+    arms, starts = (Arm("a"), Arm("b")), [0.0, 10.0, 40.0]
+    study = Study(culture=Source("files", files=("a",)), arms=arms, comparisons=(Compared("c", "a", "b", at_min=at),))
+    if settled is None:
+        with pytest.raises(
+            InvalidArgument, match=r"comparisons\.at_min: expected a minute of the recordings, from 0 to 40"
+        ):
+            study.at_recordings(starts)
+    else:
+        assert study.at_recordings(starts).comparisons[0].at_min == settled
+
+
 SCORED = Score(
     robot="cartpole", arm="without shadowing", mapping="1-threshold", at_min=0.0, policies=9, episodes=100,
     mean_return=96.0, standard_deviation=3.0, interquartile_mean=96.0, low_95=95.0, high_95=97.0, random=-80.0,
