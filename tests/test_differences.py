@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from animat.differences import first_difference
+from animat.differences import first_difference, with_fingerprint
 
 plain = st.recursive(
     st.none() | st.integers() | st.text(max_size=5),
@@ -42,3 +42,10 @@ def test_there_is_one_where_two_differ_and_none_where_they_are_the_same(one: Any
     said = first_difference(one, other, "it")
     assert bool(said) == (one != other)
     assert not said or (said.startswith("it") and said.endswith(" now"))
+
+
+def test_a_fingerprint_depends_on_what_is_described_and_not_on_its_order() -> None:
+    described = with_fingerprint({"b": {"c": 1, "d": 2}, "a": (3,)}, b"x")
+    assert described == with_fingerprint({"a": [3], "b": {"d": 2, "c": 1}}, b"x")
+    others = [({"a": [3], "b": {"c": 1, "d": 3}}, b"x"), ({"a": [3], "b": {"c": 1, "d": 2}}, b"y")]
+    assert all(with_fingerprint(*other)["fingerprint"] != described["fingerprint"] for other in others)

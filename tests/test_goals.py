@@ -199,14 +199,14 @@ class Walker(Robot[Walk]):
 
 
 @pytest.mark.parametrize(
-    "goal",
+    ("goal", "away"),
     [
-        "reach at above 8.5; avoid at below 1.5",
-        "drive at in 5.5..7.5; avoid at above 8.5",
-        "maximize at above 3; drive at above 6",
+        ("reach at above 8.5; avoid at below 1.5", lambda at: 8.5 - at),
+        ("drive at in 5.5..7.5; avoid at above 8.5", lambda at: np.maximum(5.5 - at, at - 7.5)),
+        ("maximize at above 3; drive at above 6", lambda at: 6 - at),
     ],
 )
-def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -> None:
+def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str, away: Any) -> None:
     robot, learner, limit = with_goal(Walker(), goal), SAC(discount=0.95), 30
     places, commands = np.arange(11), (-1.0, 0.0, 1.0)
     states = jax.vmap(lambda at: robot.started(Walk(at)))(jnp.asarray(places, jnp.float32))
@@ -239,6 +239,8 @@ def test_shaping_changes_values_by_the_potential_and_no_best_action(goal: str) -
     plain, with_shaping = q_values(False), q_values(True)
     potential = np.asarray(jax.vmap(robot.potential)(states))
     np.testing.assert_allclose(with_shaping, plain - potential, atol=1e-4)
+    # One of two objectives has it: 3 / 2 for each scale of 5 that the robot is away, up to the first.
+    np.testing.assert_allclose(potential, -1.5 * np.clip(away(places) / 5, 0, 1), atol=1e-6)
     assert np.ptp(potential) > 1
     # What is best, or as good, stays so.
     best = plain >= plain.max(axis=1, keepdims=True) - 1e-4
@@ -317,8 +319,9 @@ def test_a_goal_with_within_has_no_grid_and_says_so() -> None:
 def test_an_end_that_a_command_decides_is_not_known_from_the_state() -> None:
     grid = grid_for(with_goal("cartpole", CARTPOLE))
     assert grid.end_is_known and grid.smooth_commands == grid_for(Cartpole()).smooth_commands
-    by_speed = grid_for(with_goal("cartpole", "avoid cart_velocity outside -0.3..0.3 m/s"))
-    assert not by_speed.end_is_known and by_speed.smooth_commands is None
+    for goal in ("avoid cart_velocity outside -0.3..0.3 m/s", "reach cart_velocity above 0.3 m/s"):
+        by_speed = grid_for(with_goal("cartpole", goal))
+        assert not by_speed.end_is_known and by_speed.smooth_commands is None
 
 
 def test_a_goal_keeps_the_robots_other_abilities() -> None:
@@ -437,6 +440,7 @@ def test_units_are_those_of_the_robot() -> None:
         ("avoid pole_angle above 1e999 rad", "finite"),
         ("reach pole_angle above 1 rad and pole_angle below 0 rad", "an empty region"),
         ("drive pole_angle outside 0..1 deg and pole_angle in 0.2..0.5 deg", "an empty region"),
+        ("drive pole_angle outside 0..1 deg and pole_angle in 0..1 deg", "an empty region"),
         ("avoid pole_angle above 1 rad weight 1e308", "weight: expected at most"),
         ("reach pole_angle, cart_position around 0, 0 radius 1 m", "expected a quantity in rad"),
         ("reach cart_position, cart_position around 0 radius 1 m", "a centre of 2 numbers"),

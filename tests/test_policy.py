@@ -308,6 +308,7 @@ def test_others_safetensors_are_refused(metadata: dict[str, str] | None, tmp_pat
         {"conditions": [{"label": "5 Hz", "value": 5.0, "unit": "Hz"}]},
         {"conditions": 3},
         {"commands": 7, "mapping": None},
+        {"commands": [-1.0, -0.5, 0.0, 0.5, 2.0], "mapping": None},
         {"window_ms": 3},
         {"window_ms": [2.0]},
         {"presentation": {"order": "sideways", "pulses": 5}},
@@ -363,11 +364,12 @@ def test_an_unwritable_place_is_one_line_and_the_old_file_stays(tmp_path: Path) 
     assert path.read_bytes() == before
 
 
-def test_weights_that_do_not_fit_are_refused() -> None:
+@pytest.mark.parametrize("sizes", [(4, 8, 8, 4), (4, 8, 5), (4, 8, 8, 8, 5)])
+def test_weights_that_do_not_fit_are_refused(sizes: tuple[int, ...]) -> None:
     with pytest.raises(
         InvalidArgument, match=r"^weights: expected three layers from 4 observations of cartpole to 5 output"
     ):
-        replace(through_neurons(), **layers(0, 4, 8, 8, 4))
+        replace(through_neurons(), **layers(0, *sizes))
     with pytest.raises(InvalidArgument, match=r"^biases: expected finite numbers"):
         replace(two_forces(), biases=(*two_forces().biases[:-1], np.array([np.nan, 0], np.float32)))
 
@@ -409,7 +411,7 @@ def taken_apart(policy: Policy, tmp_path: Path) -> tuple[dict[str, np.ndarray], 
     return load(data), json.loads(header["__metadata__"]["animat"])
 
 
-TRAINED = {
+TRAINED: dict[str, Any] = {
     "fingerprint": "abc",
     "training": {"shadowing": True, "duration_min": 60.0, "chunks": 60, "percentiles": "first", "delivery": "chosen"},
     "simulators": {
@@ -421,6 +423,21 @@ TRAINED = {
         "recorded_at_min": [0.0, 10.0],
     },
 }
+
+
+@pytest.mark.parametrize(
+    ("changed", "until_min"),
+    [
+        ({}, 159.0),
+        ({"shadowing": "drawn", "duration_min": 30.0}, 129.5),
+        ({"shadowing": False}, 100.0),
+        ({"duration_min": None}, 100.0),
+    ],
+)
+def test_training_ends_with_the_simulator_of_its_last_part(changed: dict[str, Any], until_min: float) -> None:
+    provenance = {"training": TRAINED["training"] | changed}
+    assert replace(two_forces(), provenance=provenance).trained_until_min(100.0) == until_min
+    assert replace(two_forces(), provenance={}).trained_until_min(100.0) is None
 
 
 def used(policy: Policy) -> None:
@@ -507,6 +524,16 @@ def test_networks_of_another_build_are_refused(tmp_path: Path) -> None:
     refused(resaved(tmp_path, {name: array.astype(np.float32) for name, array in empty.items()}), "three layers")
     refused(resaved(tmp_path, {"more": np.zeros(3, np.float32)}), "expected a policy's arrays", "more")
     refused(resaved(tmp_path, {"scales": np.full(4, 1e-40, np.float32)}), "scales")
+    for shape in ((5,), (2, 4), (1, 2, 5)):
+        refused(resaved(tmp_path, {"assessments": np.zeros(shape)}), "assessments: expected rows of five")
+
+
+def test_only_policies_with_neurons_see_their_history_state_which_numpy_may_say(tmp_path: Path) -> None:
+    seeing = {**layers(0, 6, 8, 8, 5), "scales": np.ones(6, np.float32), "neural_observation": np.True_}
+    replace(through_neurons(), **seeing).save(tmp_path / "p0.safetensors")
+    assert Policy.load(tmp_path / "p0.safetensors").neural_observation is True
+    with pytest.raises(InvalidArgument, match="neural_observation: expected only with a mapping, got no mapping"):
+        replace(two_forces(), **(seeing | layers(0, 6, 8, 8, 2)))
 
 
 def test_what_is_read_of_a_provenance_is_what_training_writes() -> None:

@@ -336,8 +336,32 @@ def test_what_is_trained_on_one_recording_is_evaluated_on_it() -> None:
     assert study.minutes_of(study.arm("9 thresholds"), 0.0, 140.0) == {140.0: 100}
     assert study.minutes_of(study.arm("1 threshold"), 0.0, 140.0) == {0.0: 30, 140.0: 100}
     assert study.optimum_minutes(0.0, 140.0) == [0.0, 140.0]
-    control = Arm("c", shadowing=False, delivery="shuffled")
-    assert study.minutes_of(control, 0.0, 140.0) == {140.0: 100}
+    for other in (Arm("c", shadowing=False, delivery="shuffled"), Arm("c", shadowing=False, trained=False)):
+        assert study.minutes_of(other, 0.0, 140.0) == {140.0: 100}
+    # Of several comparisons at a minute, as many episodes as the longest takes.
+    arms = Arm("a", shadowing=False), Arm("b")
+    takes = {"first": (0.0, 30), "longest": (0.0, 300), "last": (140.0, 20), "shortest": (140.0, 10)}
+    compared = tuple(Compared(name, "a", "b", at_min=at, episodes=n) for name, (at, n) in takes.items())
+    several = Study(arms=arms, comparisons=compared, episodes=50)
+    assert [several.minutes_of(arm, 0.0, 140.0) for arm in arms] == [{0.0: 300, 140.0: 20}] * 2
+
+
+@pytest.mark.parametrize(
+    ("at", "settled"), [(None, 40), (-30, 0), (5, 0), (6, 10), (26, 40), (70, 40), (-31, None), (71, None)]
+)
+def test_a_comparison_is_made_on_the_nearest_recording_up_to_the_longest_interval_away(
+    at: float | None, settled: float | None
+) -> None:
+    # Of two as near the earlier one; the longest interval is 30 min.
+    arms, starts = (Arm("a"), Arm("b")), [0.0, 10.0, 40.0]
+    study = Study(culture=Source("files", files=("a",)), arms=arms, comparisons=(Compared("c", "a", "b", at_min=at),))
+    if settled is None:
+        with pytest.raises(
+            InvalidArgument, match=r"comparisons\.at_min: expected a minute of the recordings, from 0 to 40"
+        ):
+            study.at_recordings(starts)
+    else:
+        assert study.at_recordings(starts).comparisons[0].at_min == settled
 
 
 SCORED = Score(

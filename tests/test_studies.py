@@ -826,6 +826,11 @@ COMPARED = (
             "[[arms]]\nname = 'a'\n[[arms]]\nname = 'A'",
             "expected each name once, got 'a' 2 times: capitals, and spaces for dashes, make no difference",
         ),
+        (
+            "[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
+            + "[[comparisons]]\nname = 'c'\nfirst = 'a'\nsecond = 'b'\n" * 2,
+            "comparisons: expected each name once, got 'c' 2 times",
+        ),
         ("[[arms]]\nname = 'a'\nmapping = '2'", "arms.mapping: expected one of"),
         ("[[arms]]\nname = 'a'\nmapping = '2'", "name your own by its module:Class; none is without neurons"),
         ("[tune]\ntrials = 3", "expected a study, got the file of a tuning, with [tune]: use animat tune"),

@@ -29,7 +29,9 @@ from animat.responses.series import extract_series
 from animat.robots import Navigation
 from animat.studies.episodes import COLUMNS, RANDOM, episode_rows, mean_returns, read_episodes, write_episodes
 from animat.studies.evaluating import Evaluate
+from animat.studies.figure_tables import write_paths
 from animat.studies.optima import FindOptima, read_optima
+from animat.studies.paths import Paths
 from animat.studies.pictures import _courses, _minutes_in_training
 from animat.studies.places import controls_file, episodes_file, optima_file, results_file, table_file
 from animat.studies.recording import Record
@@ -38,7 +40,7 @@ from animat.studies.results import read_typed, write_typed
 from animat.studies.simulating import Fit
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study, mapping_label
-from animat.studies.tabulating import References, Tabulate, _finite
+from animat.studies.tabulating import References, Tabulate, _controls, _finite, _optimum_error, _scores
 from animat.studies.task import draw_seed
 from animat.studies.training import TrainGroup
 from animat.training.policy import Policy, load_policies
@@ -81,6 +83,7 @@ def compared_returns(folder: Path, *comparisons: Compared) -> tuple[ComparedRetu
     results = read_typed(results_file(folder), Results)
     with table_file(folder, "comparisons").open(newline="") as file:
         assert [row["u"] for row in csv.DictReader(file)] == [str(row.u) for row in results.comparisons]
+    assert not table_file(folder, "goals").exists(), "no robot of the study has a goal"
     return results.comparisons
 
 
@@ -132,6 +135,7 @@ def test_the_better_side_is_named_and_the_effect_has_its_sign(tmp_path: Path) ->
         assert rising.mean_first == falling.mean_second == pytest.approx(np.mean(RETURNS["worse"]))
         assert rising.mean_second == falling.mean_first == pytest.approx(np.mean(RETURNS["better"]))
         assert rising.score_second == pytest.approx((rising.mean_second + 80) / 100)
+        assert rising.as_in_paper is None, "the study is not the paper's"
 
 
 def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_path: Path) -> None:
@@ -142,6 +146,60 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
     corrected = holm({f"{row.comparison}/{row.robot}": row.p_normal for row in rows})
     assert len(corrected) == 4
     assert [row.p_holm for row in rows] == [corrected[f"{row.comparison}/{row.robot}"] for row in rows]
+
+
+def test_means_and_errors_of_arms_and_controls_are_those_counted_by_hand(tmp_path: Path) -> None:
+    """Policies and controls with several actors are judged by each one's mean, and others by their episodes."""
+    # The first has the name of its mapping, under which the controls are listed.
+    arms = Arm("1-threshold"), Arm("new", trained=False)
+    study = Study(robots=(RobotSpec("cartpole"),), arms=arms, policies=3, episodes=2)
+    (spec,) = study.robots
+    run = [
+        ("1-threshold", "policy", [[1.0, 3.0], [5.0, 7.0], [0.0, 8.0]]),
+        ("new", "policy", [[1.0, 2.0]]),
+        ("1-threshold", "random", [[-10.0, 0.0, 10.0, -20.0]]),
+        ("1-threshold", "silent", [[0.0, 2.0], [4.0, 6.0]]),
+        ("1-threshold", "constant", [[7.0]]),
+    ]
+    of_one = [
+        episode_rows(episodes_of(np.array(returns)), robot="cartpole", arm=arm, agent=agent, at_min=0.0)
+        for arm, agent, returns in run
+    ]
+    later = [of_one[0].assign(**{"return": 1000.0, "over_time": True}), of_one[2].assign(robot="another")]
+    optimum = StudyOptimum("cartpole", "1-threshold", "moving", 0.0, 20.0, None, None, 0.5, 15.0, 0.1, *[None] * 4)
+    write_typed(optima_file(tmp_path, "cartpole"), [optimum])
+    known = References(study, tmp_path, spec, pd.concat([*of_one, *later]))
+    trained, new = _scores(known, 0.0, 0.0)
+    # The means are 2, 6 and 4.
+    assert (trained.policies, trained.episodes, trained.mean_return, trained.standard_deviation) == (3, 2, 4.0, 2.0)
+    assert (trained.random, trained.optimum, trained.normalised_score) == (-5.0, 20.0, pytest.approx(9 / 25))
+    assert (new.policies, new.mean_return, new.standard_deviation) == (1, 1.5, None)
+    rows = [(row.control, row.actors, row.mean_return, row.standard_error) for row in _controls(known)]
+    assert rows == [
+        ("trained: 1-threshold", 3, 4.0, pytest.approx(2 / 3**0.5)),
+        ("random", 1, -5.0, pytest.approx((500 / 3 / 4) ** 0.5)),
+        ("silent", 2, 3.0, pytest.approx(2.0)),
+        ("constant", 1, 7.0, None),
+    ]
+    assert [row.normalised_score for row in _controls(known)][2] == pytest.approx(8 / 25)
+    # Its controller misses the value by more than the grid's error; without a grid there is neither.
+    errors = [_optimum_error(each) for each in (optimum, replace(optimum, monte_carlo=20.1), None)]
+    assert errors == [5.0, 0.5, None] and _optimum_error(replace(optimum, grid_error=None)) is None
+
+
+@pytest.mark.parametrize(
+    ("shape", "heads", "cells"),
+    [((), ["command"], ["", "0.5", "-1.0"]), ((2,), ["command_1", "command_2"], [",", "0.5,-1.0", "0.25,0.0"])],
+)
+def test_paths_have_a_column_for_each_command(
+    tmp_path: Path, shape: tuple[int, ...], heads: list[str], cells: list[str]
+) -> None:
+    # The second episode has ended after one iteration; what follows is meaningless.
+    commands = np.resize([0.5, -1.0, 0.25, 0.0], (2, 2, *shape))
+    recorded = Paths(np.zeros((2, 3, 1)), commands, np.array([2, 1]))
+    lines = write_paths(tmp_path, "rover", ["x"], {"a": recorded}).read_text().splitlines()
+    assert lines[0] == ",".join(["arm,policy,iteration,x", *heads])
+    assert lines[1:4] == [f"a,p0,{i},0.0,{cell}" for i, cell in enumerate(cells)] and len(lines) == 6
 
 
 def test_one_policy_on_a_robot_without_bounds_has_no_interval_and_its_results_are_json(tmp_path: Path) -> None:

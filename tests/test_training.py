@@ -142,9 +142,8 @@ def test_killed_at_any_moment_and_started_again_it_ends_in_the_same_bits(tmp_pat
 
 
 def test_what_a_killed_process_left_half_written_is_cleared_away(tmp_path: Path) -> None:
-    leftovers = [
-        tmp_path / name for name in (".p1.safetensors.ab.partial.safetensors", ".training.json.ab.partial.json")
-    ]
+    names = ("p1.safetensors", "training.json", "assessments.csv")
+    leftovers = [tmp_path / f".{name}.ab.partial{Path(name).suffix}" for name in names]
     for leftover in leftovers:
         leftover.write_bytes(b"half of it")
     # Another training may be writing this one just now.
@@ -267,7 +266,15 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path: 
         arrays = dict(kept)
     last = max((name for name in arrays if name.startswith("leaf")), key=lambda name: int(name[4:]))
     fewer = {name: array for name, array in arrays.items() if name != last}
-    for others in (fewer, arrays | {last: arrays[last][..., None]}, arrays | {"leaf0": arrays["leaf0"].astype(float)}):
+    of_another_version = (
+        fewer,
+        arrays | {last: arrays[last][..., None]},
+        arrays | {"leaf0": arrays["leaf0"].astype(float)},
+        arrays | {"done": arrays["done"] + 1},
+        arrays | {"done": 0 * arrays["done"], "curve": arrays["curve"][:0]},
+        arrays | {"curve": arrays["curve"][..., :-1]},
+    )
+    for others in of_another_version:
         np.savez(checkpoint, **others)
         with pytest.raises(InvalidFile, match=r"as this version of animat writes it, of .*: rm '"):
             train_group(group, checkpoint, stop, checkpoint_s=0.0)

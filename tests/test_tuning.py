@@ -331,8 +331,11 @@ def test_what_diverged_after_a_rung_is_not_drawn_as_stopped(tmp_path: Path, monk
     own = TrialResult(0, settings, "complete", (20, 60), ((1.0,), (2.0,)))
     stopped = TrialResult(1, settings, "stopped", (20,), ((0.0,),))
     diverged = TrialResult(2, settings, "diverged", (20,), ((9.0,),))
-    finals = [Final(0, settings, (2.0, 2.1))]
-    write_results(tmp_path, read_tuning(TINY), [own, stopped, diverged], finals)
+    finals = [Final(3, settings, (3.0,)), Final(0, settings, (1.0, 3.0, 5.0)), Final(2, settings, None)]
+    tuned = write_results(tmp_path, read_tuning(TINY), [own, stopped, diverged], finals)
+    assert tuned.best.trial == 0, "of two with the same mean, the one that was found first"
+    counted = [(row["mean_return"], row["standard_error"]) for row in tuned.to_dict()["finals"]]
+    assert counted == [(3.0, None), (3.0, pytest.approx(2 / 3**0.5)), (None, None)]
     drawn = {line.get_label(): list(line.get_xdata()) for line in figures[0].axes[0].lines}
     assert drawn["stopped at 33 %"] == [1]
     assert drawn["diverged"] == [2]

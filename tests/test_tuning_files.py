@@ -43,6 +43,10 @@ def test_the_usual_search_holds_the_study_s_own_settings(tmp_path: Path, arm: st
     own = own_settings(tuning.study)
     assert all(own[name] in among for name, among in tuning.space.items())
     assert ("mapping" in tuning.space) == ("none" not in arm)
+    # A range that reaches 0, or a discount of 1, has no logarithm.
+    uniform = [name for name, among in tuning.space.items() if isinstance(among, Range) and not among.log]
+    assert uniform == [algorithm.partition(" =")[0]] * algorithm.endswith(("= 0", "= 1"))
+    assert all(isinstance(among, Range) or len({*among}) == len(among) for among in tuning.space.values())
     assert with_settings(tuning.study, {name: own[name] for name in tuning.space}).arms == tuning.study.arms
 
 

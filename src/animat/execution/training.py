@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import final
 
@@ -130,7 +131,7 @@ def train(
                 raise
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         # In other subfolders another training may be writing.
-        for place, name in ((folder, "p*.safetensors"), (folder / BEST, "p*.safetensors"), (folder, MANIFEST)):
+        for place, name in product((folder, folder / BEST), ("p*.safetensors", MANIFEST, TABLE)):
             for leftover in place.glob(f".{name}.*.partial*"):
                 clear_away(leftover)
         policies = {f"p{i}": Policy.load(folder / f"p{i}.safetensors") for i in range(training.policies)}

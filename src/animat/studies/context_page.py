@@ -89,13 +89,12 @@ def summarise_cultures(by_robot: Mapping[str, Sequence[ContextRow]]) -> str:
 
 def summarise_robot(rows: Sequence[ContextRow]) -> str:
     """Two sentences on one robot on all cultures: what the task needs, and what the policies do."""
-    n, needs = sum(row.gap is not None for row in rows), sum(row.needs_context for row in rows)
-    if not n:
-        return "The context gap is not known."
-    has = sum(row.has_context for row in rows)
     gaps = [row.gap for row in rows if row.gap is not None]
+    if not gaps:
+        return "The context gap is not known."
+    n, needs, has = len(gaps), sum(row.needs_context for row in rows), sum(row.has_context for row in rows)
     least = "at least " if any(row.is_least for row in rows) else ""
-    between = f" (context gap {least}{_range(gaps)})" if gaps else ""
+    between = f" (context gap {least}{_range(gaps)})"
     task = f"A reflex leaves half of the task or more undone on {needs} of {counted(n, 'culture')}{between}."
     scores = [row.score for row in rows if row.score is not None]
     scored = f" (context score {least}{_range(scores)})" if scores else ""

@@ -111,14 +111,16 @@ def write_courses(folder: Path, robot: str, panels: Sequence[Courses]) -> Path:
 
 
 def write_paths(folder: Path, robot: str, names: Sequence[str], paths: Mapping[str, Paths]) -> Path:
-    """One episode of each policy of every arm: observations, and the command that led to each."""
+    """One episode of each policy of every arm: observations, and the command or commands that led to each."""
+    n = max(math.prod(of.commands.shape[2:]) for of in paths.values())
+    heads = ["command"] if n == 1 else [f"command_{number}" for number in range(1, n + 1)]
     rows = (
-        (arm, f"p{actor}", i, *observed.tolist(), commands[i - 1] if i else None)
+        (arm, f"p{actor}", i, *observed.tolist(), *(np.ravel(commands[i - 1]).tolist() if i else [None] * n))
         for arm, of in paths.items()
         for actor, (observations, commands) in enumerate(of.episodes())
         for i, observed in enumerate(observations)
     )
-    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, "command"), rows)
+    return _write(folder, f"{robot}-paths", ("arm", "policy", "iteration", *names, *heads), rows)
 
 
 def _write(folder: Path, name: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:

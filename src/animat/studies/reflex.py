@@ -29,7 +29,7 @@ def compare_with_reflex(
         for at_min, coupled in rows_where(controls, agent=COUPLING).groupby("at_min")["return"]:
             best = known.get(key_of(arm, at_min))
             policies = rows_where(at, arm=arm.name, agent=POLICY, at_min=at_min)
-            if best is None or best.best_return is None or not len(policies):
+            if best is None or best.best_return is None:
                 continue
             random = rows_where(controls, agent=RANDOM, at_min=at_min)["return"].to_numpy()
             # The context gap takes only the value and its error.

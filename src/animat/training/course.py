@@ -162,7 +162,7 @@ class Course:
         old_rank = np.column_stack([table[best_at, policies, 2], np.nan_to_num(score)]).tolist()
         new_rank = np.column_stack([lesson + 1, np.nan_to_num(new_score)]).tolist()
         # Among equals the last, as a policy keeps learning.
-        is_best = np.array([new >= old for new, old in zip(new_rank, old_rank, strict=True)]) | (index == 0)
+        is_best = np.array([new >= old for new, old in zip(new_rank, old_rank, strict=True)])
         for kept, new in zip(jax.tree.leaves(best), jax.tree.leaves(deployed), strict=True):
             kept[is_best] = np.asarray(new)[is_best]
         passed = [_passes(self._stages[stage], *row) for stage, row in zip(lesson, new_score, strict=True)]

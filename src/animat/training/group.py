@@ -291,7 +291,7 @@ class SideBySide:
         self._learners = learners._replace(key=jax.random.wrap_key_data(learners.key))
         if self._course is not None:
             self._course.state = course_state
-        self.curve = list(curve[:done])
+        self.curve = list(curve)
         return done
 
     @property

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from typing import Any
 
-from animat.coding.mapping import mapping_named
 from animat.errors import InvalidArgument, did_you_mean, shown, within
 from animat.records import Flag, Number, read_record, record
 from animat.studies.specification import Study
@@ -132,9 +131,7 @@ def _expect_possible(study: Study, name: str, among: Range | tuple[Value, ...], 
         with within(where):
             if name == "mapping" and value == "none":
                 raise InvalidArgument("expected mappings, got 'none': tune policies without neurons separately")
-            changed = with_settings(study, {name: _whole(value, own_settings(study)[name])})
-            if name == "mapping":
-                mapping_named(changed.arms[0].mapping)
+            with_settings(study, {name: _whole(value, own_settings(study)[name])})
 
 
 def _whole(value: Any, own: Any) -> Any:

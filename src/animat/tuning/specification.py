@@ -55,7 +55,7 @@ class Tune:
     @property
     def chunks(self) -> list[int]:
         """Chunks of training done after each rung, `CHUNKS` after the last."""
-        return [max(1, round(CHUNKS / self.keep ** (self.rungs - 1 - rung))) for rung in range(self.rungs)]
+        return [round(CHUNKS / self.keep ** (self.rungs - 1 - rung)) for rung in range(self.rungs)]
 
 
 @dataclass(frozen=True)
