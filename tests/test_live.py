@@ -238,15 +238,16 @@ def test_without_room_on_the_disk_nothing_is_recorded(tmp_path: Path, monkeypatc
     assert not (tmp_path / "live" / ".exchange").exists()
 
 
-def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [DeviceFailed("gone"), KeyboardInterrupt()], ids=repr)
+def test_of_a_recording_that_ends_half_way_the_pulses_are_spent(error: BaseException) -> None:
     account = Account(Budget())
     blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
 
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
-        raise DeviceFailed("gone")
+        raise error
 
     with FakeCulture(fault=fail, at=2) as culture:
-        with pytest.raises(DeviceFailed):
+        with pytest.raises(type(error)):
             record_within(account, culture, blocked, 1)
         # Blocks of 80: two were recorded, and the third was handed over.
         assert account.pulses == culture.delivered == culture.pulses == 3 * 80
