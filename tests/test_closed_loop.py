@@ -685,6 +685,7 @@ def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
 
 def test_a_budget_is_kept_to_the_pulse() -> None:
     account = Account(Budget(pulses=10, pulses_per_electrode=4))
+    assert account.to_dict() == {"pulses": 0, "of": 10, "most_on_an_electrode": 0, "of_per_electrode": 4}
     pair = [Stimulus(0.0, (1, 2), PUBLISHED_PULSE), Stimulus(0.1, (2, 3), PUBLISHED_PULSE)]
     for _ in range(2):
         account.check(pair)

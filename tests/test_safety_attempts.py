@@ -519,6 +519,7 @@ def test_budgets_that_are_no_whole_number_are_refused(name: str, value: Any) -> 
     with pytest.raises(InvalidArgument, match=f"budget.{name}: expected"):
         Budget(**{name: value})
     assert Budget(**{name: np.int16(3)}) == Budget(**{name: 3})
+    assert type(getattr(Budget(**{name: np.int16(3)}), name)) is int
 
 
 # Copies.
