@@ -278,6 +278,7 @@ WIDE = replace(SIMULATED_LIMITS, stimuli_per_s=10, stimuli_per_electrode_s=5, st
         ("sites", [one(electrodes=(10, 10))], "each electrode once"),
         ("overlap", [one(), one(time_s=0.0005)], "500 us too early"),
         ("overlap", [one(time_s=math.nan)], "finite times"),
+        ("overlap", [one(time_s=-1e-6)], "from 0 s on, got -1e-06"),
         ("stimuli_per_s", [one(electrodes=(10 + i % 3,), time_s=i * 0.09) for i in range(11)], "at most 10 stimuli"),
         ("stimuli_per_electrode_s", [one(time_s=i * 0.1) for i in range(6)], "at most 5 stimuli on an electrode"),
         ("stimuli_per_session", [one(time_s=float(i)) for i in range(21)], "at most 20 stimuli in a session"),
