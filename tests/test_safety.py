@@ -338,6 +338,21 @@ def test_a_gap_of_more_than_a_second_does_not_keep_the_first_stimulus_waiting() 
     guard.check([Stimulus(0.0, (11,), BALANCED_PULSE)], ends_s + 5)
 
 
+def test_only_what_time_makes_safe_is_waited_for() -> None:
+    loud, last = one(Pulse((Phase(100, amplitude_mv=-401),))), one(time_s=0.2)
+    for interval_us, earliest_s in ((100_000.0, 0.3), (2_000_000.0, 2.2), (5_000_000.0, None)):
+        guard = Guard(replace(WIDE, interval_us=interval_us), SITES)
+        guard.admit([last], 0.0)
+        with pytest.raises(UnsafeStimulus, match="amplitude"):
+            guard.earliest([loud], 0.25)
+        if earliest_s is None:
+            with pytest.raises(UnsafeStimulus, match="interval_us"):
+                guard.earliest([one()], 0.25)
+        else:
+            # In steps of a millisecond.
+            assert earliest_s - 1e-9 <= guard.earliest([one()], 0.25) < earliest_s + 0.001
+
+
 def test_limits_that_cannot_be_are_refused() -> None:
     with pytest.raises(InvalidArgument, match="phase_us: expected"):
         replace(LIMITS, phase_us=(500.0, 100.0))
