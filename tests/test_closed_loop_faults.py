@@ -24,6 +24,7 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
 from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.stretch import check_answer
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.request import Request
@@ -151,6 +152,38 @@ def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str
         assert words in session.ending.message
         assert_safe(session, culture, 7)
     assert session.to_dict()["unanswered_pulses"] == 1
+
+
+RIGHT = Observed(5.0, 0.02, Spikes(np.array([0.0, 0.01, 0.02]), np.array([0, 7, 15])), np.array([0.001]))
+"""A possible answer of 16 channels, at 20 kHz, to a pulse after 1 ms of the 20 ms from 5 s on."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({}, None),
+        # Rounded to samples, times may be off by a sample and a half; counted from a later start they are earlier.
+        ({"start_s": 5.0 - 7e-5, "duration_s": 0.0201}, None),
+        ({"start_s": 5.0 - 8e-5, "duration_s": 0.0201}, "went back to 4.99992 s"),
+        ({"stimulus_time_s": np.array([0.001 - 7e-5])}, None),
+        ({"stimulus_time_s": np.array([0.001 - 8e-5])}, "a stimulus 0.08 ms before"),
+        ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0005])}, None),
+        ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0004])}, "a stimulus 0.1 ms before"),
+        ({"duration_s": 0.02 - 5e-7, "spikes": Spikes(np.empty(0), np.empty(0, int))}, None),
+        ({"duration_s": 0.02 - 2e-6, "spikes": Spikes(np.empty(0), np.empty(0, int))}, "where 0.02 s from 5.0 s were"),
+        ({"start_s": np.inf}, "returned 0.02 s from inf s"),
+        ({"spikes": Spikes(np.array([-2e-9]), np.array([0]))}, "spike times outside of the 0.02 s"),
+        ({"spikes": Spikes(np.array([0.02 + 2e-9]), np.array([0]))}, "spike times outside of the 0.02 s"),
+        ({"spikes": Spikes(np.array([0.01, 0.01]), np.array([15, 0]))}, None),
+        ({"spikes": Spikes(np.array([0.01]), np.array([16]))}, "channel 16 of 16"),
+        ({"spikes": Spikes(np.array([0.01]), np.array([-1]))}, "channel -1 of 16"),
+        ({"spikes": Spikes(np.array([0.01]), np.array([1], np.uint8))}, None),
+    ],
+)
+def test_an_answer_is_possible_to_within_rounding_and_no_further(changed: dict[str, Any], words: str | None) -> None:
+    asked = {"requested_s": np.array([0.001]), "duration_s": 0.02, "since_s": 5.0, "from_s": 5.0}
+    fault = check_answer(replace(RIGHT, **changed), **asked, sample_s=5e-5, n_channels=16)  # type: ignore[arg-type]
+    assert fault is None if words is None else words in str(fault)
 
 
 class Gone(FakeCulture):
