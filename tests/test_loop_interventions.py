@@ -72,11 +72,16 @@ def test_random_spikes_are_recorded_responses_and_no_pulses(session: Session) ->
 
 
 def test_a_burst_of_the_culture_is_none_of_the_response_that_is_drawn_in_its_place() -> None:
-    channels, loop = FakeCulture().channels, loop_of(burst_threshold=0.5)
+    channels, drawn = FakeCulture().channels, np.array([7.5])
+    # One spike on each of 16 channels, in 8 ms. No response is a burst at a threshold of 1.
     stretch = Stretch(0, 0.0, 0.02, np.full(16, 0.006), np.arange(16), channels, np.empty(0))
-    # One spike on each of 16 channels, in 8 ms.
-    for drawn_from, hz, is_burst in ((None, 125.0, True), (np.array([7.5]), 7.5, False)):
-        members, rng = loop.readouts.members(channels), np.random.default_rng(1)
+    for threshold, drawn_from, hz, is_burst in (
+        (0.9, None, 125.0, True),
+        (1, None, 125.0, False),
+        (0.9, drawn, 7.5, False),
+    ):
+        loop, rng = loop_of(burst_threshold=threshold), np.random.default_rng(1)
+        members = loop.readouts.members(channels)
         x_hz, tick = read_response(loop, drawn_from, stretch, members, np.zeros(1), rng)
         assert (float(x_hz), tick["rate_hz"], tick["is_burst"]) == (hz, hz, is_burst)
         assert (tick["spikes"], tick["active_ratio"], tick["readout_hz"]) == (16, 1.0, ())
