@@ -149,8 +149,19 @@ def test_a_train_at_the_limit_keeps_its_pace_wherever_it_begins(neurons: Neurons
     """Half of these begin half-way between two frames: rounded to even, every other interval would be too short."""
     with CL1Culture() as culture:
         train = [Stimulus((begins_us + 5000 * n) / 1e6, (1,), CL1_PULSE) for n in range(20, 60)]
-        began = np.rint(culture.deliver(train, 0.4).stimulus_time_s * 25_000)
+        observed = culture.deliver(train, 0.4)
+    began = [frame for frame, *_ in neurons.pulses]
+    assert np.rint((observed.start_s + observed.stimulus_time_s) * 25_000).tolist() == began
+    # To the nearest frame of 40 us from the request at 0, halves up.
+    assert began[0] == (begins_us + 100_000 + 20) // 40
     assert set(np.diff(began)) == {125}
+
+
+def test_a_pulse_at_the_very_end_of_a_delivery_is_waited_for(neurons: Neurons) -> None:
+    with CL1Culture(ticks_per_s=25_000) as culture:
+        # Its nearest frame is the one after the last: 250.
+        observed = culture.deliver([Stimulus(0.009999, (1,), CL1_PULSE)], 0.01)
+    assert np.rint(observed.stimulus_time_s * 25_000).tolist() == [250]
 
 
 def test_the_five_frequencies_are_delivered_to_a_frame(neurons: Neurons) -> None:
@@ -265,6 +276,23 @@ def test_an_emergency_stop_half_way_delivers_nothing_more(neurons: Neurons) -> N
         assert neurons.queue == []
         culture.advance(0.5)
         assert len(neurons.pulses) == delivered
+
+
+def test_a_stop_after_the_last_pulse_was_sent_ends_the_delivery_too(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        ticks, loop = [0], neurons.loop
+
+        def stopping(*given: int, **more: object) -> Iterator[object]:
+            for tick in loop(*given, **more):
+                ticks[0] += 1
+                if ticks[0] == 100:
+                    culture.stop("seen enough")
+                yield tick
+
+        neurons.loop = stopping  # type: ignore[method-assign]
+        with pytest.raises(DeviceFailed, match="stopped while delivering: 1 of 1 stimuli had been sent"):
+            culture.deliver([Stimulus(0.05, (1,), CL1_PULSE)], 1.0)
+        assert ticks == [100] and len(neurons.pulses) == 1
 
 
 def test_a_stop_from_another_thread_lets_nothing_through_after_it(neurons: Neurons) -> None:
