@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import sys
 import threading
@@ -209,6 +210,14 @@ def test_a_pulse_that_never_comes_is_an_error_that_names_it(neurons: Neurons) ->
         culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE)], 0.1)
 
 
+@pytest.mark.parametrize("ticks", [0, 3])
+def test_a_loop_that_ends_before_all_was_sent_is_an_error(ticks: int, neurons: Neurons) -> None:
+    loop = neurons.loop
+    neurons.loop = lambda *given, **more: itertools.islice(loop(*given, **more), ticks)  # type: ignore[method-assign]
+    with CL1Culture() as culture, pytest.raises(DeviceFailed, match="expected a loop over 1 s, got one that ended"):
+        culture.deliver([Stimulus(0.5, (1,), CL1_PULSE)], 1.0)
+
+
 def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) -> None:
     with CL1Culture() as culture:
         before = neurons.interrupted
@@ -385,10 +394,10 @@ def test_a_delivery_that_hung_hands_over_nothing_in_a_later_session(neurons: Neu
 
 def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]
     with CL1Culture(record_to=tmp_path) as culture:
-        culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)], 0.01)
+        culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 0, 7)], 0.01)
     ((frame, text),) = neurons.stream
     assert frame == neurons.pulses[0][0]
-    assert parse_line(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 3, "presentation": 7}
+    assert parse_line(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 0, "presentation": 7}
     assert Pulse.from_list(json.loads(text)["phases"]) == CL1_PULSE
 
 
