@@ -473,13 +473,12 @@ class Broken:
                 return moved
             if self.how == "raises":
                 raise ZeroDivisionError("the wheel came off")
-            return moved._replace(reward=float("nan"))
+            return moved._replace(truncated=True) if self.how == "stops" else moved._replace(reward=float("nan"))
 
         return broken
 
 
-@pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
-def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def break_robot(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from animat.closed_loop import runner
 
     broken = Broken(how)
@@ -490,6 +489,22 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
             self.step = broken(self.step)  # type: ignore[method-assign]
 
     monkeypatch.setattr(runner, "RobotRunner", BrokenRunner)
+
+
+def test_a_robot_that_cuts_its_episode_off_ends_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    break_robot("stops", monkeypatch)
+    with FakeCulture() as culture:
+        session = run(tmp_path, culture)
+        assert session.ending.by == "plan"
+        assert culture.pulses == 11
+    # It does so in its seventh step and in every later one.
+    assert [episode.iterations for episode in session.episodes] == [7, 1, 1, 1, 1]
+    assert all(episode.is_whole and not episode.terminated for episode in session.episodes)
+
+
+@pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
+def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    break_robot(how, monkeypatch)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "robot"
