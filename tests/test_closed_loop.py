@@ -363,9 +363,13 @@ def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_conditio
     # What is read is what came when the response to a pulse of 5 Hz would have come.
     for before, tick in pairwise(silent):
         assert tick.iteration == 0 or tick.read_after_s - before.read_after_s == pytest.approx(0.2, abs=1e-4)
-    since_ms = 1e3 * np.subtract.outer([tick.read_after_s for tick in silent], session.recording().spike_times_s)
+    recording = session.recording()
+    since_ms = 1e3 * np.subtract.outer([tick.read_after_s for tick in silent], recording.spike_times_s)
     inside = (-since_ms >= 2.0 - 1e-6) & (-since_ms < 10.0 - 1e-6)
     assert [tick.spikes for tick in silent] == inside.sum(axis=1).tolist() != [0] * 60
+    # All that was seen is recorded, the pauses too: this culture's clock stands still in between.
+    assert recording.duration_s == pytest.approx(culture.now_s - 12.0, abs=1e-4)
+    assert recording.provenance["closed_loop_unwatched_s"] == "0.000000"
     shuffled = [tick.delivered for tick in session.ticks if tick.agent == "any"]
     assert {tick.chosen for tick in session.ticks if tick.agent == "any"} == {4}
     assert set(shuffled) == set(range(5))
