@@ -386,6 +386,27 @@ def test_a_replay_answers_a_frequency_that_its_recordings_state_rounded() -> Non
         replay.deliver([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)], 0.01)
 
 
+def test_a_replay_answers_from_the_newest_recording_at_its_clock() -> None:
+    with FakeCulture() as fake:
+        source = fake.record(Protocol((20.0,), patterns=2, trials=4))
+
+    def answering(channel: int, start_min: float) -> Recording:
+        times_s = source.stimuli.time_s + 0.003
+        channels = np.full(len(times_s), channel)
+        return replace(source, start_min=start_min, spike_times_s=times_s, spike_channels=channels)
+
+    with ReplayCulture([answering(1, 40.0), answering(0, 30.0)]) as replay:
+        replay.rest(599.99)
+        pulses = [Stimulus(t, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0) for t in (0.0, 0.02)]
+        observed = replay.deliver(pulses, 0.05)
+        assert observed.start_s == pytest.approx(2399.99)
+        assert (observed.spikes.time_s.tolist(), observed.spikes.channel.tolist()) == ([0.003, 0.023], [0, 1])
+        # A rest ends before the spike at its very end.
+        replay.deliver(pulses[:1], 0.001)
+        replay.rest(0.002)
+        assert replay.advance(0.01).time_s.tolist() == [0.0]
+
+
 def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
     """A place that is one of the culture's patterns has a number, and one that is not has none."""
     places = ((100, 101), (103, 105, 107))
