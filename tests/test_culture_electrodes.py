@@ -20,7 +20,7 @@ from animat.cultures.tissue.parameters import ShortTerm
 from animat.cultures.tissue.tissue import Spikes
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
 from animat.cultures.visibility import NOISE_UV
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -405,6 +405,23 @@ def test_a_replay_answers_from_the_newest_recording_at_its_clock() -> None:
         replay.deliver(pulses[:1], 0.001)
         replay.rest(0.002)
         assert replay.advance(0.01).time_s.tolist() == [0.0]
+
+
+def test_what_a_replay_cannot_answer_from_is_refused() -> None:
+    with FakeCulture() as fake:
+        source = fake.record(Protocol((20.0,), patterns=2, trials=4))
+    n = len(source.stimuli)
+    others = replace(source.channels, label=np.array([f"other {label}" for label in source.channels.label]))
+    for recordings, kind, words in (
+        ([], InvalidArgument, "recordings: expected at least one"),
+        ([source, replace(source, channels=others)], Mismatch, "recordings: expected the same channels in all"),
+        *(
+            ([replace(source, stimuli=replace(source.stimuli, **{name: unknown}))], UnusableData, "known frequency and")
+            for name, unknown in (("frequency_hz", np.full(n, np.nan)), ("electrodes", np.full((n, 1), -1)))
+        ),
+    ):
+        with pytest.raises(kind, match=words):
+            ReplayCulture(recordings)
 
 
 def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
