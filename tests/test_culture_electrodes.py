@@ -433,6 +433,10 @@ def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
     with ReplayCulture(sources) as replay:
         assert replay.stimulation_electrodes == (100, 101, 102, 103, 105, 106, 107)
         assert len(replay.record(Protocol((20.0, 40.0), places=places, trials=2)).stimuli) == 8
+    # Without any number, each set of electrodes is a pattern.
+    unnumbered = replace(sources[0].stimuli, pattern=np.full(len(sources[0].stimuli), -1))
+    patterns = ReplayCulture([replace(sources[0], stimuli=unnumbered)]).patterns
+    assert patterns.tolist() == [[100, 101, -1], [103, 105, 107]]
 
 
 def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypatch: pytest.MonkeyPatch) -> None:
