@@ -437,6 +437,8 @@ def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
     unnumbered = replace(sources[0].stimuli, pattern=np.full(len(sources[0].stimuli), -1))
     patterns = ReplayCulture([replace(sources[0], stimuli=unnumbered)]).patterns
     assert patterns.tolist() == [[100, 101, -1], [103, 105, 107]]
+    for recorded_hz, rate_hz in ((25_000.0, 25_000.0), (np.nan, 20_000.0)):
+        assert ReplayCulture([replace(sources[0], sampling_rate_hz=recorded_hz)]).sampling_rate_hz == rate_hz
 
 
 def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypatch: pytest.MonkeyPatch) -> None:
