@@ -187,7 +187,8 @@ def test_its_clock_begins_at_0_and_goes_on_where_the_devices_frames_begin_anew(r
     rig.now = 100
     with culture:
         assert culture.now_s == 4.0
-        assert len(culture.advance(1.0).time_s) == 0
+        observed = culture.deliver([], 1.0)
+        assert (observed.start_s, observed.duration_s, len(observed.spikes.time_s)) == (4.0, 1.0, 0)
         assert culture.now_s == 5.0
 
 
