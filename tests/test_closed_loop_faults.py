@@ -691,7 +691,7 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert "No space left on device" in session.ending.message
         assert disk.room == 0
         assert_safe(session, culture, 20)
-    assert session.log.lost_bytes == 0
+    assert session.log.lost_bytes == read_session(tmp_path).log.lost_bytes == 0
     assert "could not be written" in session.ending.message
     assert re.fullmatch(
         r"the log cannot be written: No space left on device; "
@@ -700,6 +700,24 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     )
     with pytest.raises(InvalidFile, match="No space left"):
         LogWriter(tmp_path / "other.log", {})
+
+
+def test_the_log_is_flushed_to_disk_before_the_first_pulse_meanwhile_and_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed: list[tuple[int, int, int]] = []
+
+    def fsync(file: int) -> None:
+        status = os.fstat(file)
+        flushed.append((status.st_ino, status.st_size, culture.pulses))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr("animat.closed_loop.running._SYNC_S", 0.0)
+    with FakeCulture() as culture:
+        run(tmp_path, culture, robot=Navigation(episode_limit=3))
+    log = (tmp_path / LOG_FILE).stat()
+    first, *meanwhile, last = [(size, pulses) for inode, size, pulses in flushed if inode == log.st_ino]
+    assert first[1] == 0 and len(meanwhile) >= 1 and last == (log.st_size, 15)
 
 
 def test_a_log_that_cannot_be_begun_leaves_nothing_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
