@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import sys
 import threading
@@ -149,8 +150,19 @@ def test_a_train_at_the_limit_keeps_its_pace_wherever_it_begins(neurons: Neurons
     """Half of these begin half-way between two frames: rounded to even, every other interval would be too short."""
     with CL1Culture() as culture:
         train = [Stimulus((begins_us + 5000 * n) / 1e6, (1,), CL1_PULSE) for n in range(20, 60)]
-        began = np.rint(culture.deliver(train, 0.4).stimulus_time_s * 25_000)
+        observed = culture.deliver(train, 0.4)
+    began = [frame for frame, *_ in neurons.pulses]
+    assert np.rint((observed.start_s + observed.stimulus_time_s) * 25_000).tolist() == began
+    # To the nearest frame of 40 us from the request at 0, halves up.
+    assert began[0] == (begins_us + 100_000 + 20) // 40
     assert set(np.diff(began)) == {125}
+
+
+def test_a_pulse_at_the_very_end_of_a_delivery_is_waited_for(neurons: Neurons) -> None:
+    with CL1Culture(ticks_per_s=25_000) as culture:
+        # Its nearest frame is the one after the last: 250.
+        observed = culture.deliver([Stimulus(0.009999, (1,), CL1_PULSE)], 0.01)
+    assert np.rint(observed.stimulus_time_s * 25_000).tolist() == [250]
 
 
 def test_the_five_frequencies_are_delivered_to_a_frame(neurons: Neurons) -> None:
@@ -196,6 +208,14 @@ def test_a_pulse_that_never_comes_is_an_error_that_names_it(neurons: Neurons) ->
     neurons.drop = {9}
     with CL1Culture() as culture, pytest.raises(DeviceFailed, match=r"expected a pulse on channel 9 .* left it out"):
         culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE)], 0.1)
+
+
+@pytest.mark.parametrize("ticks", [0, 3])
+def test_a_loop_that_ends_before_all_was_sent_is_an_error(ticks: int, neurons: Neurons) -> None:
+    loop = neurons.loop
+    neurons.loop = lambda *given, **more: itertools.islice(loop(*given, **more), ticks)  # type: ignore[method-assign]
+    with CL1Culture() as culture, pytest.raises(DeviceFailed, match="expected a loop over 1 s, got one that ended"):
+        culture.deliver([Stimulus(0.5, (1,), CL1_PULSE)], 1.0)
 
 
 def test_a_timeout_interrupts_every_channel_and_is_one_line(neurons: Neurons) -> None:
@@ -265,6 +285,23 @@ def test_an_emergency_stop_half_way_delivers_nothing_more(neurons: Neurons) -> N
         assert neurons.queue == []
         culture.advance(0.5)
         assert len(neurons.pulses) == delivered
+
+
+def test_a_stop_after_the_last_pulse_was_sent_ends_the_delivery_too(neurons: Neurons) -> None:
+    with CL1Culture() as culture:
+        ticks, loop = [0], neurons.loop
+
+        def stopping(*given: int, **more: object) -> Iterator[object]:
+            for tick in loop(*given, **more):
+                ticks[0] += 1
+                if ticks[0] == 100:
+                    culture.stop("seen enough")
+                yield tick
+
+        neurons.loop = stopping  # type: ignore[method-assign]
+        with pytest.raises(DeviceFailed, match="stopped while delivering: 1 of 1 stimuli had been sent"):
+            culture.deliver([Stimulus(0.05, (1,), CL1_PULSE)], 1.0)
+        assert ticks == [100] and len(neurons.pulses) == 1
 
 
 def test_a_stop_from_another_thread_lets_nothing_through_after_it(neurons: Neurons) -> None:
@@ -357,10 +394,10 @@ def test_a_delivery_that_hung_hands_over_nothing_in_a_later_session(neurons: Neu
 
 def test_the_stimuli_are_kept_beside_the_devices_own_recording(neurons: Neurons, tmp_path) -> None:  # type: ignore[no-untyped-def]
     with CL1Culture(record_to=tmp_path) as culture:
-        culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 3, 7)], 0.01)
+        culture.deliver([Stimulus(0.0, (1, 9), CL1_PULSE, 20.0, 0, 7)], 0.01)
     ((frame, text),) = neurons.stream
     assert frame == neurons.pulses[0][0]
-    assert parse_line(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 3, "presentation": 7}
+    assert parse_line(text) == {"electrodes": [1, 9], "frequency_hz": 20.0, "pattern": 0, "presentation": 7}
     assert Pulse.from_list(json.loads(text)["phases"]) == CL1_PULSE
 
 

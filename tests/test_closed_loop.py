@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -359,6 +360,16 @@ def test_the_silent_control_gives_no_pulse_and_the_shuffled_one_another_conditio
     silent = [tick for tick in session.ticks if tick.agent == "no"]
     assert not any(tick.patterns or tick.pulse_time_s for tick in silent)
     assert all(tick.reward is not None for tick in silent)
+    # What is read is what came when the response to a pulse of 5 Hz would have come.
+    for before, tick in pairwise(silent):
+        assert tick.iteration == 0 or tick.read_after_s - before.read_after_s == pytest.approx(0.2, abs=1e-4)
+    recording = session.recording()
+    since_ms = 1e3 * np.subtract.outer([tick.read_after_s for tick in silent], recording.spike_times_s)
+    inside = (-since_ms >= 2.0 - 1e-6) & (-since_ms < 10.0 - 1e-6)
+    assert [tick.spikes for tick in silent] == inside.sum(axis=1).tolist() != [0] * 60
+    # All that was seen is recorded, the pauses too: this culture's clock stands still in between.
+    assert recording.duration_s == pytest.approx(culture.now_s - 12.0, abs=1e-4)
+    assert recording.provenance["closed_loop_unwatched_s"] == "0.000000"
     shuffled = [tick.delivered for tick in session.ticks if tick.agent == "any"]
     assert {tick.chosen for tick in session.ticks if tick.agent == "any"} == {4}
     assert set(shuffled) == set(range(5))
@@ -685,6 +696,7 @@ def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:
 
 def test_a_budget_is_kept_to_the_pulse() -> None:
     account = Account(Budget(pulses=10, pulses_per_electrode=4))
+    assert account.to_dict() == {"pulses": 0, "of": 10, "most_on_an_electrode": 0, "of_per_electrode": 4}
     pair = [Stimulus(0.0, (1, 2), PUBLISHED_PULSE), Stimulus(0.1, (2, 3), PUBLISHED_PULSE)]
     for _ in range(2):
         account.check(pair)

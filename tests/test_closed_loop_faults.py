@@ -24,6 +24,7 @@ from animat.closed_loop.log import LogWriter, Record, read_log
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session, read_session, recover_session
 from animat.closed_loop.session_data import LOG_FILE
+from animat.closed_loop.stretch import check_answer
 from animat.cultures.budget import Account, Budget
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.request import Request
@@ -151,6 +152,40 @@ def test_a_backend_that_answers_garbage(tmp_path: Path, fault: Fault, words: str
         assert words in session.ending.message
         assert_safe(session, culture, 7)
     assert session.to_dict()["unanswered_pulses"] == 1
+
+
+RIGHT = Observed(5.0, 0.02, Spikes(np.array([0.0, 0.01, 0.02]), np.array([0, 7, 15])), np.array([0.001]))
+"""A possible answer of 16 channels, at 20 kHz, to a pulse after 1 ms of the 20 ms from 5 s on."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({}, None),
+        # Rounded to samples, times may be off by a sample and a half; counted from a later start they are earlier.
+        ({"start_s": 5.0 - 7e-5, "duration_s": 0.0201}, None),
+        ({"start_s": 5.0 - 8e-5, "duration_s": 0.0201}, "went back to 4.99992 s"),
+        ({"stimulus_time_s": np.array([0.001 - 7e-5])}, None),
+        ({"stimulus_time_s": np.array([0.001 - 8e-5])}, "a stimulus 0.08 ms before"),
+        ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0005])}, None),
+        ({"start_s": 5.0005, "stimulus_time_s": np.array([0.0004])}, "a stimulus 0.1 ms before"),
+        ({"duration_s": 0.02 - 5e-7, "spikes": Spikes(np.empty(0), np.empty(0, int))}, None),
+        ({"duration_s": 0.02 - 2e-6, "spikes": Spikes(np.empty(0), np.empty(0, int))}, "where 0.02 s from 5.0 s were"),
+        ({"start_s": np.inf}, "returned 0.02 s from inf s"),
+        ({"duration_s": np.inf}, "returned inf s from 5.0 s"),
+        ({"spikes": Spikes(np.array([-2e-9]), np.array([0]))}, "spike times outside of the 0.02 s"),
+        ({"spikes": Spikes(np.array([0.02 + 2e-9]), np.array([0]))}, "spike times outside of the 0.02 s"),
+        ({"spikes": Spikes(np.array([0.01, 0.01]), np.array([15, 0]))}, None),
+        ({"spikes": Spikes(np.array([0.0, 0.015, 0.01]), np.array([0, 1, 2]))}, "spike times that do not rise"),
+        ({"spikes": Spikes(np.array([0.01]), np.array([16]))}, "channel 16 of 16"),
+        ({"spikes": Spikes(np.array([0.01]), np.array([-1]))}, "channel -1 of 16"),
+        ({"spikes": Spikes(np.array([0.01]), np.array([1], np.uint8))}, None),
+    ],
+)
+def test_an_answer_is_possible_to_within_rounding_and_no_further(changed: dict[str, Any], words: str | None) -> None:
+    asked = {"requested_s": np.array([0.001]), "duration_s": 0.02, "since_s": 5.0, "from_s": 5.0}
+    fault = check_answer(replace(RIGHT, **changed), **asked, sample_s=5e-5, n_channels=16)  # type: ignore[arg-type]
+    assert fault is None if words is None else words in str(fault)
 
 
 class Gone(FakeCulture):
@@ -438,13 +473,12 @@ class Broken:
                 return moved
             if self.how == "raises":
                 raise ZeroDivisionError("the wheel came off")
-            return moved._replace(reward=float("nan"))
+            return moved._replace(truncated=True) if self.how == "stops" else moved._replace(reward=float("nan"))
 
         return broken
 
 
-@pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
-def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def break_robot(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from animat.closed_loop import runner
 
     broken = Broken(how)
@@ -455,6 +489,22 @@ def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: p
             self.step = broken(self.step)  # type: ignore[method-assign]
 
     monkeypatch.setattr(runner, "RobotRunner", BrokenRunner)
+
+
+def test_a_robot_that_cuts_its_episode_off_ends_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    break_robot("stops", monkeypatch)
+    with FakeCulture() as culture:
+        session = run(tmp_path, culture)
+        assert session.ending.by == "plan"
+        assert culture.pulses == 11
+    # It does so in its seventh step and in every later one.
+    assert [episode.iterations for episode in session.episodes] == [7, 1, 1, 1, 1]
+    assert all(episode.is_whole and not episode.terminated for episode in session.episodes)
+
+
+@pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])
+def test_a_robot_that_fails(tmp_path: Path, how: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    break_robot(how, monkeypatch)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "robot"
@@ -641,7 +691,7 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert "No space left on device" in session.ending.message
         assert disk.room == 0
         assert_safe(session, culture, 20)
-    assert session.log.lost_bytes == 0
+    assert session.log.lost_bytes == read_session(tmp_path).log.lost_bytes == 0
     assert "could not be written" in session.ending.message
     assert re.fullmatch(
         r"the log cannot be written: No space left on device; "
@@ -650,6 +700,24 @@ def test_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     )
     with pytest.raises(InvalidFile, match="No space left"):
         LogWriter(tmp_path / "other.log", {})
+
+
+def test_the_log_is_flushed_to_disk_before_the_first_pulse_meanwhile_and_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed: list[tuple[int, int, int]] = []
+
+    def fsync(file: int) -> None:
+        status = os.fstat(file)
+        flushed.append((status.st_ino, status.st_size, culture.pulses))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr("animat.closed_loop.running._SYNC_S", 0.0)
+    with FakeCulture() as culture:
+        run(tmp_path, culture, robot=Navigation(episode_limit=3))
+    log = (tmp_path / LOG_FILE).stat()
+    first, *meanwhile, last = [(size, pulses) for inode, size, pulses in flushed if inode == log.st_ino]
+    assert first[1] == 0 and len(meanwhile) >= 1 and last == (log.st_size, 15)
 
 
 def test_a_log_that_cannot_be_begun_leaves_nothing_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

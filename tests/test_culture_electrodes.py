@@ -20,7 +20,7 @@ from animat.cultures.tissue.parameters import ShortTerm
 from animat.cultures.tissue.tissue import Spikes
 from animat.cultures.virtual import WARM_UP_S, VirtualCulture
 from animat.cultures.visibility import NOISE_UV
-from animat.errors import InvalidArgument, InvalidFile, Mismatch
+from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Recording
@@ -386,6 +386,44 @@ def test_a_replay_answers_a_frequency_that_its_recordings_state_rounded() -> Non
         replay.deliver([Stimulus(0.0, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0)], 0.01)
 
 
+def test_a_replay_answers_from_the_newest_recording_at_its_clock() -> None:
+    with FakeCulture() as fake:
+        source = fake.record(Protocol((20.0,), patterns=2, trials=4))
+
+    def answering(channel: int, start_min: float) -> Recording:
+        times_s = source.stimuli.time_s + 0.003
+        channels = np.full(len(times_s), channel)
+        return replace(source, start_min=start_min, spike_times_s=times_s, spike_channels=channels)
+
+    with ReplayCulture([answering(1, 40.0), answering(0, 30.0)]) as replay:
+        replay.rest(599.99)
+        pulses = [Stimulus(t, replay.stimulation_electrodes[:1], PUBLISHED_PULSE, 20.0) for t in (0.0, 0.02)]
+        observed = replay.deliver(pulses, 0.05)
+        assert observed.start_s == pytest.approx(2399.99)
+        assert (observed.spikes.time_s.tolist(), observed.spikes.channel.tolist()) == ([0.003, 0.023], [0, 1])
+        # A rest ends before the spike at its very end.
+        replay.deliver(pulses[:1], 0.001)
+        replay.rest(0.002)
+        assert replay.advance(0.01).time_s.tolist() == [0.0]
+
+
+def test_what_a_replay_cannot_answer_from_is_refused() -> None:
+    with FakeCulture() as fake:
+        source = fake.record(Protocol((20.0,), patterns=2, trials=4))
+    n = len(source.stimuli)
+    others = replace(source.channels, label=np.array([f"other {label}" for label in source.channels.label]))
+    for recordings, kind, words in (
+        ([], InvalidArgument, "recordings: expected at least one"),
+        ([source, replace(source, channels=others)], Mismatch, "recordings: expected the same channels in all"),
+        *(
+            ([replace(source, stimuli=replace(source.stimuli, **{name: unknown}))], UnusableData, "known frequency and")
+            for name, unknown in (("frequency_hz", np.full(n, np.nan)), ("electrodes", np.full((n, 1), -1)))
+        ),
+    ):
+        with pytest.raises(kind, match=words):
+            ReplayCulture(recordings)
+
+
 def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
     """A place that is one of the culture's patterns has a number, and one that is not has none."""
     places = ((100, 101), (103, 105, 107))
@@ -395,6 +433,12 @@ def test_a_replay_is_stimulated_wherever_its_recordings_were() -> None:
     with ReplayCulture(sources) as replay:
         assert replay.stimulation_electrodes == (100, 101, 102, 103, 105, 106, 107)
         assert len(replay.record(Protocol((20.0, 40.0), places=places, trials=2)).stimuli) == 8
+    # Without any number, each set of electrodes is a pattern.
+    unnumbered = replace(sources[0].stimuli, pattern=np.full(len(sources[0].stimuli), -1))
+    patterns = ReplayCulture([replace(sources[0], stimuli=unnumbered)]).patterns
+    assert patterns.tolist() == [[100, 101, -1], [103, 105, 107]]
+    for recorded_hz, rate_hz in ((25_000.0, 25_000.0), (np.nan, 20_000.0)):
+        assert ReplayCulture([replace(sources[0], sampling_rate_hz=recorded_hz)]).sampling_rate_hz == rate_hz
 
 
 def test_a_rest_that_is_broken_off_was_as_long_as_the_tissue_has_rested(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,6 +43,7 @@ from animat.responses.extraction import extract_responses
 from animat.robots import Navigation
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import PUBLISHED_PULSE
+from animat.stimulation.stimulus import Stimulus
 from animat.training.policy import load_policies
 from animat.training.settings import SAC
 from animat.training.specification import Training
@@ -238,15 +239,16 @@ def test_without_room_on_the_disk_nothing_is_recorded(tmp_path: Path, monkeypatc
     assert not (tmp_path / "live" / ".exchange").exists()
 
 
-def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path) -> None:
-    account = Account(Budget())
+@pytest.mark.parametrize("error", [DeviceFailed("gone"), KeyboardInterrupt()], ids=repr)
+def test_of_a_recording_that_ends_half_way_the_pulses_are_spent(error: BaseException) -> None:
+    account = Account(Budget(3 * 80 + 5 * 80))
     blocked = Protocol(pulses=2, patterns=8, trials=40, setup_s=0.1)
 
     def fail(culture: FakeCulture, observed: Observed) -> Observed:
-        raise DeviceFailed("gone")
+        raise error
 
     with FakeCulture(fault=fail, at=2) as culture:
-        with pytest.raises(DeviceFailed):
+        with pytest.raises(type(error)):
             record_within(account, culture, blocked, 1)
         # Blocks of 80: two were recorded, and the third was handed over.
         assert account.pulses == culture.delivered == culture.pulses == 3 * 80
@@ -254,6 +256,9 @@ def test_of_a_recording_that_fails_half_way_the_pulses_are_spent(tmp_path: Path)
             culture.stop()
             record_within(account, culture, blocked, 1)
         assert account.pulses == 3 * 80
+        account.spend([Stimulus(0.0, (100,), PUBLISHED_PULSE)])
+        with pytest.raises(BudgetSpent, match="241 of 640 pulses are spent, and 400 more were wanted"):
+            record_within(account, culture, blocked, 1)
 
 
 def test_of_a_block_in_stretches_that_stops_half_way_all_pulses_are_spent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import pytest
 from animat.closed_loop.agents import ActorController, Agent, AnyCondition, OneCondition, agent_of
 from animat.closed_loop.running import run_session
 from animat.closed_loop.session import Session
+from animat.closed_loop.stretch import Stretch, read_response
 from animat.closed_loop.tick import Tick
 from animat.coding.mapping import Thresholds
 from animat.environment import Animat
@@ -68,6 +69,22 @@ def test_random_spikes_are_recorded_responses_and_no_pulses(session: Session) ->
     decoder, percentiles = loop_of(robot=ROBOT).decoder, loop_of(robot=ROBOT).percentiles
     wanted = [float(decoder.command(np.float32(tick.rate_hz), percentiles)) for tick in ticks]
     assert [tick.command for tick in ticks] == wanted
+
+
+def test_a_burst_of_the_culture_is_none_of_the_response_that_is_drawn_in_its_place() -> None:
+    channels, drawn = FakeCulture().channels, np.array([7.5])
+    # One spike on each of 16 channels, in 8 ms. No response is a burst at a threshold of 1.
+    stretch = Stretch(0, 0.0, 0.02, np.full(16, 0.006), np.arange(16), channels, np.empty(0))
+    for threshold, drawn_from, hz, is_burst in (
+        (0.9, None, 125.0, True),
+        (1, None, 125.0, False),
+        (0.9, drawn, 7.5, False),
+    ):
+        loop, rng = loop_of(burst_threshold=threshold), np.random.default_rng(1)
+        members = loop.readouts.members(channels)
+        x_hz, tick = read_response(loop, drawn_from, stretch, members, np.zeros(1), rng)
+        assert (float(x_hz), tick["rate_hz"], tick["is_burst"]) == (hz, hz, is_burst)
+        assert (tick["spikes"], tick["active_ratio"], tick["readout_hz"]) == (16, 1.0, ())
 
 
 def test_yoked_stimuli_are_those_of_a_policy_s_episode_before(session: Session) -> None:

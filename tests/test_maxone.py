@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,49 @@ def test_a_recording_is_delivered_to_the_sample_within_a_sequence(rig: Rig) -> N
     for row, frame in enumerate(frames):
         out = {pulse.electrode for pulse in rig.delivered if pulse.frame == frame}
         assert out == set(recording.stimuli.electrodes[row].tolist())
+
+
+def test_what_begins_late_is_observed_as_much_longer(rig: Rig) -> None:
+    with culture_on(rig) as culture:
+        observed = culture.deliver([Stimulus(0.0, (SITES[0],), BALANCED_PULSE)], 0.05)
+    # All of a sequence has to arrive before its first pulse, for which it waits 5 ms.
+    assert observed.stimulus_time_s.tolist() == [0.005]
+    assert observed.duration_s == 0.055
+
+
+def test_a_sequence_waits_for_the_last_pulse_of_the_one_before(rig: Rig) -> None:
+    # The stand-in fails for two at once.
+    with culture_on(rig, sequence_s=0.1) as culture:
+        stimuli = [Stimulus(t, (SITES[i],), BALANCED_PULSE) for i, t in enumerate((0.01, 0.109, 0.1115))]
+        observed = culture.deliver(stimuli, 0.2)
+    assert len(rig.sent) == 2
+    assert np.diff(observed.stimulus_time_s)[1] >= 0.001 + 0.005
+
+
+def test_its_clock_begins_at_0_and_goes_on_where_the_devices_frames_begin_anew(rig: Rig) -> None:
+    culture = culture_on(rig)
+    with culture:
+        assert culture.now_s == 0.0
+        culture.rest(3.0)
+    rig.now += 20_000
+    with culture:
+        assert culture.now_s == 4.0
+    rig.now = 100
+    with culture:
+        assert culture.now_s == 4.0
+        observed = culture.deliver([], 1.0)
+        assert (observed.start_s, observed.duration_s, len(observed.spikes.time_s)) == (4.0, 1.0, 0)
+        assert culture.now_s == 5.0
+
+
+def test_each_step_of_opening_settles_as_long_as_the_vendor_says(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("animat.cultures.devices.maxone.time.sleep", slept.append)
+    timing = SimpleNamespace(waitInit=1, waitAfterDownload=2.5)
+    monkeypatch.setattr(sys.modules["maxlab"], "Timing", timing, raising=False)
+    with MaxOneCulture(selection(), stream=Stream(rig)):
+        # The last is unknown to this version of the module.
+        assert slept == [1.0, 2.5, 5.0]
 
 
 def test_spikes_are_by_channel_and_those_of_no_electrode_are_counted(rig: Rig) -> None:

@@ -278,6 +278,7 @@ WIDE = replace(SIMULATED_LIMITS, stimuli_per_s=10, stimuli_per_electrode_s=5, st
         ("sites", [one(electrodes=(10, 10))], "each electrode once"),
         ("overlap", [one(), one(time_s=0.0005)], "500 us too early"),
         ("overlap", [one(time_s=math.nan)], "finite times"),
+        ("overlap", [one(time_s=-1e-6)], "from 0 s on, got -1e-06"),
         ("stimuli_per_s", [one(electrodes=(10 + i % 3,), time_s=i * 0.09) for i in range(11)], "at most 10 stimuli"),
         ("stimuli_per_electrode_s", [one(time_s=i * 0.1) for i in range(6)], "at most 5 stimuli on an electrode"),
         ("stimuli_per_session", [one(time_s=float(i)) for i in range(21)], "at most 20 stimuli in a session"),
@@ -335,6 +336,21 @@ def test_a_gap_of_more_than_a_second_does_not_keep_the_first_stimulus_waiting() 
     with pytest.raises(UnsafeStimulus, match="gap_us: expected"):
         guard.check([Stimulus(0.0, (11,), BALANCED_PULSE)], ends_s + 4.999)
     guard.check([Stimulus(0.0, (11,), BALANCED_PULSE)], ends_s + 5)
+
+
+def test_only_what_time_makes_safe_is_waited_for() -> None:
+    loud, last = one(Pulse((Phase(100, amplitude_mv=-401),))), one(time_s=0.2)
+    for interval_us, earliest_s in ((100_000.0, 0.3), (2_000_000.0, 2.2), (5_000_000.0, None)):
+        guard = Guard(replace(WIDE, interval_us=interval_us), SITES)
+        guard.admit([last], 0.0)
+        with pytest.raises(UnsafeStimulus, match="amplitude"):
+            guard.earliest([loud], 0.25)
+        if earliest_s is None:
+            with pytest.raises(UnsafeStimulus, match="interval_us"):
+                guard.earliest([one()], 0.25)
+        else:
+            # In steps of a millisecond.
+            assert earliest_s - 1e-9 <= guard.earliest([one()], 0.25) < earliest_s + 0.001
 
 
 def test_limits_that_cannot_be_are_refused() -> None:

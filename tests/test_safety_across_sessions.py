@@ -173,6 +173,13 @@ def test_a_second_after_it_was_broken_off_nothing_holds_it_back(clock: Clock) ->
     culture.advance(1.0)
     culture.deliver([Stimulus(0.18 * i, (10 + i,), BALANCED_PULSE) for i in range(6)], 1.0)
     assert len(culture.given) == 8
+    # Nor does a stimulus of long ago, on a clock that begins anew before it.
+    culture.advance(2.0)
+    culture.advance(0.1)
+    culture.close()
+    culture.open()
+    culture.deliver([Stimulus(0.0, (10,), BALANCED_PULSE)], 0.1)
+    assert len(culture.given) == 9
 
 
 def test_a_limit_on_intervals_may_be_longer_than_a_second() -> None:

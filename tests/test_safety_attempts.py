@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import FrozenInstanceError, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -31,6 +32,7 @@ from animat.cultures.devices.cl1 import CL1_LIMITS, CL1_PULSE, CL1Culture
 from animat.cultures.devices.maxone import MAXONE_LIMITS, MaxOneCulture
 from animat.cultures.limits import SIMULATED_LIMITS, Limits
 from animat.cultures.observed import Observed
+from animat.cultures.openable import Turns
 from animat.cultures.safety import Admitted, Guard
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
 from animat.stimulation.array import MAXONE
@@ -151,6 +153,18 @@ def test_a_close_from_another_thread_ends_what_is_delivered() -> None:
     assert not hanging.is_alive()
     with pytest.raises(InvalidArgument, match="expected an open one"):
         culture.deliver([one()], 0.1)
+
+
+def test_a_call_that_was_on_its_way_when_it_was_closed_is_refused() -> None:
+    turns, halted = Turns(Guard(SIMULATED_LIMITS, (100,))), list[int]()
+    turns.end(lambda: halted.append(1), 0.1)
+    with pytest.raises(InvalidArgument, match="got one that was closed meanwhile"), turns:
+        pass
+    # Another thread is told the same, and does not wait. None had a turn, so nothing was to be halted.
+    turns.guard.stop("it was closed")
+    with ThreadPoolExecutor(1) as thread, pytest.raises(InvalidArgument, match="got one that was closed meanwhile"):
+        thread.submit(turns.__enter__).result()
+    assert halted == []
 
 
 def test_a_delivery_from_within_a_delivery_is_refused() -> None:
@@ -419,8 +433,10 @@ def test_limits_of_a_subclass_are_what_their_attributes_say() -> None:
             pass
 
     wide = Wide(**{each.name: getattr(SIMULATED_LIMITS, each.name) for each in fields(Limits)} | {"amplitude": 1e9})
+    culture = FakeCulture(limits=wide)
+    culture._open = lambda: pytest.fail("opened in vain")  # type: ignore[method-assign]
     with pytest.raises(InvalidArgument, match=r"limits\.amplitude"):
-        FakeCulture(limits=wide).open()
+        culture.open()
     with pytest.raises(InvalidArgument, match="expected Limits, got dict"):
         FakeCulture(limits={"amplitude": 1e9})  # type: ignore[arg-type]
 
@@ -519,6 +535,7 @@ def test_budgets_that_are_no_whole_number_are_refused(name: str, value: Any) -> 
     with pytest.raises(InvalidArgument, match=f"budget.{name}: expected"):
         Budget(**{name: value})
     assert Budget(**{name: np.int16(3)}) == Budget(**{name: 3})
+    assert type(getattr(Budget(**{name: np.int16(3)}), name)) is int
 
 
 # Copies.

@@ -70,7 +70,7 @@ class SessionData:
         }
         if outline.left_out:
             metadata["left_out"] = describe_left_out(outline.left_out)
-        duration_s = max(0.0, self._end_s, self.spike_counts.span_s[1], *self._time_s[-1:])
+        duration_s = max(self._end_s, self.spike_counts.span_s[1], *self._time_s[-1:])
         metadata["closed_loop_unwatched_s"] = f"{max(0.0, duration_s - self._watched_s):.6f}"
         return Recording(
             spike_times_s=[],  # type: ignore[arg-type]
@@ -87,7 +87,7 @@ class SessionData:
 
     def _stimuli(self) -> Stimuli:
         widths = np.array(self._widths, np.int64)
-        electrodes = np.full((len(widths), int(np.max(widths, initial=0)) if len(widths) else 1), UNKNOWN)
+        electrodes = np.full((len(widths), int(np.max(widths)) if len(widths) else 1), UNKNOWN)
         electrodes[np.arange(electrodes.shape[1])[None, :] < widths[:, None]] = self._electrodes
         return Stimuli(
             time_s=np.array(self._time_s, np.float64),

@@ -262,7 +262,6 @@ class MaxOneCulture(Culture):
         self._switch_power(False)
 
     def _close(self) -> None:
-        self._halted.set()
         mx, wiring = self._mx, self._wiring
         # Whatever fails, the rest is still tried, in reverse order.
         with ExitStack() as steps:
