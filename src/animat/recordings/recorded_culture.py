@@ -58,11 +58,9 @@ class RecordedCulture:
             if self.seed != other.seed:
                 return f"{self} {self.seed}", f"{other} {other.seed}"
             return None
-        names, others = dict(self.names), dict(other.names)
-        for name, value in others.items():
-            # The same chip may move to another system.
-            is_moved = name == "system_id" and names.get("chip_id", "") == others.get("chip_id")
-            if names.get(name, value) != value and not is_moved:
+        names = dict(self.names)
+        for name, value in other.names:
+            if names.get(name, value) != value:
                 return f"{name} {names[name]}", f"{name} {value}"
         return None
 
