@@ -180,6 +180,13 @@ def test_empty_and_thin_conditions() -> None:
     one = message(answering({5: 10.0, 10: 14.0}, n=1), "few-samples", burst_threshold=1)
     assert one.endswith("1 non-burst response; a distribution needs 30 or more")
     assert "few-samples" not in names(extract_responses(answering({5: 10.0, 10: 14.0}, n=30), burst_threshold=1))
+    # Frequencies that were computed from intervals may make a condition of each stimulus.
+    many = extract_responses(answering({5 + i / 8: 10.0 for i in range(40)}, n=2), burst_threshold=1)
+    (finding,) = [finding for finding in many.findings if finding.name == "few-samples"]
+    assert finding.message.startswith(
+        "40 of 40 conditions have fewer than 30 non-burst responses, as 5 Hz (2), 5.125 Hz"
+    )
+    assert finding.value == 2
 
 
 def test_conditions_that_do_not_differ_are_said_to_give_no_control() -> None:

@@ -71,9 +71,11 @@ def _multiples(stimuli: Stimuli) -> Iterator[dict[float, Float64[np.ndarray, " i
     """
     interval_s = np.diff(stimuli.time_s)
     for frequency_hz in (stimuli.frequency_hz[1:], stimuli.frequency_hz[:-1]):
-        known = ~np.isnan(frequency_hz) & (interval_s > 0)
-        stated_hz = np.unique(frequency_hz[known]).tolist()
-        yield {hz: interval_s[known & (frequency_hz == hz)] * hz for hz in stated_hz}
+        known = np.flatnonzero(~np.isnan(frequency_hz) & (interval_s > 0))
+        known = known[np.argsort(frequency_hz[known], kind="stable")]
+        stated_hz, first = np.unique(frequency_hz[known], return_index=True)
+        of_each = np.split(interval_s[known] * frequency_hz[known], first[1:])
+        yield dict(zip(stated_hz.tolist(), of_each[: len(stated_hz)], strict=True))
 
 
 def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:

@@ -38,6 +38,8 @@ LITTLE_DIFFERENCE = 0.2
 _WINDOW_PARTS = 8
 _PLACES = {CUT_NAMES["halves"]: "corners", CUT_NAMES["quadrants"]: "quadrants"}
 """The places to record for such readouts."""
+_MOST_LISTED = 16
+"""Conditions with few responses that have a finding each."""
 _NAMED_ALONE = ("frequency", "electrode", "pattern")
 """Kinds of conditions that may be named without values: all that occur in a recording."""
 
@@ -210,6 +212,7 @@ def _dead_conditions(
 
 
 def _conditions(responses: Responses) -> Iterator[Finding]:
+    few: list[tuple[str, int]] = []
     for i, condition in enumerate(responses.conditions):
         n_all = int(np.count_nonzero(responses.condition == i))
         n = len(responses.rates_of(i))
@@ -219,9 +222,19 @@ def _conditions(responses: Responses) -> Iterator[Finding]:
             message = f"condition {condition.label}: {what}; leave it out or choose other conditions (--conditions)"
             yield Finding("empty-condition", "refuse", message, 0.0)
         elif n < FEW_SAMPLES:
-            few = counted(n, "non-burst response")
-            message = f"condition {condition.label}: {few}; a distribution needs {FEW_SAMPLES} or more"
-            yield Finding("few-samples", "warning", message, float(n))
+            few.append((condition.label, n))
+    if len(few) > _MOST_LISTED:
+        message = (
+            f"{len(few):,} of {len(responses.conditions):,} conditions have fewer than {FEW_SAMPLES} non-burst "
+            f"responses, as {some_of([f'{label} ({n})' for label, n in few])}; a distribution needs as many: "
+            "group the stimuli, for instance with --conditions interval:5,10+-25%"
+        )
+        yield Finding("few-samples", "warning", message, float(min(n for _, n in few)))
+        return
+    for label, n in few:
+        have = counted(n, "non-burst response")
+        message = f"condition {label}: {have}; a distribution needs {FEW_SAMPLES} or more"
+        yield Finding("few-samples", "warning", message, float(n))
 
 
 def _bursts(responses: Responses, bursts: BurstSeparation) -> Iterator[Finding]:

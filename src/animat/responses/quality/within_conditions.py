@@ -60,7 +60,7 @@ def compare_passing(
         if not len(usable):
             continue
         median_hz = float(np.median(responses.rate_hz[usable]))
-        for condition in range(len(responses.conditions)):
+        for condition in np.unique(responses.condition[usable]).tolist():
             chosen = usable[responses.condition[usable] == condition]
             passes, group = responses.rate_hz[chosen] >= median_hz, in_group(chosen, median_hz)
             n1 = int(np.count_nonzero(group))
