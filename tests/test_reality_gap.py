@@ -566,8 +566,11 @@ def test_the_interval_of_a_loss_is_that_of_two_means() -> None:
 
 
 @pytest.mark.parametrize("failing", [0.02, 0.2])
-def test_failures_that_were_missed_by_chance_are_in_the_interval(failing: float) -> None:
+def test_failures_that_were_missed_by_chance_are_in_the_interval(
+    failing: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Almost without an error of the prediction, and with episodes that end early as often as predicted."""
+    monkeypatch.setattr("animat.reality_gap.row._RESAMPLES", 1_000)
     rng, covered = np.random.default_rng(7), 0
     row = Row("p", "", np.zeros(9), np.zeros(9), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
 
@@ -584,6 +587,24 @@ def test_failures_that_were_missed_by_chance_are_in_the_interval(failing: float)
     # Far more failures than predicted still show.
     lost = np.tile([120.0, -60.0], 10)
     assert replace(row, measured=lost).gap.high < 0
+
+
+def test_episodes_of_a_turn_count_once_only_as_far_as_they_go_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four policies in twelve turns: from 12 to 48 episodes' worth, where they vary as much as predicted ones."""
+    monkeypatch.setattr("animat.reality_gap.row._RESAMPLES", 2_000)
+    rng, turn = np.random.default_rng(8), np.tile(np.arange(12), 4)
+    row = Row("p", "", rng.normal(50.0, 20.0, 1600), np.full(9, 50.0), np.zeros(48), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+
+    def half_width(measured: np.ndarray) -> float:
+        gap = replace(row, measured=measured, turn=turn).gap
+        return (gap.high - gap.low) / 2
+
+    each = np.mean([half_width(rng.normal(50.0, 20.0, 48)) for _ in range(10)])
+    by_start = np.mean([half_width(rng.normal(50.0, 20.0, 12)[turn]) for _ in range(10)])
+    # Not less than without turns, and not by more than their few degrees of freedom cost.
+    assert 1.0 < each / (1.96 * 20 / 48**0.5) < 1.3 and 1.0 < by_start / (1.96 * 20 / 12**0.5) < 1.3
+    # Nothing shows whether episodes that are all the same go alike.
+    assert half_width(np.full(48, 50.0)) == pytest.approx(1.96 * 20 / 12**0.5, rel=0.05)
 
 
 @pytest.mark.oracle

@@ -645,6 +645,7 @@ def test_tables_that_may_be_stimuli_are_listed_if_none_is_named_like_stimuli(tmp
         ([7, -1, 9], [[7], [-1], [9]]),
         ([[7, 9], [8, -1], [9, 7]], [[7, 9], [8, -1], [9, 7]]),
         ([7, -5, 9], [[7], [-1], [9]]),
+        (["7 -5", "-5", "9"], [[7, -1], [-1, -1], [9, -1]]),
     ],
 )
 def test_electrodes_of_each_stimulus_are_read_as_in_csv(

@@ -96,8 +96,7 @@ class Inspect(ResponseOptions):
             unusable = [each["name"] for each in inspected if each["verdict"] == "not usable"]
             results: dict[str, Any] = {"recordings": inspected, "unreadable": unreadable, "unusable": unusable}
             of_files = [responses for _, responses in series]
-            together = [*unlike_finding(of_files), *series_findings(of_files)]
-            if together:
+            if together := [*unlike_finding(of_files), *series_findings(of_files)]:
                 print("\n".join(["all together:", *finding_lines(together)]), end="\n\n")
             results["together"] = [{**finding.to_dict(), "value": finding.value} for finding in together]
             if self.out is not None and series:
@@ -105,8 +104,7 @@ class Inspect(ResponseOptions):
                 results |= self._draw_series(series, self.out)
         if unreadable:
             others = "; the rest were inspected" if inspected else ""
-            count = f"{len(unreadable)} of {len(files)} files could not be inspected"
-            print(f"animat: {count}{others}", file=sys.stderr)
+            print(f"animat: {len(unreadable)} of {len(files)} files could not be inspected{others}", file=sys.stderr)
         return results
 
     def _draw_series(self, series: Sequence[tuple[Path, Responses]], out: Path) -> dict[str, Any]:

@@ -67,7 +67,9 @@ class Row:
         drawn = resampled_means(self.measured, rng := np.random.default_rng(0), self.turn)
         if drawn is None:
             return Interval(float(mean - expected), -np.inf, np.inf, CONFIDENCE)
-        independent = len(self.measured if self.turn is None else np.unique(self.turn))
+        fewest = len(self.measured if self.turn is None else np.unique(self.turn))
+        # Episodes of a turn count once if they go alike, or if all go alike, and each by itself if they do not.
+        independent = int(np.clip(self.measured.var() / max(drawn.var(), 1e-12), fewest, len(self.measured)))
         missed = expected - rng.choice(self.predicted, (len(drawn), independent)).mean(axis=1)
         measured = mean + missed if missed.std() > drawn.std() else drawn
         return bootstrap_interval(mean - expected, measured - rng.choice(self.bootstrap_means, len(drawn)))

@@ -92,7 +92,7 @@ def _of_intervals(file: Hdf5File, at: str, findings: list[Finding]) -> dict[str,
                 break
     for name in ELECTRODES:
         if (electrodes := _electrodes(file, f"{at}/{name}", len(time_s))) is not None:
-            columns["stimulus_electrodes"] = electrodes
+            columns["stimulus_electrodes"] = np.maximum(electrodes, UNKNOWN)
             used.add(name)
             break
     known = COLUMNS | {"stimulus_electrodes": ELECTRODES}
@@ -143,7 +143,7 @@ def _electrodes(file: Hdf5File, at: str, n: int) -> Column | None:
             return None
     if dataset.dtype.kind not in "iu":
         return None
-    values = np.maximum(file.read(at).astype(np.int64), UNKNOWN)
+    values = file.read(at).astype(np.int64)
     if file.attribute(at, "neurodata_type") == "DynamicTableRegion":
         if (numbers := _electrodes_in_rows(file, at, values)) is None:
             return None
@@ -167,7 +167,7 @@ def _electrodes_in_rows(file: Hdf5File, at: str, rows: Column) -> Column | None:
     numbers = file.read(f"{ELECTRODES_TABLE}/id").astype(np.int64).reshape(-1)
     if np.any((rows < 0) | (rows >= len(numbers))):
         return None
-    return np.maximum(numbers[rows], UNKNOWN)
+    return numbers[rows]
 
 
 def _of_series(file: Hdf5File, at: str) -> Column:
