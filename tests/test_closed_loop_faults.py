@@ -549,7 +549,10 @@ def test_a_robot_that_hangs_leaves_the_response_it_did_not_move_by(
     assert session.to_dict()["unanswered_pulses"] == 0
 
 
-@pytest.mark.parametrize(("action", "words"), [(None, "raised TypeError"), (5, "chose 5"), (-1, "chose -1")])
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [(None, "raised TypeError"), (1.0, "raised TypeError"), (5, "chose 5"), (-1, "chose -1")],
+)
 def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> None:
     class Confused:
         def act(self, observation: Any, rng: np.random.Generator) -> Any:
@@ -560,6 +563,21 @@ def test_a_controller_that_fails(tmp_path: Path, action: Any, words: str) -> Non
         assert session.ending.by == "controller"
         assert f"it {words}" in session.ending.message
         assert_safe(session, culture, 0)
+
+
+@pytest.mark.parametrize(
+    ("controller", "delivery", "words"),
+    [
+        (OneCondition(0), "shufled", "it: delivery: expected one of chosen, shuffled, silent, yoked, got 'shufled'"),
+        (object(), "chosen", "it: controller: expected a method `act`, got <object"),
+        ({"p0": OneCondition(0), "p1": 3}, "silent", "it: controller: expected a method `act`, got 3"),
+    ],
+)
+def test_an_agent_that_cannot_act_is_refused_before_a_culture_is_touched(
+    controller: Any, delivery: Any, words: str
+) -> None:
+    with pytest.raises(InvalidArgument, match=re.escape(words)):
+        Agent("it", "", controller, delivery)
 
 
 def pressing(number: signal.Signals) -> Fault:

@@ -307,9 +307,9 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
     ("command", "words"),
     [
         (lambda x: 0.5, "expected 25 commands from -1 to 1, got 0.5"),
-        (lambda x: x, "expected 25 commands from -1 to 1"),
+        (lambda x: x, "expected commands from -1 to 1, got 1.5 at 1.5 Hz"),
         # A little above 1, at the largest response only.
-        (lambda x: x / 9_900, "expected 25 commands from -1 to 1, got "),
+        (lambda x: x / 9_900, "expected commands from -1 to 1, got 1.0101 at 10000 Hz"),
         (
             lambda x: -x / (x + 100),
             "expected commands that never fall as the response rises, got -0 at 0 Hz and -0.0",
@@ -324,8 +324,8 @@ def test_robots_that_keep_to_the_contract_pass() -> None:
             "expected the same command for a single response as in an array, 1, got 0",
         ),
         # A line without its ends, which only a response far above the largest measured one shows.
-        (lambda x: (x - 6) / 12, "expected 25 commands from -1 to 1, got "),
-        (lambda x: x * np.nan, "expected 25 commands from -1 to 1"),
+        (lambda x: (x - 6) / 12, "expected commands from -1 to 1, got 832.833 at 10000 Hz"),
+        (lambda x: x * np.nan, "expected commands from -1 to 1, got nan at 0 Hz"),
         (lambda x: x.command, "expected commands, got AttributeError"),
     ],
 )

@@ -589,6 +589,17 @@ def test_failures_that_were_missed_by_chance_are_in_the_interval(
     assert replace(row, measured=lost).gap.high < 0
 
 
+def test_no_gap_is_beyond_what_an_episode_can_return() -> None:
+    row = Row("p", "", np.full(9, 100.0), np.full(9, 100.0), np.zeros(0), 1.0, 1.0, None, 0.0, 0.0, 0.0)
+    two = replace(row, measured=np.array([120.0, 20.0]))
+    gap = replace(two, within=(-100.0, 120.0)).gap
+    # From two episodes the interval would reach from -500 to 440.
+    assert (gap.low, gap.value, gap.high) == (-200.0, -30.0, 20.0)
+    assert two.gap.low < -400 and two.gap.high > 300
+    # A robot of one's own may return more than it says.
+    assert replace(two, within=(0.0, 1.0)).gap.high == 20.0
+
+
 def test_episodes_of_a_turn_count_once_only_as_far_as_they_go_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four policies in twelve turns: from 12 to 48 episodes' worth, where they vary as much as predicted ones."""
     monkeypatch.setattr("animat.reality_gap.row._RESAMPLES", 2_000)

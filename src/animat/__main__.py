@@ -1,5 +1,6 @@
 """`python -m animat` runs the command `animat`."""
 
+import os
 import sys
 
 from animat.ctrl_c import interruptible
@@ -11,10 +12,16 @@ def main() -> int:
         with interruptible():
             from animat.cli import main as run
 
-            return run()
+            status = run()
     except KeyboardInterrupt:
         print("animat: interrupted", file=sys.stderr)
-        return 130
+        status = 130
+    if status == 130:
+        # Without waiting for compiled programs, which crash if they still run while Python exits.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status
 
 
 if __name__ == "__main__":

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64
 
 from animat.environment import Animat, Environment
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 from animat.evaluation.controls import RANDOM, Control, Delivered
 from animat.evaluation.rollouts import Actor, Constant, Networks, Uniform
 
@@ -101,6 +101,9 @@ class Agent:
         drawn_from: responses from which one is drawn in place of the culture's; None: the culture's own is read.
         is_turned_round: whether every command is reversed.
         switch_at: the iteration after which the robot gets another goal; None: never.
+
+    Raises:
+        InvalidArgument: for another delivery, or a controller without `act`.
     """
 
     name: str
@@ -111,6 +114,15 @@ class Agent:
     drawn_from: Float64[np.ndarray, "responses *readouts"] | None = None
     is_turned_round: bool = False
     switch_at: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.delivery not in get_args(Delivered):
+            kinds = ", ".join(get_args(Delivered))
+            raise InvalidArgument(f"{self.name}: delivery: expected one of {kinds}, got {self.delivery!r}")
+        controllers = self.controller.values() if isinstance(self.controller, Mapping) else (self.controller,)
+        for controller in controllers:
+            if not callable(getattr(controller, "act", None)):
+                raise InvalidArgument(f"{self.name}: controller: expected a method `act`, got {shown(controller)}")
 
     def sees_neurons(self, turn: int) -> bool:
         """Whether the controller of its episode number `turn` also sees the history state."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -171,7 +172,9 @@ class Driver:
 
     def _choose(self, agent: Agent, controller: Controller, observation: Float64[np.ndarray, " observations"]) -> int:
         n = len(self.loop.conditions)
-        chosen = self._answer_of(agent.name, "controller", lambda: int(controller.act(observation, self._rng)))
+        chosen = self._answer_of(
+            agent.name, "controller", lambda: operator.index(controller.act(observation, self._rng))
+        )
         if not 0 <= chosen < n:
             raise Stop(Ending("controller", f"{agent.name} chose {chosen}: expected a condition from 0 to {n - 1}"))
         return chosen

@@ -41,9 +41,12 @@ def _check_commands(mapping: Mapping) -> None:
     expected, n, compiled = f"{type(mapping).__name__}.command: expected", len(_RESPONSES_HZ), jax.jit(mapping.command)
     for where, percentiles in _PERCENTILES_HZ.items():
         u = _results(mapping.command, _RESPONSES_HZ, percentiles, f"{expected} commands")
-        # Also false for NaN.
-        if u.shape != (n,) or u.dtype.kind not in "fiu" or not np.all(np.abs(u) <= 1):
+        if u.shape != (n,) or u.dtype.kind not in "fiu":
             raise InvalidArgument(f"{expected} {n} commands from -1 to 1{where}, got {shown(u.tolist())}")
+        # Also true for NaN.
+        if wrong := np.flatnonzero(~(np.abs(u) <= 1)).tolist():
+            i = wrong[0]
+            raise InvalidArgument(f"{expected} commands from -1 to 1{where}, got {u[i]:g} at {_RESPONSES_HZ[i]:g} Hz")
         if falls := np.flatnonzero(np.diff(u) < 0).tolist():
             i = falls[0]
             raise InvalidArgument(

@@ -30,6 +30,7 @@ class Row:
         comparison: of the policies' measured returns with these; None for the policies, and if either has none.
         met: how the goal was met on the culture (`animat.goals.tally.Outcome.means`); empty for a robot without a goal,
             and without complete episodes.
+        within: lowest and highest possible return of an episode.
         turn: which of its agent's episodes each measured one is, where starts are drawn: in the same turn all agents
             have the same start; None where all episodes start alike.
     """
@@ -47,6 +48,7 @@ class Row:
     late: float
     comparison: EpisodeComparison | None = None
     met: dict[str, Any] = field(default_factory=dict)
+    within: tuple[float, float] = (-np.inf, np.inf)
     turn: Int64[np.ndarray, " measured"] | None = None
 
     @property
@@ -60,8 +62,9 @@ class Row:
 
         Episodes of the same turn are drawn together. If measured episodes vary less than predicted ones, as when all
         reach the limit, the interval is over as many predicted episodes instead: rare failures may have been missed.
-        The ends are infinite with fewer than two measured episodes, or turns. Responses are drawn as if they were
-        independent: drift between recording and loop is not in the interval, and shows as a gap.
+        It ends where an episode's return does. The ends are infinite with fewer than two measured episodes, or turns.
+        Responses are drawn as if they were independent: drift between recording and loop is not in the interval, and
+        shows as a gap.
         """
         mean, expected = self.measured.mean(), self.predicted.mean()
         drawn = resampled_means(self.measured, rng := np.random.default_rng(0), self.turn)
@@ -71,7 +74,9 @@ class Row:
         # Episodes of a turn count once if they go alike, or if all go alike, and each by itself if they do not.
         independent = int(np.clip(self.measured.var() / max(drawn.var(), 1e-12), fewest, len(self.measured)))
         missed = expected - rng.choice(self.predicted, (len(drawn), independent)).mean(axis=1)
-        measured = mean + missed if missed.std() > drawn.std() else drawn
+        # A robot of one's own may return more than it says.
+        limits = min(self.within[0], self.measured.min()), max(self.within[1], self.measured.max())
+        measured = np.clip(mean + missed if missed.std() > drawn.std() else drawn, *limits)
         return bootstrap_interval(mean - expected, measured - rng.choice(self.bootstrap_means, len(drawn)))
 
     @property

@@ -325,6 +325,7 @@ def _rows(
             bursts=sum(each.bursts for each in episodes) / trials,
             late=sum(each.late for each in episodes) / trials,
             met=Outcome(*map(np.stack, zip(*met, strict=True))).means() if met else {},  # type: ignore[arg-type]
+            within=loop.robot.return_range,
             turn=np.array([of_agents[each.agent].index(each.number) for each in whole], np.int64) if is_drawn else None,
         )
 

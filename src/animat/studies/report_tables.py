@@ -61,7 +61,7 @@ def returns_table(rows: Sequence[ComparedReturns]) -> Table:
         rows,
         [
             *columns_of("first", "second", "robot", "mean_first", "mean_second"),
-            ("random", "random_second"),
+            ("random second", "random_second"),
             ("optimum first", _pair("optimum_first", "optimum_error_first")),
             ("optimum second", _pair("optimum_second", "optimum_error_second")),
             *columns_of("score_first", "score_second"),
