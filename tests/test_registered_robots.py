@@ -278,6 +278,16 @@ def test_robots_are_listed_with_what_each_can_do(
     assert capsys.readouterr().err.startswith("animat: robot: expected my_nowhere:Tank to be importable")
 
 
+def test_a_return_beyond_what_a_robot_states_is_reported_before_training(
+    package: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Cartpole, "return_range", property(lambda self: (0.0, 120.0)))
+    assert main(["train", "cartpole", "--mapping", "none", "--out", "policies"]) == 1
+    words = r"animat: cartpole.return_range: expected the lowest .*, got 0 to 120, and an episode .* returned -\d"
+    assert re.search(words, capsys.readouterr().err)
+    assert not (package / "policies").exists()
+
+
 @pytest.mark.parametrize(
     ("place", "words"),
     [

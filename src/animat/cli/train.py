@@ -227,7 +227,11 @@ _PAPER: dict[str, Any] = {"mapping": "1-threshold", "policies": 10, "share": 100
 
 
 def _random_return(training: Training, timeline: SimulatorTimeline | None) -> float | None:
-    """The mean return of random actions on the first simulator; None for a robot that is stepped on the host."""
+    """The mean return of random actions on the first simulator; None for a robot that is stepped on the host.
+
+    Raises:
+        InvalidArgument: for a return beyond the robot's `return_range`.
+    """
     from animat.compilation import keep_compilations
     from animat.evaluation.rollouts import Uniform, roll_out
     from animat.robots.host import HostRobot
@@ -238,7 +242,14 @@ def _random_return(training: Training, timeline: SimulatorTimeline | None) -> fl
     environment = training.environment(0 if timeline is None else len(timeline.conditions))
     simulator = None if timeline is None else timeline.at(float(timeline.start_min[0]))
     # As many episodes as in the final evaluation, which then reuses the compiled program.
-    return float(roll_out(environment, simulator, Uniform(), episodes=100, seed=1).returns.mean())
+    returns = roll_out(environment, simulator, Uniform(), episodes=100, seed=1).returns
+    low, high = training.robot.return_range
+    for wrong in returns[(returns < low - 1e-3 * (1 + abs(low))) | (returns > high + 1e-3 * (1 + abs(high)))][:1]:
+        raise InvalidArgument(
+            f"{training.robot.name}.return_range: expected the lowest and highest return of an episode, got {low:g} "
+            f"to {high:g}, and an episode of random actions returned {wrong:g}"
+        )
+    return float(returns.mean())
 
 
 def _assessed(policy: Policy, best: Policy) -> dict[str, Any]:
