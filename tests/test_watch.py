@@ -9,6 +9,7 @@ import json
 import math
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -21,6 +22,7 @@ from animat.closed_loop.session import read_session
 from animat.closed_loop.session_data import LOG_FILE
 from animat.closed_loop.tick import STOP_FILE
 from animat.errors import InvalidArgument, InvalidFile
+from animat.watch.agents import by_agent
 from animat.watch.session import SessionView, _in_force, stop_session
 from animat.watch.tail import Tail
 from watching import session_in
@@ -60,6 +62,13 @@ def test_the_numbers_of_the_page_are_those_of_the_table(folder: Path) -> None:
         observed = [row[name] for name in about["observed"]]
         assert ticks["observation"][i] == ([float(each) for each in observed] if observed[0] else [])
     assert found["state"] == "ended"
+
+
+def test_episodes_that_are_all_alike_have_no_interval(folder: Path) -> None:
+    episodes = read_session(folder).episodes
+    alike = [replace(episode, total=120.0) for episode in episodes]
+    assert {agent["half"] for agent in by_agent([], alike, {})} == {None}
+    assert None not in {agent["half"] for agent in by_agent([], episodes, {})}
 
 
 def test_totals_are_those_of_the_session(folder: Path) -> None:

@@ -43,8 +43,8 @@ def by_agent(names: Sequence[str], episodes: Sequence[Episode], predictions: Any
 
 
 def _half_width(returns: Sequence[float]) -> float | None:
-    """Half the width of the 95 % interval of a mean, by Student's t; None for fewer than two returns."""
-    if len(returns) < 2:
+    """Half the width of the 95 % interval of a mean, by Student's t; None if returns do not show how they vary."""
+    if len(set(returns)) < 2:
         return None
     from scipy.special import stdtrit
 
