@@ -180,3 +180,22 @@ def test_an_interrupted_session_is_reported_as_not_resumable(tmp_path, monkeypat
     (tmp_path / "session.nwb").touch()
     assert animat(command) == 130
     assert "recover" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("status", "printed"), [(0, "all\nat exit\n"), (1, "all\nat exit\n"), (130, "all\n")])
+def test_an_interrupted_command_leaves_without_python_s_own_end(status: int, printed: str) -> None:
+    code = f"""
+import atexit, sys
+import animat.cli
+from animat.__main__ import main
+
+def run():
+    print("all", flush=True)
+    return {status}
+
+animat.cli.main = run
+atexit.register(print, "at exit")
+sys.exit(main())
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (status, printed, "")

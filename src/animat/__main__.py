@@ -17,9 +17,8 @@ def main() -> int:
         print("animat: interrupted", file=sys.stderr)
         status = 130
     if status == 130:
-        # Without waiting for compiled programs, which crash if they still run while Python exits.
-        sys.stdout.flush()
-        sys.stderr.flush()
+        # Without waiting for compiled programs, which crash if they still run while Python exits. All is printed:
+        # the command has flushed its output, and standard error is written line by line.
         os._exit(status)
     return status
 
