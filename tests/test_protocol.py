@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +72,13 @@ def test_five_pulses_are_of_one_frequency_and_the_last_is_read() -> None:
         assert sorted(pattern[frequency_hz[:, 0] == f, -1].tolist()) == list(range(100))
 
 
+# Frequencies that differ by rounding only are the same.
+frequencies_hz = st.lists(st.floats(0.5, 200), min_size=1, max_size=4).filter(
+    lambda values_hz: all(high > 1.00001 * low for low, high in pairwise(sorted(values_hz)))
+)
 protocols = st.builds(
     Protocol,
-    frequencies_hz=st.lists(st.floats(0.5, 200), min_size=1, max_size=4, unique=True).map(tuple),
+    frequencies_hz=frequencies_hz.map(tuple),
     order=st.sampled_from(["blocked", "mixed"]),
     pulses=st.integers(1, 4),
     patterns=st.integers(1, 6),

@@ -260,7 +260,7 @@ def test_scores_of_all_cultures_are_one_table_the_same_in_parquet(
     assert table["mean_return"].tolist() == [seed + i / 3 for seed in (1, 2, 3) for i in range(2)]
     assert table["optimum"].isna().all() and table["optimum"].dtype == np.float64
     assert table["policies"].dtype == np.int64 and set(table["arm"]) == {"1 threshold"}
-    csv = pd.read_csv(tmp_path / cultures.SCORES, dtype=dict(table.dtypes))
+    csv = pd.read_csv(tmp_path / cultures.SCORES, dtype=dict(table.dtypes), float_precision="round_trip")
     pd.testing.assert_frame_equal(table, csv, check_exact=True)
     before = found.parquet.read_bytes()
     assert run_scored(tmp_path, monkeypatch).parquet == found.parquet and found.parquet.read_bytes() == before
