@@ -393,6 +393,9 @@ def test_mismatches_are_refused() -> None:
     policy = policy_of(timeline)
     with pytest.raises(InvalidArgument, match="policies"):
         evaluate({}, timeline)
+    for wrong in ("policies", [policy], {"a": 3}):
+        with pytest.raises(InvalidArgument, match="policies: expected policies by name, as"):
+            evaluate(wrong, timeline)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="episodes"):
         evaluate({"a": policy}, timeline, episodes=0)
     with pytest.raises(InvalidArgument, match="timeline"):

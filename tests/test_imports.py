@@ -137,6 +137,8 @@ def test_every_public_name_is_there_and_stands_for_one_thing() -> None:
         # A registry's `named` is called by what it names: robot_named, mapping_named.
         of = f"{thing.__self__.noun}_" if ismethod(thing) else ""
         assert of + getattr(thing, "__name__", name) == name
+    # Completion in a notebook offers nothing else.
+    assert {name for name in dir(animat) if not name.startswith("_")} == set(animat.__all__)
     # What is in the package under the same name would be there or not, by what was imported before.
     assert not set(animat.__all__) & {path.stem for path in PACKAGE.iterdir()}
     # The nouns of the story that a study is made of are not those of its specification.

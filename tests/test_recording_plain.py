@@ -588,6 +588,9 @@ def test_recordings_with_the_same_start_and_empty_folders_are_refused(tmp_path: 
         read_recordings(tmp_path)
     with pytest.raises(InvalidArgument, match="recordings: expected at least one file or folder"):
         read_recordings([])
+    for wrong in (3, [3]):
+        with pytest.raises(InvalidArgument, match="recordings: expected files or folders, got 3"):
+            read_recordings(wrong)  # type: ignore[arg-type]
     path = npz(tmp_path, **SPIKES, **STIMULI)
     with pytest.raises(InvalidFile, match=r"both start at 0 min; leave one out"):
         read_recordings([path, path])

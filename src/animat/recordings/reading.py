@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from animat.errors import InvalidArgument, InvalidFile, as_invalid_file, first_line, in_file
+from animat.errors import InvalidArgument, InvalidFile, as_invalid_file, expect_several, first_line, in_file
 from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.recordings.columns import with_start
 from animat.recordings.formats.csv import read_csv
@@ -172,6 +172,7 @@ def _in_order(files: list[Path], read_one: Callable[[Path], S]) -> list[S]:
 def list_recordings(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
     """The recording files among paths: files as given, and those in folders in the order of their names."""
     listed = [paths] if isinstance(paths, str | os.PathLike) else paths
+    listed = expect_several("recordings", listed, str | os.PathLike, "files or folders")
     files = [file for path in listed for file in _files(Path(path))]
     if not files:
         raise InvalidArgument("recordings: expected at least one file or folder of recordings, got none")
