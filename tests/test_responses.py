@@ -10,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from animat.errors import InvalidArgument, Mismatch, UnusableData
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording
 from animat.recordings.recording import Channels, Recording
 from animat.responses.conditions import All, ByFrequency, ByInterval, ByPattern, Conditions
 from animat.responses.extraction import extract_responses
+from animat.responses.inspection import inspect_recording
 from animat.responses.psth import find_response, post_stimulus_histogram, spontaneous_rate
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
@@ -151,6 +153,19 @@ def test_a_window_may_be_a_list_or_an_array() -> None:
         assert extract_responses(recording([], [1]), window_ms=window_ms).window_ms == (2.0, 10.0)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match="window_ms: expected two numbers of milliseconds, start and end, got"):
         extract_responses(recording([], [1]), window_ms=(2, 10, 20))  # type: ignore[arg-type]
+
+
+def test_conditions_may_be_text_and_what_is_not_a_recording_is_named(tmp_path: Path) -> None:
+    source = recording([(1.004, 0), (2.004, 1)], [1.0, 2.0], frequency_hz=[5.0, 40.0])
+    assert [c.label for c in extract_responses(source, "frequency:40").conditions] == ["40 Hz"]
+    assert [c.label for c in inspect_recording(source, "frequency:5").responses.conditions] == ["5 Hz"]
+    with pytest.raises(InvalidArgument, match="conditions: expected"):
+        extract_responses(source, "colour")
+    for wrong in ([source], "culture.nwb", None):
+        for use in (extract_responses, inspect_recording, lambda given: write_nwb(given, tmp_path / "of-nothing.nwb")):
+            with pytest.raises(InvalidArgument, match=r"expected a recording, as animat\.read_recording returns, got"):
+                use(wrong)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_recording_without_channels_is_refused() -> None:

@@ -182,6 +182,14 @@ def test_a_folder_of_another_study_is_refused(finished: Path, tmp_path: Path) ->
         run_study(read_study(TINY), tmp_path / "a-file", base=TINY.parent)
 
 
+def test_what_is_not_a_study_is_named(tmp_path: Path) -> None:
+    with pytest.raises(
+        InvalidArgument, match=r"study: expected a Study, as animat\.read_study returns, got 'my-study\.toml"
+    ):
+        run_study("my-study.toml", tmp_path)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_of_before_results_were_typed_is_refused_with_what_to_do(tmp_path: Path) -> None:
     """Its fingerprint knew neither pandas nor pillow; what its jobs handed each other was CSV."""
     study = replace(read_study(TINY), culture=Source())

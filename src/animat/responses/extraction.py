@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from animat.errors import Mismatch, UnusableData
+from animat.errors import Mismatch, UnusableData, expect_kind
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import separate_bursts
-from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, default_conditions
+from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, conditions_named, default_conditions
 from animat.responses.quality.responses import findings_on
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses, Trials
@@ -23,7 +23,7 @@ SILENCE_S = 1.0
 
 def extract_responses(
     source: Recording | ResponseTable,
-    by: Conditions | None = None,
+    by: Conditions | str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
     readouts: Readouts = ALL,
@@ -41,14 +41,16 @@ def extract_responses(
 
     Args:
         source: spikes, or the response of each channel to each stimulus.
-        by: the rule of the conditions; None: `animat.responses.conditions.default_conditions`.
+        by: the rule of the conditions, or its text form (`conditions_named`); None: by frequency if it is known, by
+            place if the protocol has places.
         window_ms: start and end of the window after the pulse. A table that states its window replaces the default; for
             one that does not, this is the window in which its spikes were counted.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
         readouts: groups of channels whose x is read too, in the same windows; bursts are identified from all channels.
 
     Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        InvalidArgument: for a window that is not a stretch of time after the stimulus, or conditions that cannot be
+            read.
         UnusableData: without channels, or for conditions by interval with a table without times.
         Mismatch: for channels that do not read all electrodes of the readouts, or a window that differs from the
             table's.
@@ -56,12 +58,13 @@ def extract_responses(
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
         only where it finds two groups).
     """
+    expect_kind("source", source, Recording | ResponseTable, "a recording, as animat.read_recording returns")
     window_ms = check_window(window_ms)
     stimuli, n_channels = source.stimuli, len(source.channels)
     if not n_channels:
         what = "recording" if isinstance(source, Recording) else "table"
         raise UnusableData(f"channels: expected at least one, got a {what} without any; x is a mean over channels")
-    by = by or default_conditions(stimuli, source.protocol)
+    by = conditions_named(by) if isinstance(by, str) else by or default_conditions(stimuli, source.protocol)
     assignment = by.assign(stimuli)
     # Trials without a condition are read too, as the history of others.
     read, inside = stimuli.is_last_of_presentation, None

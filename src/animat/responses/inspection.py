@@ -137,7 +137,7 @@ class Inspection:
 
 def inspect_recording(
     recording: Recording | ResponseTable,
-    by: Conditions | None = None,
+    by: Conditions | str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
     name: str | None = None,
@@ -145,13 +145,14 @@ def inspect_recording(
     """Inspect a recording as training would use it: its contents, and what is wrong with it.
 
     Args:
-        by: what makes a condition; None: `animat.responses.conditions.default_conditions`.
+        by: the rule of the conditions, or its text form, as in `extract_responses`.
         window_ms: start and end of the window that responses are read in, after the pulse.
         burst_threshold: a ratio of active channels in place of Otsu's threshold; 1 keeps every response.
         name: what to call it; by default the source in its provenance.
 
     Raises:
-        InvalidArgument: for a window that is not a stretch of time after the stimulus.
+        InvalidArgument: for anything but a recording, a window that is not a stretch of time after the stimulus, or
+            conditions that cannot be read.
         UnusableData: for a recording without channels.
         Mismatch: for a window that differs from a table's.
     """

@@ -12,7 +12,7 @@ from typing import Any
 
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import mapping_named
-from animat.errors import InvalidFile
+from animat.errors import InvalidFile, expect_kind
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
@@ -73,6 +73,7 @@ def run_study(
             violates the contract.
         AnimatError: if a job failed; its message names the job.
     """
+    expect_kind("study", study, Study, "a Study, as animat.read_study returns")
     expect_workers(workers, executor)
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from animat.compilation import pynwb_importable
-from animat.errors import InvalidFile, UnusableData, in_file
+from animat.errors import InvalidFile, UnusableData, expect_kind, in_file
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import (
@@ -55,9 +55,10 @@ def write_nwb(
 
     Raises:
         InvalidFile: if the file cannot be written (no permission, a full disk).
-        InvalidArgument: for text that HDF5 cannot hold, or a `recorded_at` that is not a date.
+        InvalidArgument: for anything but a recording, text that HDF5 cannot hold, or a `recorded_at` that is no date.
         UnusableData: for `spikes` that are not finite, not on a channel, or outside the recording.
     """
+    expect_kind("recording", recording, Recording, "a recording, as animat.read_recording returns")
     with pynwb_importable():
         from hdmf.build import BuildManager
         from pynwb import NWBHDF5IO
