@@ -6,9 +6,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from animat.cultures.limits import steps_of
+from animat.recordings.formats.stimulus_text import parameters_of
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimulus
 
@@ -79,7 +78,11 @@ class Sequences:
         """Append one stimulus; returns its duration in samples."""
         mx, units = self._mx, [self._unit_of[electrode] for electrode in stimulus.electrodes]
         self._event += 1
-        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_event_data(stimulus, is_kept))))
+        data = parameters_of(stimulus)
+        if is_kept:
+            # Nothing that differs between its uses.
+            data = {name: data[name] for name in ("electrodes", "pattern") if name in data}
+        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(data)))
         for unit in units:
             sequence.append(mx.StimulationUnit(unit).power_up(True).connect(True).set_voltage_mode().dac_source(0))
         lasted = 0
@@ -93,15 +96,3 @@ class Sequences:
         for unit in units:
             sequence.append(mx.StimulationUnit(unit).power_up(True).connect(False).set_voltage_mode().dac_source(0))
         return lasted
-
-
-def _event_data(stimulus: Stimulus, is_kept: bool) -> dict[str, Any]:
-    """Data of a stimulus for the device's file; a kept sequence has none that differ between its uses."""
-    data: dict[str, Any] = {"electrodes": list(stimulus.electrodes)}
-    if stimulus.pattern >= 0:
-        data["pattern"] = stimulus.pattern
-    if not is_kept:
-        data["presentation"] = stimulus.presentation
-        if np.isfinite(stimulus.frequency_hz):
-            data["frequency_hz"] = stimulus.frequency_hz
-    return data
