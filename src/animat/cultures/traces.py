@@ -64,12 +64,9 @@ def record_traces(
     100-3000 Hz and the artefact of each pulse. Spikes closer together than their waveforms overlap.
 
     Args:
-        culture: open; its clock advances.
-        duration_s: of the stretch.
         channels: rows of its channel table; None: all.
         stimuli: to deliver meanwhile.
-        noise_uv: root mean square of the noise.
-        seed: of the noise.
+        noise_uv, seed: root mean square and seed of the noise.
 
     Raises:
         InvalidArgument: for a channel that does not exist, or more than a gigabyte of samples.

@@ -164,11 +164,7 @@ class VirtualCulture(ComputedCulture):
         }
 
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write the complete state, to continue from bit for bit; the file is complete or absent.
-
-        Args:
-            path: the file.
-            remarks: whole numbers to store with it.
+        """Write the complete state, with whole numbers as remarks, to a file that is complete or absent.
 
         Raises:
             InvalidFile: if it cannot be written.

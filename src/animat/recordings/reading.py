@@ -74,10 +74,9 @@ def read_recording(
             offer, or a `start_min` or `start_s` that is not finite.
     """
     path = Path(path)
-    if start_min is not None and not np.isfinite(start_min):
-        raise InvalidArgument(f"start_min: expected finite minutes, got {start_min:g}")
-    if start_s is not None and not np.isfinite(start_s):
-        raise InvalidArgument(f"start_s: expected finite seconds, got {start_s:g}")
+    for name, start, unit in (("start_min", start_min, "minutes"), ("start_s", start_s, "seconds")):
+        if start is not None and not np.isfinite(start):
+            raise InvalidArgument(f"{name}: expected finite {unit}, got {start:g}")
     source = read_source(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(

@@ -35,7 +35,6 @@ class ResponseTable:
         start_min: start on the culture's clock, in minutes.
         presentation: how stimuli were presented, None if not known.
         provenance: where the table came from, as text by keyword, for people.
-        findings: made when it was read.
         protocol, culture: None, as files do not state them.
 
     Raises:

@@ -27,7 +27,6 @@ LEVEL_STEP = 20
 """Every so many samples are enough for the median of the voltage."""
 DEAD, NOISY = 0.1, 5.0
 """Multiples of the median channel's noise: a channel below is dead, one above is noisy."""
-
 MUCH_LOST = 0.01
 
 

@@ -41,9 +41,7 @@ def open_traces(
 ) -> tuple[RawTraces, Recording]:
     """The raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
-    Args:
-        part: which recording of a MaxWell file, or which series of an NWB file, if there are several.
-        stimuli: which of several candidates are the stimuli, as in `read_recording`.
+    `part` says which recording of a MaxWell file, or which series of an NWB file, `stimuli` as in `read_recording`.
     """
     with hdf5_file(Path(path)) as file:
         kind = format_of(file)
