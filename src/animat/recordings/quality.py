@@ -101,10 +101,7 @@ def _duplicates(recording: Recording) -> Iterable[Finding]:
 
 
 def _on_channels(recording: Recording) -> Iterator[Finding]:
-    """Findings on silent channels, and on noisy ones, of a recording with at least one spike.
-
-    A channel is noisy if it fires at more than 100 Hz on average, or has a third of all spikes of eight or more.
-    """
+    """Findings on silent channels, and on noisy ones, which fire too fast or have too many of all spikes."""
     channels = recording.channels
     n, n_spikes = len(channels), len(recording.spike_times_s)
     count = np.bincount(recording.spike_channels, minlength=n)

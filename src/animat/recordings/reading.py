@@ -35,8 +35,7 @@ ZIP = b"PK"
 PICKLE = "a Python pickle, which is never read; save plain arrays with numpy.savez"
 OTHERS = {
     **{bytes([0x80, protocol]): PICKLE for protocol in range(2, 6)},
-    b"\xff\xfe": "text in UTF-16; save it as CSV in UTF-8",
-    b"\xfe\xff": "text in UTF-16; save it as CSV in UTF-8",
+    **dict.fromkeys((b"\xff\xfe", b"\xfe\xff"), "text in UTF-16; save it as CSV in UTF-8"),
     b"MATLAB": "a MATLAB file; save its columns as CSV or NPZ",
     b"\x93NUMPY": "NPY, which holds one array; save several by name with numpy.savez",
 }

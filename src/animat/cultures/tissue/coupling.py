@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from typing import NamedTuple
@@ -85,11 +86,12 @@ class Coupling:
         self._parameters = parameters
         # Not of methods: with caches of its own methods a coupling would stay in memory until it is garbage-collected.
         reach_of_one = cache(partial(_find_reach, seed, parameters, network, kick_factor, own_latency_ms))
+        self._reach_of_all = lru_cache(10_000)(partial(_join_reaches, reach_of_one))
 
-        def reach_of_all(places: tuple[tuple[int, int], ...]) -> Reach:
-            return Reach(*(np.concatenate(columns) for columns in zip(*map(reach_of_one, places), strict=True)))
-
-        self._reach_of_all = lru_cache(10_000)(reach_of_all)
+    def reach(self, x_um: Float64[np.ndarray, " electrodes"], y_um: Float64[np.ndarray, " electrodes"]) -> Reach:
+        """What a pulse on the electrodes at (x, y) reaches; positions are distinguished to 0.1 um."""
+        places = tuple((round(10 * x), round(10 * y)) for x, y in zip(x_um.tolist(), y_um.tolist(), strict=True))
+        return self._reach_of_all(places)
 
     def kicks(self, pulse: Pulse, pulse_step: int) -> Kicks:
         """The kicks of a pulse at `pulse_step`, in no particular order.
@@ -100,9 +102,7 @@ class Coupling:
         parameters = self._parameters
         if len(pulse.x_um) == 0:
             return NO_KICKS
-        # Positions are distinguished to 0.1 um.
-        at = zip(pulse.x_um.tolist(), pulse.y_um.tolist(), strict=True)
-        reach = self._reach_of_all(tuple((round(10 * x), round(10 * y)) for x, y in at))
+        reach = self.reach(pulse.x_um, pulse.y_um)
         draw, jitter = axonal_draws(reach.axon_key, pulse_step)
         passes = (draw < parameters.axon_reliability) & (reach.axon_rank < pulse.strength)
         latency_ms = reach.axon_latency_ms[passes] + parameters.axon_jitter_ms * jitter[passes]
@@ -112,6 +112,10 @@ class Coupling:
             np.concatenate([reach.near, reach.axons[passes]]),
             np.concatenate([reach.kick_mv * pulse.strength, np.full(len(arrival), AXONAL_KICK_MV)], dtype=np.float32),
         )
+
+
+def _join_reaches(reach_of_one: Callable[[tuple[int, int]], Reach], places: tuple[tuple[int, int], ...]) -> Reach:
+    return Reach(*(np.concatenate(columns) for columns in zip(*map(reach_of_one, places), strict=True)))
 
 
 def _find_reach(

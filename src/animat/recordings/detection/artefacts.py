@@ -12,14 +12,11 @@ from animat.recordings.detection.settings import Detection
 
 TAUS_MS = (0.3, 0.5, 0.8, 1.2, 2.0, 3.5, 5.0, 8.0)
 GAUSS_NEWTON_STEPS = 8
-FAR = 20.0
-"""Distance from rest, in standard deviations of the noise, beyond which a still trace counts as saturated."""
-UNSETTLED = 2.0
-"""Mean distance from rest in the half millisecond after blanking, in standard deviations of the noise, beyond which a
-recovery is fitted."""
+FAR, UNSETTLED = 20.0, 2.0
+"""Distances from rest, in standard deviations of the noise: beyond the first a still trace counts as saturated; beyond
+the second, on average over the half millisecond after blanking, a recovery is fitted."""
 FLAT_MS, FLAT_SHARE = 0.4, 0.005
-"""How long a saturated trace stays still at least, and how far it moves at most, as a share of its distance from
-rest."""
+"""A saturated trace stays still at least so long, and moves at most by this share of its distance from rest."""
 SETTLE_MS = 0.25
 """Blanked after an amplifier recovers: its first samples do not lie on an exponential."""
 PAUSE_MS = 1.0

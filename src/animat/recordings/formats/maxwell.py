@@ -218,8 +218,4 @@ def _channels(file: Hdf5File, layout: _Layout, spike_channel: Column) -> dict[st
     if recorded is not None and (unmapped := len(np.setdiff1d(recorded, labels))):
         message = f"{unmapped:,} recorded channels have no electrode in the mapping and are left out"
         findings.append(Finding("channels-not-routed", "note", message, float(unmapped)))
-    return {
-        "channel_label": labels,
-        "channel_electrode": electrode[used][first],
-        "channel_xy_um": xy_um[used][first],
-    }
+    return {"channel_label": labels, "channel_electrode": electrode[used][first], "channel_xy_um": xy_um[used][first]}
