@@ -38,7 +38,6 @@ class Traces:
         channels: row of the culture's channel table for each column.
         spikes: times of the true spikes' troughs from the first sample; `channel` is a column of `voltage_uv`.
         amplitude_uv: amplitude of each spike on its channel, shape (spikes,).
-        stimulus_time_s: starts of the pulses.
     """
 
     voltage_uv: Voltage

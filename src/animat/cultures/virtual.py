@@ -48,9 +48,7 @@ class VirtualCulture(ComputedCulture):
 
     Args:
         seed: decides the tissue, the spike shapes, and the patterns; zero or more.
-        parameters: of the tissue.
-        selection: electrodes to use; None: scan and choose, which takes some seconds.
-        rule: by which they are chosen.
+        selection: electrodes to use; None: scan and choose by `rule`, which takes some seconds.
         scan_s: how long the array is scanned, all blocks of 1,024 electrodes at once; in a shorter scan more neurons
             stay silent, and unseen.
         limits: tighter limits than `SIMULATED_LIMITS`.

@@ -45,10 +45,8 @@ class Origin:
         age: ISO 8601 duration, such as `P42D`, or a range of two separated by a slash.
         subject_description: such as `dissociated cortical culture`.
         experimenter: `Last, First`; several separated by semicolons.
-        institution, lab: where.
         keywords: separated by commas.
         recorded_at: ISO 8601 date.
-        experiment_description: as text.
 
     Raises:
         InvalidArgument: for a `species` that is not in Latin, an `age` that is not a duration, an `experimenter`

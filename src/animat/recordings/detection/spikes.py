@@ -62,7 +62,6 @@ def detect_spikes(
 
     Args:
         stimulus_time_s: starts of the pulses on the recording's clock.
-        settings: by default those of `Detection`.
         workers: threads; by default one per core. Each takes some 200 MB of memory for 1,024 channels.
         progress: updated after each piece.
 

@@ -50,8 +50,7 @@ def write_nwb(
 
     Args:
         path: parent folders are created, and an old file is replaced only by a complete new one.
-        spikes: instead of the recording's own, which must be empty; may exceed memory, in any order.
-        counts: of `spikes`.
+        spikes, counts: instead of the recording's own, which must be empty; may exceed memory, in any order.
 
     Raises:
         InvalidFile: if the file cannot be written (no permission, a full disk).
