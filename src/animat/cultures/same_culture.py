@@ -29,7 +29,7 @@ def other_culture(recording: Recording, culture: Culture) -> Finding | None:
         differ = (f"of {difference[0]}", difference[1]) if difference else None
     if differ:
         message = f"the recordings are {differ[0]}, but this is {differ[1]}: percentiles differ between cultures"
-    elif culture.name == "virtual" and now_min < start_min:
+    elif isinstance(culture, VirtualCulture) and now_min < start_min:
         message = (
             f"the culture starts{' afresh' if now_min == 0 else ''} at {now_min:.0f} min, but its percentiles are of "
             f"the recording at {start_min:.0f} min, and they change over time: pass its state after that recording "

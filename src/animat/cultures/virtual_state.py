@@ -44,8 +44,8 @@ def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state
     """Write the state of a culture of these settings; see `VirtualCulture.save_state`."""
     snapshot = state.snapshot
     head: dict[str, Any] = {"format": FORMAT, "culture": dict(settings), "selection": state.selection.to_dict()}
-    head |= {"zero_ns": state.zero_ns, "now_ns": state.now_ns, "remarks": dict(state.remarks)}
-    head |= {"tissue_now_ns": snapshot.now_ns, "tissue_step": snapshot.step}
+    head |= {"zero_ns": state.zero_ns, "now_ns": state.now_ns, "tissue_now_ns": snapshot.now_ns}
+    head |= {"tissue_step": snapshot.step, "remarks": dict(state.remarks)}
     arrays = {f"state_{name}": values for name, values in snapshot.state._asdict().items()}
     arrays |= {f"kicks_{name}": values for name, values in snapshot.kicks._asdict().items()}
     held = {name: getattr(state, name) for name in _HELD}
