@@ -130,8 +130,7 @@ class Culture(Openable):
         """Let time pass unobserved.
 
         Raises:
-            InvalidArgument: for a culture that is not open, or a negative time.
-            DeviceFailed: if the device fails meanwhile.
+            InvalidArgument, DeviceFailed: as `deliver` does.
         """
         turns, duration_s = self._opened(), plain_duration(duration_s)
         with as_device_failure(self.name, "rest"), turns:
@@ -145,11 +144,7 @@ class Culture(Openable):
 
         Args:
             electrodes: pulsed together.
-            pulse: that each delivers.
-            window_ms: start and end of the window after the pulse.
-
-        Returns:
-            Spikes with start <= time < end, counted from the pulse.
+            window_ms: start and end; spikes have start <= time < end, counted from the pulse.
 
         Raises:
             UnsafeStimulus, InvalidArgument, DeviceFailed: as `deliver` does.

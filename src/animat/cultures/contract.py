@@ -60,12 +60,10 @@ class CultureContract(abc.ABC):
         with self.make_culture() as culture:
             assert len(culture.channels) >= 1
             sites = set(culture.stimulation_electrodes)
-            assert sites
-            assert len(sites) == len(culture.stimulation_electrodes)
+            assert 0 < len(sites) == len(culture.stimulation_electrodes)
             for pattern in culture.patterns:
                 used = [electrode for electrode in pattern.tolist() if electrode != UNKNOWN]
-                assert used
-                assert len(set(used)) == len(used)
+                assert 0 < len(set(used)) == len(used)
                 assert sites >= set(used)
             culture.limits.check_within(culture.device_limits)
             assert culture.sampling_rate_hz > 0

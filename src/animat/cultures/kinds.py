@@ -28,7 +28,6 @@ def culture_of(
     """A culture of a kind, closed.
 
     Args:
-        kind: `"virtual"`, `"replay"`, `"cl1"` or `"maxone"`.
         seed: selects a virtual culture, the draws of a replay, or a CL1's patterns. 0 or more.
         state: of a virtual culture, from which to continue (`VirtualCulture.save_state`).
         recordings: from which a replay answers.

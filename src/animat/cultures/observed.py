@@ -18,11 +18,9 @@ Rows = Int64[np.ndarray, " spikes"]
 
 
 class Spikes(NamedTuple):
-    """Spikes in order of time.
+    """Spikes in order of time, counted from the start that the method returning them documents; shapes (spikes,).
 
-    Attributes:
-        time_s: counted from the start that the method returning them documents, shape (spikes,).
-        channel: row of the culture's channel table, shape (spikes,).
+    `channel` is the row of the culture's channel table.
     """
 
     time_s: Float64[np.ndarray, " spikes"]

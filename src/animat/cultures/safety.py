@@ -56,7 +56,6 @@ class Guard:
     second apart are. Only one thread at a time may use it, except for `stop`.
 
     Args:
-        limits: in force.
         sites: electrodes that can stimulate.
         history: of earlier sessions, which limits on pace also cover; None: there were none.
         now_s: the culture's clock, if there is a history.

@@ -20,47 +20,42 @@ def other_culture(recording: Recording, culture: Culture) -> Finding | None:
     here, there = culture.recorded_as, recording.culture
     if here is not None and here.kind == "replay":
         return None
+    now_min, start_min = culture.now_s / 60, recording.start_min
+    stop_min = start_min + recording.duration_s / 60
     if isinstance(culture, VirtualCulture):
-        message = _other_virtual(recording, culture)
-    elif here and there and (difference := there.difference(here)):
-        message = _another(f"of {difference[0]}", difference[1])
+        differ = _other_virtual(recording, culture)
     else:
-        message = _restarted(recording, culture)
-    before_min = recording.start_min + recording.duration_s / 60 - culture.now_s / 60
-    return Finding("other-culture", "warning", message, before_min if before_min > 0 else None) if message else None
-
-
-def _another(there: str, here: str) -> str:
-    return f"the recordings are {there}, but this is {here}: percentiles differ between cultures"
-
-
-def _other_virtual(recording: Recording, culture: VirtualCulture) -> str:
-    now_min, start_min, recorded = culture.now_s / 60, recording.start_min, recording.culture
-    differ = [name for name, value in culture.settings.items() if recording.provenance.get(name) != value]
-    here = f"virtual culture {culture.seed}"
+        difference = there.difference(here) if here and there else None
+        differ = (f"of {difference[0]}", difference[1]) if difference else None
     if differ:
-        if recorded is None or recorded.kind != "virtual":
-            return _another("not of a virtual culture", here)
-        with_another = "" if "seed" in differ else f" with a different {' and '.join(differ)}"
-        return _another(f"of virtual culture {recorded.seed}{with_another}", here)
-    if now_min < start_min:
-        return (
+        message = f"the recordings are {differ[0]}, but this is {differ[1]}: percentiles differ between cultures"
+    elif isinstance(culture, VirtualCulture) and now_min < start_min:
+        message = (
             f"the culture starts{' afresh' if now_min == 0 else ''} at {now_min:.0f} min, but its percentiles are of "
             f"the recording at {start_min:.0f} min, and they change over time: pass its state after that recording "
             "(--state)"
         )
-    return ""
-
-
-def _restarted(recording: Recording, culture: Culture) -> str:
-    now_min, start_min = culture.now_s / 60, recording.start_min
-    if culture.name == "cl1" and now_min < start_min + recording.duration_s / 60:
-        return (
+    elif culture.name == "cl1" and now_min < stop_min:
+        message = (
             f"the CL1's clock is at {now_min:.1f} min, before the end of the recording at {start_min:.1f} min that "
             "percentiles are taken from: the device was restarted, as the SDK's simulator is whenever it is opened, "
             "and a simulated culture with it; percentiles change over time"
         )
-    return ""
+    else:
+        return None
+    return Finding("other-culture", "warning", message, stop_min - now_min if stop_min > now_min else None)
+
+
+def _other_virtual(recording: Recording, culture: VirtualCulture) -> tuple[str, str] | None:
+    """What the recordings are of, and what this culture is, where its settings differ."""
+    differ = [name for name, value in culture.settings.items() if recording.provenance.get(name) != value]
+    recorded, here = recording.culture, f"virtual culture {culture.seed}"
+    if not differ:
+        return None
+    if recorded is None or recorded.kind != "virtual":
+        return "not of a virtual culture", here
+    with_another = "" if "seed" in differ else f" with a different {' and '.join(differ)}"
+    return f"of virtual culture {recorded.seed}{with_another}", here
 
 
 def other_patterns(recording: Recording, culture: Culture) -> Finding | None:

@@ -38,7 +38,6 @@ class Traces:
         channels: row of the culture's channel table for each column.
         spikes: times of the true spikes' troughs from the first sample; `channel` is a column of `voltage_uv`.
         amplitude_uv: amplitude of each spike on its channel, shape (spikes,).
-        stimulus_time_s: starts of the pulses.
     """
 
     voltage_uv: Voltage
@@ -64,12 +63,9 @@ def record_traces(
     100-3000 Hz and the artefact of each pulse. Spikes closer together than their waveforms overlap.
 
     Args:
-        culture: open; its clock advances.
-        duration_s: of the stretch.
         channels: rows of its channel table; None: all.
         stimuli: to deliver meanwhile.
-        noise_uv: root mean square of the noise.
-        seed: of the noise.
+        noise_uv, seed: root mean square and seed of the noise.
 
     Raises:
         InvalidArgument: for a channel that does not exist, or more than a gigabyte of samples.
@@ -105,7 +101,10 @@ def record_traces(
             spikes.append(np.column_stack(np.broadcast_arrays(at / rate_hz, column, size_uv)))
     for stimulus, at_s in zip(stimuli, stimulus_time_s.tolist(), strict=True):
         distance_um = culture.selection.array.distance_um(np.array(stimulus.electrodes), recorded)
-        _add_artefact(voltage_uv[round(at_s * rate_hz) :], distance_um, rate_hz)
+        size_uv = np.sum(ARTEFACT_UV / (1 + (distance_um / ARTEFACT_REACH_UM) ** 3), axis=0)
+        stretch = voltage_uv[round(at_s * rate_hz) :][: round(0.02 * rate_hz)]
+        decay = np.exp(-np.arange(len(stretch)) / rate_hz * 1e3 / ARTEFACT_MS)
+        stretch -= (decay[:, None] * size_uv).astype(np.float32)
     np.clip(voltage_uv, -SATURATION_UV, SATURATION_UV, out=voltage_uv)
     time_s, column_of, spike_uv = np.concatenate(spikes).T
     order = np.lexsort((column_of, time_s))
@@ -150,11 +149,3 @@ def _add(trace_uv: Float32[np.ndarray, " samples"], first: Int64[np.ndarray, " s
     sample = (first[:, None] + np.arange(len(shape))[None, :]).ravel()
     inside = (sample >= 0) & (sample < len(trace_uv))
     np.add.at(trace_uv, sample[inside], np.tile(shape, len(first))[inside].astype(np.float32))
-
-
-def _add_artefact(voltage_uv: Voltage, distance_um: Float64[np.ndarray, "sites channels"], rate_hz: float) -> None:
-    """Add a pulse's artefact to the samples from its start on."""
-    size_uv = np.sum(ARTEFACT_UV / (1 + (distance_um / ARTEFACT_REACH_UM) ** 3), axis=0)
-    stretch = voltage_uv[: round(0.02 * rate_hz)]
-    decay = np.exp(-np.arange(len(stretch)) / rate_hz * 1e3 / ARTEFACT_MS)
-    stretch -= (decay[:, None] * size_uv[None, :]).astype(np.float32)

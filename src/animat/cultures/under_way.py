@@ -17,7 +17,7 @@ from animat.writing import atomic_write, clear_away
 UNDER_WAY = ".under-way.npz"
 """Its name in the folder of the recordings; hidden, so that no reader takes it for one of them."""
 EVERY_S = 3.0
-"""Shortest time between two writes, in seconds."""
+"""Shortest time between two writes."""
 
 
 class PartialRecording:

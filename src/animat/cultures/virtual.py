@@ -48,9 +48,7 @@ class VirtualCulture(ComputedCulture):
 
     Args:
         seed: decides the tissue, the spike shapes, and the patterns; zero or more.
-        parameters: of the tissue.
-        selection: electrodes to use; None: scan and choose, which takes some seconds.
-        rule: by which they are chosen.
+        selection: electrodes to use; None: scan and choose by `rule`, which takes some seconds.
         scan_s: how long the array is scanned, all blocks of 1,024 electrodes at once; in a shorter scan more neurons
             stay silent, and unseen.
         limits: tighter limits than `SIMULATED_LIMITS`.
@@ -164,11 +162,7 @@ class VirtualCulture(ComputedCulture):
         }
 
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write the complete state, to continue from bit for bit; the file is complete or absent.
-
-        Args:
-            path: the file.
-            remarks: whole numbers to store with it.
+        """Write the complete state, with whole numbers as remarks, to a file that is complete or absent.
 
         Raises:
             InvalidFile: if it cannot be written.

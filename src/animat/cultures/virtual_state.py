@@ -7,7 +7,7 @@ import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -43,16 +43,9 @@ class VirtualState(NamedTuple):
 def write_state(path: str | os.PathLike[str], settings: Mapping[str, str], state: VirtualState) -> None:
     """Write the state of a culture of these settings; see `VirtualCulture.save_state`."""
     snapshot = state.snapshot
-    head = {
-        "format": FORMAT,
-        "culture": dict(settings),
-        "selection": state.selection.to_dict(),
-        "zero_ns": state.zero_ns,
-        "now_ns": state.now_ns,
-        "tissue_now_ns": snapshot.now_ns,
-        "tissue_step": snapshot.step,
-        "remarks": dict(state.remarks),
-    }
+    head: dict[str, Any] = {"format": FORMAT, "culture": dict(settings), "selection": state.selection.to_dict()}
+    head |= {"zero_ns": state.zero_ns, "now_ns": state.now_ns, "tissue_now_ns": snapshot.now_ns}
+    head |= {"tissue_step": snapshot.step, "remarks": dict(state.remarks)}
     arrays = {f"state_{name}": values for name, values in snapshot.state._asdict().items()}
     arrays |= {f"kicks_{name}": values for name, values in snapshot.kicks._asdict().items()}
     held = {name: getattr(state, name) for name in _HELD}

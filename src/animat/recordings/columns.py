@@ -50,10 +50,7 @@ class PlainColumns:
     presentation_pulses: int | None = None
 
     def to_recording(self, provenance: Mapping[str, str], findings: tuple[Finding, ...] = ()) -> Recording:
-        """Check and sort the columns and make a recording from them.
-
-        Args:
-            findings: findings so far; they are kept in the recording together with those made here.
+        """Check and sort the columns and make a recording from them; findings so far are kept in it.
 
         Raises:
             UnusableData: naming the column, what was expected and what came.

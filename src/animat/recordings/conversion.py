@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -30,7 +29,7 @@ DURATION = re.compile(rf"P(?=.){_DATE}(?:T(?=\d){_TIME})?", re.ASCII)
 DAY_S = 86_400.0
 UNITS_S = (365.25 * DAY_S, 365.25 / 12 * DAY_S, 7 * DAY_S, DAY_S, 3600.0, 60.0, 1.0)
 """The length of each of these, with mean years and months."""
-PERSON = re.compile(r"\s*[^,;]+,\s*[^,;]+")
+PERSONS = re.compile(r"\s*[^,;]+,\s*[^,;]+(?:;\s*[^,;]+,\s*[^,;]+)*")
 SPECIES = re.compile(r"[A-Z][a-z]*\.?( [a-z]+){1,2}|https?://\S+/NCBITaxon_\d+")
 """Genus, species and optionally subspecies, or an address in NCBI's taxonomy."""
 
@@ -46,10 +45,8 @@ class Origin:
         age: ISO 8601 duration, such as `P42D`, or a range of two separated by a slash.
         subject_description: such as `dissociated cortical culture`.
         experimenter: `Last, First`; several separated by semicolons.
-        institution, lab: where.
         keywords: separated by commas.
         recorded_at: ISO 8601 date.
-        experiment_description: as text.
 
     Raises:
         InvalidArgument: for a `species` that is not in Latin, an `age` that is not a duration, an `experimenter`
@@ -70,26 +67,20 @@ class Origin:
 
     def __post_init__(self) -> None:
         # Checked here rather than when the file is written, as spike detection takes minutes.
-        if self.species is not None and not SPECIES.fullmatch(self.species):
-            expected = "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy"
-            raise InvalidArgument(f"species: expected {expected}, got {self.species!r}")
-        if self.age is not None:
-            # One duration, or two of a range, whose end may be open.
-            lengths_s = [_length_s(age) for age in self.age.removesuffix("/").split("/", 1)]
-            if any(map(math.isnan, lengths_s)):
-                expected = "an ISO 8601 duration such as P42D (days), P6W or P3M"
-                raise InvalidArgument(f"age: expected {expected}, got {self.age!r}")
-            if lengths_s != sorted(lengths_s):
-                raise InvalidArgument(f"age: expected a range with the younger age first, got {self.age!r}")
-        if self.experimenter is not None and not all(map(PERSON.fullmatch, self.experimenter.split(";"))):
-            expected = "Last, First, several separated by semicolons"
-            raise InvalidArgument(f"experimenter: expected {expected}, got {self.experimenter!r}")
-        if self.recorded_at is not None:
-            try:
-                datetime.fromisoformat(self.recorded_at)
-            except ValueError as error:
-                expected = "an ISO 8601 date such as 2024-05-31T14:00:00+09:00"
-                raise InvalidArgument(f"recorded_at: expected {expected}, got {self.recorded_at!r}") from error
+        checks: dict[str, tuple[Callable[[str], object], str]] = {
+            "species": (
+                SPECIES.fullmatch,
+                "the name in Latin, such as Mus musculus, or its address in NCBI's taxonomy",
+            ),
+            "age": (_lengths_s, "an ISO 8601 duration such as P42D (days), P6W or P3M"),
+            "experimenter": (PERSONS.fullmatch, "Last, First, several separated by semicolons"),
+            "recorded_at": (_date, "an ISO 8601 date such as 2024-05-31T14:00:00+09:00"),
+        }
+        for name, (read, expected) in checks.items():
+            if (text := getattr(self, name)) is not None and not read(text):
+                raise InvalidArgument(f"{name}: expected {expected}, got {text!r}")
+        if self.age is not None and (lengths_s := _lengths_s(self.age)) != sorted(lengths_s):
+            raise InvalidArgument(f"age: expected a range with the younger age first, got {self.age!r}")
 
     def to_provenance(self) -> Mapping[str, str]:
         """The values given, as entries of `Recording.provenance`."""
@@ -153,21 +144,28 @@ def convert_recording(
     return recording
 
 
-def _length_s(age: str) -> float:
-    """The length of an ISO 8601 duration; NaN for other text."""
-    if (match := DURATION.fullmatch(age)) is None:
-        return math.nan
-    return sum(float(number or 0) * unit_s for number, unit_s in zip(match.groups(), UNITS_S, strict=True))
+def _lengths_s(age: str) -> list[float]:
+    """The length of an ISO 8601 duration, or of the two of a range, whose end may be open; empty for other text."""
+    lengths_s = []
+    for part in age.removesuffix("/").split("/", 1):
+        if (match := DURATION.fullmatch(part)) is None:
+            return []
+        lengths_s.append(sum(float(n or 0) * unit_s for n, unit_s in zip(match.groups(), UNITS_S, strict=True)))
+    return lengths_s
+
+
+def _date(text: str) -> datetime | None:
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        return None
 
 
 def _without_zone(recording: Recording) -> Iterator[Finding]:
     """A note on a date without a time zone."""
     recorded_at = recording.provenance.get("recorded_at", "")
-    try:
-        is_without = datetime.fromisoformat(recorded_at).tzinfo is None
-    except ValueError:
-        return
-    if is_without and all(finding.name != "zone-unknown" for finding in recording.findings):
+    is_noted = any(finding.name == "zone-unknown" for finding in recording.findings)
+    if (date := _date(recorded_at)) is not None and date.tzinfo is None and not is_noted:
         message = f"recorded_at {recorded_at} has no time zone and is taken as UTC; add one, such as +09:00"
         yield Finding("zone-unknown", "note", message)
 
@@ -182,13 +180,7 @@ def read_traces(
 ) -> Recording:
     """Detect the spikes in a file's raw traces (MaxWell, CL1, NWB) and make a recording from them.
 
-    Args:
-        part, stimuli: as in `read_recording`.
-        progress: updated after each piece.
-
-    Raises:
-        InvalidFile: if the file holds no raw traces, or they cannot be read.
-        InvalidArgument: for settings that the traces do not allow.
+    Arguments and errors are those of `convert_recording`, whose `detection` the settings are.
     """
     path = Path(path)
     magic = first_bytes(path)

@@ -75,8 +75,7 @@ _KINDS = {
     "synthetic": ("synthetic", "seed"),
     "made up": ("synthetic", "seed"),
 }
-"""How the source in a file begins, and the kind of culture and the key of its seed that this means; the
-last one is of earlier files."""
+"""By how the source in a file begins, the kind of culture and the key of its seed; the last is of earlier files."""
 _OURS = " by animat.cultures."
 """In the source of animat's own recordings; the source of any other is the name of its file, which may begin alike."""
 

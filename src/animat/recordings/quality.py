@@ -17,8 +17,13 @@ from animat.tables import UNKNOWN
 
 MANY_STIMULI = 100
 STIMULI_PER_SPIKE = 10.0
-"""From this ratio on spikes and stimuli must be swapped: nothing can be learned from a culture that responds so
-rarely."""
+"""From this ratio on spikes and stimuli must be swapped: nothing can be learned from such rare responses."""
+DUPLICATES = 0.03, 20
+"""Share of the spikes above which duplicates are reported, and the fewest that are."""
+MOSTLY_SILENT = 0.5
+FAST_HZ = 100.0
+"""On average over a recording: the few neurons near one electrode cannot fire so fast for minutes."""
+HOLDS_MOST, SEVERAL, NAMED = 1 / 3, 8, 6
 
 
 def recording_findings(recording: Recording | ResponseTable) -> tuple[Finding, ...]:
@@ -83,10 +88,6 @@ def _stimulus_rows(recording: Recording) -> Iterable[Finding]:
         yield Finding("trials-of-several-frequencies", "warning", message, float(several))
 
 
-DUPLICATES = 0.03, 20
-"""Share of the spikes above which duplicates are reported, and the fewest that are."""
-
-
 def _duplicates(recording: Recording) -> Iterable[Finding]:
     """A finding on spikes with the same channel and time, which is impossible."""
     same = (np.diff(recording.spike_times_s) == 0) & (np.diff(recording.spike_channels) == 0)
@@ -99,19 +100,8 @@ def _duplicates(recording: Recording) -> Iterable[Finding]:
         yield Finding("duplicate-spikes", "warning", message, share)
 
 
-MOSTLY_SILENT = 0.5
-FAST_HZ = 100.0
-"""On average over a recording: the few neurons near one electrode cannot fire so fast for minutes."""
-HOLDS_MOST = 1 / 3
-SEVERAL = 8
-NAMED = 6
-
-
 def _on_channels(recording: Recording) -> Iterator[Finding]:
-    """Findings on silent channels, and on noisy ones, of a recording with at least one spike.
-
-    A channel is noisy if it fires at more than 100 Hz on average, or has a third of all spikes of eight or more.
-    """
+    """Findings on silent channels, and on noisy ones, which fire too fast or have too many of all spikes."""
     channels = recording.channels
     n, n_spikes = len(channels), len(recording.spike_times_s)
     count = np.bincount(recording.spike_channels, minlength=n)

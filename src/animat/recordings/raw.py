@@ -64,8 +64,6 @@ class RawTraces:
 
         Args:
             voltage_uv: shape (samples, channels), any number type, in steps of `uv_per_step`.
-            channels: one per column.
-            start_s: time of the first sample.
 
         Raises:
             InvalidArgument: for a wrong shape.

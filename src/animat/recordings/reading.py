@@ -35,8 +35,7 @@ ZIP = b"PK"
 PICKLE = "a Python pickle, which is never read; save plain arrays with numpy.savez"
 OTHERS = {
     **{bytes([0x80, protocol]): PICKLE for protocol in range(2, 6)},
-    b"\xff\xfe": "text in UTF-16; save it as CSV in UTF-8",
-    b"\xfe\xff": "text in UTF-16; save it as CSV in UTF-8",
+    **dict.fromkeys((b"\xff\xfe", b"\xfe\xff"), "text in UTF-16; save it as CSV in UTF-8"),
     b"MATLAB": "a MATLAB file; save its columns as CSV or NPZ",
     b"\x93NUMPY": "NPY, which holds one array; save several by name with numpy.savez",
 }
@@ -74,10 +73,9 @@ def read_recording(
             offer, or a `start_min` or `start_s` that is not finite.
     """
     path = Path(path)
-    if start_min is not None and not np.isfinite(start_min):
-        raise InvalidArgument(f"start_min: expected finite minutes, got {start_min:g}")
-    if start_s is not None and not np.isfinite(start_s):
-        raise InvalidArgument(f"start_s: expected finite seconds, got {start_s:g}")
+    for name, start, unit in (("start_min", start_min, "minutes"), ("start_s", start_s, "seconds")):
+        if start is not None and not np.isfinite(start):
+            raise InvalidArgument(f"{name}: expected finite {unit}, got {start:g}")
     source = read_source(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(

@@ -78,8 +78,7 @@ def culture_of_series(cultures: Iterable[RecordedCulture | None]) -> RecordedCul
     if not known:
         return None
     known = [culture for culture in known if not known[0].difference(culture)]
-    values: dict[str, str] = {}
-    for culture in known:
-        values = dict(culture.names) | values
+    # What the first states comes last, and counts.
+    values = {name: value for culture in reversed(known) for name, value in culture.names}
     names = tuple((name, values[name]) for name in NAMES if name in values)
     return replace(next((culture for culture in known if culture.kind), known[0]), names=names)

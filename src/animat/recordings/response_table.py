@@ -32,10 +32,7 @@ class ResponseTable:
         stimuli: the stimulus table, one row per row of `values`.
         has_times: whether `stimuli.time_s` are times; otherwise they number the rows.
         window_ms: the window after the stimulus in which spikes were counted, None if not known.
-        start_min: start on the culture's clock, in minutes.
-        presentation: how stimuli were presented, None if not known.
-        provenance: where the table came from, as text by keyword, for people.
-        findings: made when it was read.
+        start_min, presentation, provenance, findings: as in `Recording`.
         protocol, culture: None, as files do not state them.
 
     Raises:

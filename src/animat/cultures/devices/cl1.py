@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -104,9 +104,8 @@ class CL1Culture(Culture):
         self._patterns = _check_patterns(_draw_patterns(seed) if patterns is None else patterns)
         self._seed = seed if patterns is None else None
         self._ticks_per_s, self._margin_frames = ticks_per_s, round(margin_ms * 1e-3 * FRAMES_PER_S)
-        self._jitter: dict[str, Any] = {"ignore_jitter": True}
-        if jitter_tolerance_ms is not None:
-            self._jitter = {"jitter_tolerance_frames": round(jitter_tolerance_ms * 1e-3 * FRAMES_PER_S)}
+        tolerance = None if jitter_tolerance_ms is None else round(jitter_tolerance_ms * 1e-3 * FRAMES_PER_S)
+        self._jitter = {"ignore_jitter": True} if tolerance is None else {"jitter_tolerance_frames": tolerance}
         channel, pitch = np.array(SITES, np.int64), np.nan if pitch_um is None else float(pitch_um)
         self._channels = Channels(channel.astype(np.str_), channel, (channel // 8) * pitch, (channel % 8) * pitch)
         self._record_to, self._raw = record_to, raw

@@ -17,6 +17,7 @@ from animat.cultures.observed import Observed, observed_in_frames
 from animat.cultures.safety import Guard
 from animat.errors import DeviceFailed
 from animat.recordings.formats.cl1_layout import CHANNELS, SITES
+from animat.recordings.formats.stimulus_text import parameters_of
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN
@@ -124,7 +125,7 @@ class Session:
         plan.stim(self.cl.ChannelSet(*stimulus.electrodes), self._design_of(stimulus.pulse), lead_time_us=LEAD_US)
         plan.run(at_timestamp=frame - LEAD_FRAMES)
         if self.stream is not None:
-            self.stream.append(frame, json.dumps(_parameters(stimulus)))
+            self.stream.append(frame, json.dumps({**parameters_of(stimulus), "phases": stimulus.pulse.to_list()}))
         return frame
 
     def _design(self, pulse: Pulse) -> Any:
@@ -149,13 +150,3 @@ def _began(stimulus: Stimulus, frame: int, reported: dict[int, deque[int]], star
             )
         began.append(reported[electrode].popleft())
     return min(began)
-
-
-def _parameters(stimulus: Stimulus) -> dict[str, Any]:
-    """Parameters of a stimulus that the device's own file lacks."""
-    parameters: dict[str, Any] = {"electrodes": list(stimulus.electrodes), "presentation": stimulus.presentation}
-    if np.isfinite(stimulus.frequency_hz):
-        parameters["frequency_hz"] = stimulus.frequency_hz
-    if stimulus.pattern >= 0:
-        parameters["pattern"] = stimulus.pattern
-    return {**parameters, "phases": stimulus.pulse.to_list()}

@@ -43,7 +43,6 @@ class SimulatedCL1:
     and pulses, not on the pieces in which it is read: noise is drawn for whole blocks of frames.
 
     Args:
-        seed: of the culture.
         neurons: of the tissue; with fewer than 1,200, each has proportionally fewer partners. More than the default may
             be too many for real time, as a warning at opening says: the application then falls behind the SDK's buffer.
         pitch_um: between electrodes, in the middle of the tissue. Assumed: the SDK does not specify it.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import count
 from typing import Any
 
-import numpy as np
-
 from animat.cultures.limits import steps_of
+from animat.recordings.formats.stimulus_text import parameters_of
 from animat.stimulation.pulse import Pulse
 from animat.stimulation.stimulus import Stimulus
 
@@ -40,8 +40,7 @@ class Sequences:
         self._mx, self._unit_of, self._lsb_mv = mx, unit_of, lsb_mv
         self._kept: dict[tuple[tuple[int, ...], Pulse], Any] = {}
         self._passing: list[Any] = []
-        self._made = 0
-        self._event = 0
+        self._numbers, self._events = count(1), count(1)
 
     def of(self, stimuli: Sequence[Stimulus]) -> Any:
         """A sequence that delivers these stimuli, the first `INITIAL_DELAY` samples after sending."""
@@ -65,8 +64,7 @@ class Sequences:
         self._passing.clear()
 
     def _build(self, stimuli: Sequence[Stimulus], *, is_kept: bool) -> Any:
-        self._made += 1
-        sequence = self._mx.Sequence(f"animat_{self._made}", initial_delay=INITIAL_DELAY, persistent=is_kept)
+        sequence = self._mx.Sequence(f"animat_{next(self._numbers)}", initial_delay=INITIAL_DELAY, persistent=is_kept)
         at = 0
         for stimulus in stimuli:
             begins = round((stimulus.time_s - stimuli[0].time_s) * FRAMES_PER_S)
@@ -78,8 +76,11 @@ class Sequences:
     def _append(self, sequence: Any, stimulus: Stimulus, is_kept: bool) -> int:
         """Append one stimulus; returns its duration in samples."""
         mx, units = self._mx, [self._unit_of[electrode] for electrode in stimulus.electrodes]
-        self._event += 1
-        sequence.append(mx.Event(WELL, EVENT_TYPE, self._event, json.dumps(_event_data(stimulus, is_kept))))
+        data = parameters_of(stimulus)
+        if is_kept:
+            # Nothing that differs between its uses.
+            data = {name: data[name] for name in ("electrodes", "pattern") if name in data}
+        sequence.append(mx.Event(WELL, EVENT_TYPE, next(self._events), json.dumps(data)))
         for unit in units:
             sequence.append(mx.StimulationUnit(unit).power_up(True).connect(True).set_voltage_mode().dac_source(0))
         lasted = 0
@@ -93,15 +94,3 @@ class Sequences:
         for unit in units:
             sequence.append(mx.StimulationUnit(unit).power_up(True).connect(False).set_voltage_mode().dac_source(0))
         return lasted
-
-
-def _event_data(stimulus: Stimulus, is_kept: bool) -> dict[str, Any]:
-    """Data of a stimulus for the device's file; a kept sequence has none that differ between its uses."""
-    data: dict[str, Any] = {"electrodes": list(stimulus.electrodes)}
-    if stimulus.pattern >= 0:
-        data["pattern"] = stimulus.pattern
-    if not is_kept:
-        data["presentation"] = stimulus.presentation
-        if np.isfinite(stimulus.frequency_hz):
-            data["frequency_hz"] = stimulus.frequency_hz
-    return data

@@ -19,16 +19,13 @@ UNITS = 32
 
 
 class Wiring(NamedTuple):
-    """The wiring of a selection."""
+    """Recording electrodes that were routed, and those that were not; the unit of each stimulation electrode."""
 
     channels: Channels
-    """Recording electrodes that were routed."""
     row_of: Int64[np.ndarray, " amplifiers"]
     """Row of `channels` for each amplifier, -1 if it has none."""
     not_routed: tuple[int, ...]
-    """Recording electrodes that were selected but not routed."""
     unit_of: dict[int, int]
-    """Stimulation unit of each stimulation electrode."""
 
 
 def wire(mx: Any, selection: Selection, *, wait: Callable[[str], None]) -> Wiring:

@@ -74,9 +74,8 @@ class TissueParameters:
     """[L] Its time constant: after a train the sodium pump hyperpolarises for about 20 s (Gulledge et al. 2013,
     doi 10.1523/JNEUROSCI.0220-13.2013)."""
     adaptation_mv: Number = 0.27
-    """[C] Added to the threshold by each spike."""
     adaptation_ms: Positive = 126.0
-    """[C] Its time constant."""
+    """[C] Added to the threshold by each spike, and its time constant."""
 
     # Synapses.
     ampa_ms: Positive = 3.0
@@ -95,9 +94,8 @@ class TissueParameters:
     weight_ei: Number = 0.9483
     weight_ie: Number = 0.302
     weight_ii: Number = 0.94
-    """[C] Mean weights, from the first letter to the second."""
     weight_sigma: Number = 0.5
-    """[C] Sigma of the log-normal weights."""
+    """[C] Mean weights, from the first letter to the second, and the sigma of their log-normal spread."""
     in_degree_e: Whole = 52
     in_degree_i: Whole = 30
     """[C] Synapses on each neuron, from excitatory and from inhibitory neurons."""
@@ -123,9 +121,8 @@ class TissueParameters:
     community_drive_mv: Number = 0.1
     """[C] Standard deviation of the additional drive of each community's neurons: some lead."""
     noise_mv: Number = 7.5
-    """[C] Standard deviation of the Ornstein-Uhlenbeck drive."""
     noise_ms: Positive = 5.0
-    """[C] Its time constant."""
+    """[C] Standard deviation and time constant of the Ornstein-Uhlenbeck drive."""
     shared_noise_mv: Number = 0.6
     """[C] Standard deviation of the slow Ornstein-Uhlenbeck drive that all neurons of a community share."""
     shared_noise_ms: Positive = 575.0
@@ -134,15 +131,13 @@ class TissueParameters:
 
     # Stimulation.
     kick_mv: Number = 68.0
-    """[C] Depolarisation of a neuron on the electrode by a full pulse."""
     kick_sigma: Number = 0.35
-    """[C] Sigma of its log-normal spread over neurons (median 1)."""
+    """[C] Median depolarisation of a neuron on the electrode by a full pulse; sigma of its log-normal spread."""
     kick_reach_um: Positive = 40.0
     """[C] The kick falls as 1 / (1 + (distance / reach)^2)."""
     axons_per_electrode: Number = 14.5
-    """[C] Expected number of neurons that an electrode drives through their axons."""
     axon_reach_um: Positive = 500.0
-    """[C] Their probability falls as exp(-distance / reach)."""
+    """[C] Expected number of axons that an electrode drives; their probability falls as exp(-distance / reach)."""
     axon_reliability: Share = 0.8
     """[L] Probability that a pulse drives an axon in its reach."""
     axon_latency_ms: FromZero = 0.5

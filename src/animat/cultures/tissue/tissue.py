@@ -40,7 +40,6 @@ class Tissue:
 
     Args:
         seed: decides the network, every draw of noise, and the drift over hours; zero or more.
-        parameters: of the model.
 
     Attributes:
         x_um, y_um: position of each neuron along the array's long and short side, shape (neurons,).
@@ -81,7 +80,6 @@ class Tissue:
         12.5 ms is the same as in one. A pulse acts at the first step that does not begin before it.
 
         Args:
-            duration_s: how long, zero or more.
             pulses: with times in [now_s, now_s + duration_s), in any order.
 
         Raises:

@@ -12,14 +12,11 @@ from animat.recordings.detection.settings import Detection
 
 TAUS_MS = (0.3, 0.5, 0.8, 1.2, 2.0, 3.5, 5.0, 8.0)
 GAUSS_NEWTON_STEPS = 8
-FAR = 20.0
-"""Distance from rest, in standard deviations of the noise, beyond which a still trace counts as saturated."""
-UNSETTLED = 2.0
-"""Mean distance from rest in the half millisecond after blanking, in standard deviations of the noise, beyond which a
-recovery is fitted."""
+FAR, UNSETTLED = 20.0, 2.0
+"""Distances from rest, in standard deviations of the noise: beyond the first a still trace counts as saturated; beyond
+the second, on average over the half millisecond after blanking, a recovery is fitted."""
 FLAT_MS, FLAT_SHARE = 0.4, 0.005
-"""How long a saturated trace stays still at least, and how far it moves at most, as a share of its distance from
-rest."""
+"""A saturated trace stays still at least so long, and moves at most by this share of its distance from rest."""
 SETTLE_MS = 0.25
 """Blanked after an amplifier recovers: its first samples do not lie on an exponential."""
 PAUSE_MS = 1.0
@@ -54,14 +51,9 @@ def without_artefacts(
     subtracted, with tau from about 0.2 to 16 ms. What some amplifiers leave, as they recover in another way,
     `animat.responses.quality.timing` reports.
 
-    Args:
-        voltage_uv: recorded traces, one row per channel; changed.
-        stimulus: sample of each pulse, ascending; pulses outside the stretch count if their artefacts reach into it.
-        noise_uv: standard deviation of each channel's noise.
-        rate_hz: sampling rate.
-        settings: how long to blank.
-        rest_uv: voltage of each channel before the last pulses before the stretch; a channel that stays still far from
-            it just before the first pulse is still saturated.
+    `stimulus` is the sample of each pulse, ascending; pulses outside the stretch count if their artefacts reach into
+    it. `rest_uv` is the voltage of each channel before earlier pulses; a channel that stays still far from it just
+    before the first pulse is still saturated.
     """
     samples = voltage_uv.shape[1]
     saturated, longest_ms = np.zeros(len(stimulus), np.int64), np.zeros(len(stimulus), np.float32)

@@ -23,15 +23,9 @@ REST_PULSES = 5
 class Piece:
     """Raw traces of samples `start` to `stop` of a recording, with `margin` samples more on both sides.
 
-    Attributes:
-        margin: beyond the ends of the recording its first or last sample is repeated.
-        lead: samples before the first margin, from just before the last pulse, only for the removal of artefacts.
-        voltage_uv: finite voltages, shape (lead + samples + 2 margin, channels).
-        is_lost: samples that were not finite and are interpolated, of the same shape; None if there are none.
-        stimulus: samples of the pulses in the piece, counted from the first row of `voltage_uv`.
-        first_stimulus: index of the first of these among all pulses.
-        rests_uv: resting voltages at a few earlier pulses of the last second, shape (pulses, channels); None if there
-            are no such pulses.
+    Beyond the ends of the recording its first or last sample is repeated. The `lead` before the first margin, from just
+    before the last pulse, is only for the removal of artefacts. Samples that were not finite are interpolated
+    (`is_lost`). Pulses count from the first row of `voltage_uv`; `rests_uv` are resting voltages at a few earlier ones.
     """
 
     start: int
@@ -42,7 +36,7 @@ class Piece:
     is_lost: Bool[np.ndarray, "samples channels"] | None
     stimulus: Int64[np.ndarray, " stimuli"]
     first_stimulus: int
-    rests_uv: Float32[np.ndarray, "pulses channels"] | None = None
+    rests_uv: Float32[np.ndarray, "pulses channels"] | None
 
     @property
     def owned(self) -> np.ndarray:

@@ -27,7 +27,6 @@ LEVEL_STEP = 20
 """Every so many samples are enough for the median of the voltage."""
 DEAD, NOISY = 0.1, 5.0
 """Multiples of the median channel's noise: a channel below is dead, one above is noisy."""
-
 MUCH_LOST = 0.01
 
 
@@ -63,7 +62,6 @@ def detect_spikes(
 
     Args:
         stimulus_time_s: starts of the pulses on the recording's clock.
-        settings: by default those of `Detection`.
         workers: threads; by default one per core. Each takes some 200 MB of memory for 1,024 channels.
         progress: updated after each piece.
 

@@ -103,10 +103,7 @@ def _stimuli(file: Hdf5File) -> tuple[Column, dict[str, Any]]:
 
 
 def _parameters(file: Hdf5File, stimulus: Column, findings: list[Finding]) -> dict[str, Any]:
-    """The parameters of stimuli from animat's data stream, each entry of which applies until the next.
-
-    Electrodes are known from the stimuli themselves.
-    """
+    """The parameters of stimuli, except electrodes, from animat's data stream: each entry applies until the next."""
     at = f"data_stream/{STIMULUS_STREAM}"
     if not len(stimulus) or not file.has(f"{at}/index") or not file.has(f"{at}/data"):
         return {}

@@ -42,9 +42,8 @@ SUFFIXES = (".csv", ".csv.gz")
 def read_csv(table: TextTable, stimuli_path: str | os.PathLike[str] | None = None) -> Recording:
     """Make a recording from a table of spikes and a file of stimuli.
 
-    Args:
-        stimuli_path: the stimuli; by default `NAME_stimuli.csv` or `NAME_stimuli.csv.gz` next to `NAME_spikes.csv` (or
-            next to `NAME.csv`). If there is none, the recording has no stimuli, with a finding.
+    That is by default `NAME_stimuli.csv[.gz]` next to `NAME_spikes.csv` (or next to `NAME.csv`). If there is none, the
+    recording has no stimuli, with a finding.
     """
     path = table.path
     if stimuli_path is None and _stem(path).endswith("_stimuli"):

@@ -231,19 +231,14 @@ def choose(
 ) -> str:
     """The name that was asked for, or the only one; other cases are refused, with a list of the names.
 
-    Args:
-        what: what is chosen and where, such as `rig.h5: part`.
-        option: the option that chooses it, such as `--part`.
-        describe: how a name is listed.
-        commands: which have the option.
+    `what` is chosen and where (`rig.h5: part`), by an `option` (`--part`) of some `commands`.
     """
     candidates = list(names)
+    if asked in candidates or (asked is None and len(candidates) == 1):
+        return asked or candidates[0]
     listed = some_of([describe(name)[:80] for name in candidates])
     if asked is not None:
-        if asked in candidates:
-            return asked
         raise InvalidFile(f"{what}: expected one of {listed}; got {asked}")
-    if len(candidates) == 1:
-        return candidates[0]
-    found = f"expected one, found {len(candidates)}: {listed}"
-    raise InvalidFile(f"{what}: {found}; choose with {option} NAME in {commands}")
+    raise InvalidFile(
+        f"{what}: expected one, found {len(candidates)}: {listed}; choose with {option} NAME in {commands}"
+    )

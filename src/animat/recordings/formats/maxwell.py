@@ -65,9 +65,7 @@ def read_maxwell(
 ) -> Recording:
     """Read spikes, which must exist, stimuli and electrodes of an open MaxWell file; or no spikes, for raw traces.
 
-    Args:
-        part: which recording, such as `well000/rec0000`, if the file has several.
-        stimuli: the type of the events that are stimuli, as a number, if there are several types.
+    `part` and `stimuli` are those of `read_recording`.
     """
     layout = _old(file) if is_old(file) else _new(file, part)
     findings, rate_hz = layout.findings, layout.rate_hz
@@ -220,8 +218,4 @@ def _channels(file: Hdf5File, layout: _Layout, spike_channel: Column) -> dict[st
     if recorded is not None and (unmapped := len(np.setdiff1d(recorded, labels))):
         message = f"{unmapped:,} recorded channels have no electrode in the mapping and are left out"
         findings.append(Finding("channels-not-routed", "note", message, float(unmapped)))
-    return {
-        "channel_label": labels,
-        "channel_electrode": electrode[used][first],
-        "channel_xy_um": xy_um[used][first],
-    }
+    return {"channel_label": labels, "channel_electrode": electrode[used][first], "channel_xy_um": xy_um[used][first]}

@@ -114,15 +114,13 @@ def _single(what: str, name: str, array: Column) -> str | float:
     """The single value of an array, a number or text."""
     if array.size != 1:
         raise InvalidFile(f"{what}: expected one value, got shape {array.shape}")
-    value = array.reshape(-1)[0].item()
-    is_text = name == "presentation_order"
-    if not isinstance(value, str if is_text else int | float):
+    value: str | float = array.item()
+    is_text, is_whole = name == "presentation_order", name == "presentation_pulses"
+    if isinstance(value, str) != is_text or not isinstance(value, str | int | float):
         raise InvalidFile(f"{what}: expected {'text' if is_text else 'a number'}, got {value!r}")
-    if name == "presentation_pulses":
-        if not float(value).is_integer():
-            raise InvalidFile(f"{what}: expected a whole number, got {value!r}")
-        value = int(value)
-    return value  # type: ignore[no-any-return]
+    if is_whole and not float(value).is_integer():
+        raise InvalidFile(f"{what}: expected a whole number, got {value!r}")
+    return int(value) if is_whole else value
 
 
 def _electrodes_at(xy_um: Column, electrode: Column, electrode_xy_um: Column) -> Column:

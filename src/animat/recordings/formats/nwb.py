@@ -49,9 +49,8 @@ def write_nwb(
     NWB's fields for its origin are filled from `Recording.provenance`, by the keys in docs/recordings.md.
 
     Args:
-        path: the file; parent folders are created, and an old file is replaced only by a complete new one.
-        spikes: instead of the recording's own, which must be empty; may exceed memory, in any order.
-        counts: of `spikes`.
+        path: parent folders are created, and an old file is replaced only by a complete new one.
+        spikes, counts: instead of the recording's own, which must be empty; may exceed memory, in any order.
 
     Raises:
         InvalidFile: if the file cannot be written (no permission, a full disk).
@@ -192,10 +191,5 @@ def _stimuli(file: Hdf5File, columns: int) -> Stimuli:
         raise UnusableData(f"stimulus_electrode_columns: expected the width of a table, got {columns}")
     electrodes = np.full((len(lengths), columns), UNKNOWN, dtype=np.int64)
     electrodes[np.arange(columns)[None, :] < lengths[:, None]] = flat
-    return Stimuli(
-        time_s=time_s,
-        frequency_hz=file.read(f"{STIMULI_TABLE}/frequency_hz"),
-        pattern=file.read(f"{STIMULI_TABLE}/pattern"),
-        electrodes=electrodes,
-        presentation=file.read(f"{STIMULI_TABLE}/presentation"),
-    )
+    others = {name: file.read(f"{STIMULI_TABLE}/{name}") for name in ("frequency_hz", "pattern", "presentation")}
+    return Stimuli(time_s=time_s, electrodes=electrodes, **others)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from animat.stimulation.stimulus import Stimulus
 from animat.tables import UNKNOWN, padded
 
 LONGEST = 4096
@@ -23,6 +24,16 @@ NAMES = {name: name for name in ("frequency_hz", "pattern", "presentation", "ele
 NAMES |= {"frequency": "frequency_hz", "freq": "frequency_hz", "electrode": "electrodes"}
 _MOST_ELECTRODES = 1024
 _PAIR = re.compile(r"([a-z_]+)\s*[=:\s]\s*(-?[\d.]+(?:e[+-]?\d+)?(?:[,+]\d+)*)", re.IGNORECASE)
+
+
+def parameters_of(stimulus: Stimulus) -> dict[str, Any]:
+    """The parameters of a stimulus that a rig's own file lacks, as far as they are known."""
+    known: dict[str, Any] = {"electrodes": list(stimulus.electrodes), "presentation": stimulus.presentation}
+    if math.isfinite(stimulus.frequency_hz):
+        known["frequency_hz"] = stimulus.frequency_hz
+    if stimulus.pattern >= 0:
+        known["pattern"] = stimulus.pattern
+    return known
 
 
 def parse_line(text: str) -> dict[str, Any]:

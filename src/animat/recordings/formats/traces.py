@@ -16,14 +16,7 @@ from animat.errors import InvalidFile
 from animat.recordings.columns import duration_between
 from animat.recordings.formats.cl1 import read_cl1
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
-from animat.recordings.formats.hdf5 import (
-    PLUGIN_ADVICE,
-    Hdf5File,
-    choose,
-    hdf5_file,
-    is_positive,
-    unavailable_filters,
-)
+from animat.recordings.formats.hdf5 import PLUGIN_ADVICE, Hdf5File, choose, hdf5_file, is_positive, unavailable_filters
 from animat.recordings.formats.hdf5_formats import format_of
 from animat.recordings.formats.maxwell import OLD_CHANNELS, is_old, parts, read_maxwell
 from animat.recordings.raw import RawTraces, in_microvolts
@@ -41,9 +34,7 @@ def open_traces(
 ) -> tuple[RawTraces, Recording]:
     """The raw traces of a file, and its recording without spikes: channels, stimuli, provenance.
 
-    Args:
-        part: which recording of a MaxWell file, or which series of an NWB file, if there are several.
-        stimuli: which of several candidates are the stimuli, as in `read_recording`.
+    `part` says which recording of a MaxWell file, or which series of an NWB file, `stimuli` as in `read_recording`.
     """
     with hdf5_file(Path(path)) as file:
         kind = format_of(file)

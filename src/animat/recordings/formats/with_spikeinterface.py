@@ -23,23 +23,14 @@ from animat.recordings.formats.csv import read_stimuli_csv, stimuli_beside
 from animat.recordings.raw import RawTraces, in_microvolts
 from animat.recordings.recording import Recording
 
-REFUSED = ("binary",)
-"""Trace readers that need more than a file."""
-
 
 def open_with_spikeinterface(
     path: str | os.PathLike[str], reader: str, *, stimuli_path: str | os.PathLike[str] | None = None
 ) -> tuple[RawTraces, Recording]:
-    """Raw traces read by SpikeInterface, and their recording without spikes.
+    """Raw traces of a file or folder read by SpikeInterface, and their recording without spikes.
 
-    Args:
-        path: a file or folder, as the reader requires.
-        reader: the format, such as `intan`.
-        stimuli_path: CSV with stimulus times from the start of the traces; by default `NAME_stimuli.csv` beside it.
-
-    Raises:
-        InvalidArgument: for an unknown reader, or if SpikeInterface is not installed.
-        InvalidFile: if the file cannot be read.
+    The reader is the format, such as `intan`. Stimulus times, from the start of the traces, are in CSV, by default in
+    `NAME_stimuli.csv` beside it. Raises InvalidArgument for an unknown reader, or if SpikeInterface is not installed.
     """
     path = Path(path)
     if not path.exists():
@@ -84,10 +75,10 @@ def _reader(name: str) -> Callable[..., Any]:
         raise InvalidArgument(
             f"reader: expected the package SpikeInterface, which is not installed: {install_command('raw')}"
         ) from error
-    # Excludes readers of sortings and events, and of SpikeInterface's own saved objects.
+    # Excludes readers of sortings, events and SpikeInterface's own objects, and one that needs more than a file.
     of_traces = list(extractors.recording_extractor_full_dict.values())
     readers = {n[5:]: getattr(extractors, n) for n in dir(extractors) if n.startswith("read_")}
-    readers = {n: read for n, read in readers.items() if read in of_traces and n not in REFUSED}
+    readers = {n: read for n, read in readers.items() if read in of_traces and n != "binary"}
     if name not in readers:
         raise InvalidArgument(f"reader: expected one of {', '.join(sorted(readers))}; got {name!r}")
     return readers[name]  # type: ignore[no-any-return]
