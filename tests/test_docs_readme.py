@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from animat.cli import _parse
-from synthetic_recordings import write_synthetic_series
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -71,16 +70,22 @@ def test_the_code_for_gymnasium_runs(capsys: pytest.CaptureFixture[str]) -> None
 def test_the_examples_in_python_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The README's and, on the policies that it trains, those of docs/training.md; two short ones for ten long ones."""
+    """The README's and, on the policies that it trains, those of docs/training.md; all shorter than there."""
     monkeypatch.chdir(tmp_path)
-    write_synthetic_series(1, tmp_path / "recordings", sessions=2, interval_min=50, patterns=30, channels=32)
-    example = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
-    shorter = example.replace("policies=4, iterations=400_000", "policies=2, iterations=6_400")
-    assert shorter != example
+    shorter = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[1]
+    for written, short in (
+        ("trials=1000", "trials=40"),
+        ("policies=4, iterations=400_000", "policies=2, iterations=6_400"),
+        ('"session")', '"session", episodes=1, with_controls=False)'),
+    ):
+        assert written in shorter
+        shorter = shorter.replace(written, short)
     names: dict[str, object] = {}
     exec(compile(shorter, "README.md", "exec"), names)
-    assert capsys.readouterr().out.startswith(
-        "cartpole, 9-thresholds, recording at 50 min: 2 policies, 100 episodes each"
+    evaluated, measured = re.split(r"\n(?=cartpole)", capsys.readouterr().out)
+    assert evaluated.startswith("cartpole, 9-thresholds, recording at 10 min: 2 policies, 100 episodes each")
+    assert measured.startswith(
+        "cartpole, 9-thresholds, mixed, 1 pulse per trial; predicted from the recording at 10 min"
     )
     training_page = (ROOT / "docs" / "training.md").read_text()
     wrapped, followed, loaded = re.findall(r"```python\n(.*?)```", training_page, flags=re.DOTALL)

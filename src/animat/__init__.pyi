@@ -17,6 +17,7 @@ from animat.cultures.base import Culture as Culture
 from animat.cultures.safety import Limits as Limits
 from animat.cultures.virtual import VirtualCulture as VirtualCulture
 from animat.cultures.replay import ReplayCulture as ReplayCulture
+from animat.cultures.series import record_series as record_series
 from animat.responses.condition import Condition as Condition
 from animat.responses.conditions import conditions_named as conditions_named
 from animat.responses.readouts import Readouts as Readouts
