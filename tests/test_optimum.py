@@ -342,6 +342,9 @@ def test_refusals_say_what_to_do() -> None:
         best_return(environment, SIMULATOR, resolution=0.0)
     with pytest.raises(InvalidArgument, match="episodes"):
         best_return(environment, SIMULATOR, episodes=1)
+    # Two bytes for each of five steps and each iteration left.
+    with pytest.raises(InvalidArgument, match=r"resolution: .* fit into 16 GiB, got 1, which takes 18\.6 GiB"):
+        best_return(Animat(Stairs(2 * 10**9), Thresholds(1), 2), coins(3, 6), grid=STEPS)
     with pytest.raises(InvalidArgument, match="axis x"):
         Axis("x", "m", 0.0, 1.0, 3)
     grid = grid_for(Navigation()).scaled(0.3)
