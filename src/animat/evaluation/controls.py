@@ -108,7 +108,7 @@ def controls_of(
         action = "the command" if environment.n_actions is None else "the stimulus nearest to the command"
         meaning = f"no learning: {action} of the robot's heuristic"
         controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
-    if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
+    if policies is not None and isinstance(unwrapped(environment), Animat):
         controls += _without_influence(policies)
     return controls
 
