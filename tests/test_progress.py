@@ -168,6 +168,11 @@ def test_compiling_and_going_on_from_a_checkpoint_are_forgotten(monkeypatch: pyt
         phase.update(0.0 if now_s < 20 else 0.5 + (now_s - 20) / 200, 1)
     assert phase.left() == "40 s left"
     assert phase.counted() == ["800 of 1,000 iterations", "5.0 a second"]
+    # What a sum of parts loses by rounding is no new work; anything more is.
+    phase.update(0.8 - 1e-15, 1)
+    assert phase.left() == "40 s left"
+    phase.update(0.799, 1)
+    assert phase.left() == ""
 
 
 def test_the_speed_of_the_last_minute_is_that_of_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
