@@ -161,6 +161,7 @@ def test_fidelity_is_what_binning_makes_of_the_share_above_the_median() -> None:
     # Within the bin from 30 to 36, P(x >= 31.5) = 4.5 / 6 for both.
     np.testing.assert_allclose(kept.in_simulator, [0.75, 0.75], atol=1e-3)
     assert [f.name for f in kept.findings()] == ["binning"]
+    assert "binning" in {f.name for f in fit_timeline([responses], kind="histogram", range_hz=120.0).findings}
     assert not fidelity(responses, fit_empirical(responses)).findings()
 
 
