@@ -35,13 +35,13 @@ def assert_whole(rows: list[CurveRow], policies: dict[str, Policy]) -> None:
 def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain = trained(FOUR, timeline_of(), tmp_path / "plain")
     rows: list[CurveRow] = []
-    came = Event()
+    came, waited = Event(), list[bool]()
     add = CurveFile.add
 
     def add_and_wait(file: CurveFile, part: np.ndarray) -> None:
         """The training goes on only when its first row has come."""
         add(file, part)
-        assert came.wait(60)
+        waited.append(came.wait(60))
 
     def on_row(row: CurveRow) -> None:
         rows.append(row)
@@ -51,6 +51,8 @@ def test_rows_come_while_it_trains_and_change_no_bit(tmp_path: Path, monkeypatch
     followed = trained(FOUR, timeline_of(), tmp_path / "followed", callbacks=[on_row])
     assert bits(tmp_path / "plain") == bits(tmp_path / "followed")
     assert_whole(rows, followed)
+    # Every chunk of both groups; the first waited for its rows, and not in vain.
+    assert waited == [True] * 2 * CHUNKS
     # In memory, one by one; and of a folder that is finished.
     in_memory: list[CurveRow] = []
     alone = train(FOUR, timeline_of(), None, callbacks=[in_memory.append])

@@ -22,7 +22,7 @@ from animat.neurons.simulator import indifferent
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots import Cartpole, Quantity, Robot, Wheels
 from animat.training.networks import Layer
-from animat.wrappers import GoalSwitch, YokedDelivery
+from animat.wrappers import GoalSwitch, IdealActuator, ReversedMapping, ShuffledDelivery, YokedDelivery
 
 
 class Aimed(NamedTuple):
@@ -82,10 +82,29 @@ class Delayed(Animat[Any]):
     delay: int = 2
 
 
-def test_an_environment_of_ones_own_may_have_more_attributes() -> None:
+def test_each_intervention_changes_one_thing_also_in_an_environment_with_more_attributes() -> None:
     own = Delayed(ENVIRONMENT.robot, ENVIRONMENT.mapping, ENVIRONMENT.n_conditions)
+    found = {}
     for each in interventions_of(own, SIMULATOR, BEST, switch_at=4):  # type: ignore[arg-type]
-        assert each.within(own, SIMULATOR)[0].n_actions == own.n_actions
+        environment, simulator = each.within(own, SIMULATOR)
+        assert environment.n_actions == own.n_actions
+        # Four even draws for each of five conditions: the same four, or silence.
+        answered = np.unique(simulator.evenly_drawn(4)) if simulator is not SIMULATOR else []
+        found[each.name] = type(environment), len(answered)
+    assert found == {
+        "ideal actuator": (IdealActuator, 0), "random spikes": (Delayed, 4), "silent": (Delayed, 1),
+        "shuffled": (ShuffledDelivery, 0), "yoked": (YokedDelivery, 0), "turned round": (ReversedMapping, 0),
+        "goal switched": (GoalSwitch, 0),
+    }  # fmt: skip
+    assert "goal switched" not in {each.name for each in interventions_of(own, SIMULATOR, BEST)}  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("simulator", [SIMULATOR, indifferent(SIMULATOR)])
+def test_an_ideal_actuator_stretches_mean_commands_to_the_full_range(simulator: Any) -> None:
+    means = mean_commands(ENVIRONMENT, simulator)[1]
+    low, high = means.min(), means.max()
+    wanted = np.interp(means, [low, high], [-1, 1]) if high > low else np.zeros(5)
+    np.testing.assert_allclose(interventions_of(ENVIRONMENT, simulator, BEST)[0].commands, wanted, atol=1e-12)  # type: ignore[arg-type]
 
 
 @pytest.mark.oracle

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -13,18 +14,24 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from animat.errors import AnimatError, InvalidFile
 from animat.execution.jobs import PLANNED, Job, Jobs, in_order
 from animat.execution.pinned import PinnedProcesses
-from animat.execution.receipts import Receipt, digest_of, receipt_path
+from animat.execution.receipts import Receipt, _packed, digest_of, receipt_path
 from animat.execution.task import Task, carry_out, carry_out_alone, reported
 from animat.progress import Silent
+from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.recording import Channels, Recording
+from animat.stimulation.protocol import Presentation, Protocol
+from animat.stimulation.stimulus import Stimuli
 from synthetic_recordings import synthetic_recording
 from worker_tasks import Die, Fail, Join, Killed, Starve, Stumble
 
@@ -249,6 +256,35 @@ def test_a_recording_is_known_by_what_it_says_not_by_what_nwb_adds(tmp_path: Pat
     assert receipt.changed(tmp_path) == ["a.nwb"]
     made.write_bytes(made.read_bytes()[:1000])
     assert receipt.changed(tmp_path) == ["a.nwb"]
+
+
+def test_a_recording_s_digest_rests_on_all_of_it_and_on_no_version_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    channels = Channels(np.array(["a", "b"]), np.array([7, 9]), np.zeros(2), np.ones(2))
+    stimuli = Stimuli(np.array([0.5, 1.0]), np.array([5.0, 5.0]), np.array([0, 1]), np.array([[1], [2]]), np.arange(2))
+    numbers = {"sampling_rate_hz": 20_000.0, "start_s": 0.0, "duration_s": 2.0, "start_min": 1.0}
+    of = Recording(
+        np.array([0.6, 1.1]), np.array([0, 1]), channels, stimuli, **numbers, presentation=Presentation("blocked")
+    )
+
+    def digest(recording: Recording) -> str:
+        return hashlib.sha256(_packed(recording)).hexdigest()
+
+    # As commit fdbeb56 found it: with another one, finished recordings would be made again.
+    assert digest(of) == "b5e812e3eac6cf6f4d641e67ddb8265a3ccbf7517db39a4752276ffd2bad8718"
+    others: list[dict[str, Any]] = [{name: number + 0.25} for name, number in numbers.items()]
+    others += [{"presentation": each} for each in (None, Presentation("mixed"), Presentation("blocked", 2))]
+    others += [{"spike_times_s": of.spike_times_s + 0.1}, {"spike_channels": 1 - of.spike_channels}]
+    others += [{"provenance": {"rig": "1"}}, {"findings": (Finding("noisy", "warning", "very"),)}]
+    others += [{"protocol": Protocol((5.0,))}, {"channels": replace(channels, label=np.array(["a", "c"]))}]
+    others += [{"channels": replace(channels, **{name: np.arange(2)})} for name in ("electrode", "x_um", "y_um")]
+    for name in ("time_s", "frequency_hz", "pattern", "electrodes", "presentation"):
+        others.append({"stimuli": replace(stimuli, **{name: getattr(stimuli, name) + 1})})
+    assert len({digest(of), *(digest(replace(of, **other)) for other in others)}) == 1 + len(others)
+    # For numpy 2.0 every keyword is an array, which it writes.
+    written: dict[str, Any] = {}
+    monkeypatch.setattr(np, "savez", lambda file, **arrays: written.update(arrays))
+    _packed(of)
+    assert len(written) == 12 and all(isinstance(array, np.ndarray) for array in written.values())
 
 
 @pytest.mark.parametrize("freezes", [False, True])

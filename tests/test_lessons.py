@@ -375,17 +375,18 @@ def test_trainings_with_other_lessons_or_assessments_have_other_fingerprints() -
     assert len({plain["fingerprint"], *(describe(other, timeline_of())["fingerprint"] for other in others)}) == 4
 
 
-def test_recordings_are_drawn_of_those_that_shadowing_would_have_used() -> None:
+def test_recordings_are_drawn_of_those_that_shadowing_would_have_used(tmp_path: Path) -> None:
     timeline: SimulatorTimeline = timeline_of((0.0, 10.0, 20.0, 30.0))
     half = replace(SHORT, shadowing="drawn", duration_min=20.0)
     assert rows_of(half, timeline) == [(0, 1)]
     assert rows_of(replace(half, duration_min=None), timeline) == [(0, 3)]
     narrow = replace(half, duration_min=40.0, lessons=(Lesson(recordings_min=(5, 25), until_return=0.0),))
     assert rows_of(narrow, timeline) == [(1, 2), (0, 3)]
-    with pytest.raises(
-        InvalidArgument, match=r"lesson 1: recordings_min: expected minutes with a recording \(0, 10\), got"
-    ):
-        rows_of(replace(narrow, duration_min=20.0, lessons=(Lesson(recordings_min=(15, 99)),)), timeline)
+    late, out = replace(narrow, duration_min=20.0, lessons=(Lesson(recordings_min=(15, 99)),)), tmp_path / "out"
+    for refusing in (lambda: rows_of(late, timeline), lambda: trained(late, timeline, out)):
+        with pytest.raises(InvalidArgument, match=r"^lesson 1: recordings_min: expected .* recording \(0, 10\), got"):
+            refusing()
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
 from animat.recordings.formats.nwb import write_nwb
+from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
 from animat.responses.conditions import conditions_named
 from animat.responses.extraction import extract_responses
@@ -480,10 +481,24 @@ def test_simulators_of_recordings_of_different_lengths_stack() -> None:
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_a_study_keeps_simulators_of_every_kind(kind: Kind, tmp_path: Path) -> None:
-    series = [chain(n, after_low=(0.1, 0.5), after_high=(0.3, 0.9), start_min=float(n)) for n in (200, 300)]
-    timeline = fit_timeline(series, kind=kind)
+    culture, presentation = RecordedCulture("virtual", 3), Presentation("mixed", 2)
+    known: dict[str, Any] = {
+        "culture": culture,
+        "presentation": presentation,
+        "after_low": (0.1, 0.5),
+        "after_high": (0.3, 0.9),
+    }
+    timeline = fit_timeline([chain(n, start_min=float(n), **known) for n in (200, 300)], kind=kind, range_hz=90.0)
     save_timeline(timeline, tmp_path / "timeline.safetensors")
     loaded = load_timeline(tmp_path / "timeline.safetensors")
+    assert (loaded.culture, loaded.presentation) == (culture, presentation)
+    for name in ("conditions", "window_ms", "findings", "fitted", "readouts"):
+        assert getattr(loaded, name) == getattr(timeline, name), name
+    of_histogram = (20, 90.0) if kind == "histogram" else (None, None)
+    assert (loaded.fitted["bins"], loaded.fitted["range_hz"]) == of_histogram
+    for read, written in zip(loaded.fidelities, timeline.fidelities, strict=True):
+        assert (read.labels, read.n_above_range) == (written.labels, written.n_above_range)
+        np.testing.assert_array_equal((read.in_data, read.in_simulator), (written.in_data, written.in_simulator))
     assert type(loaded.simulators) is type(timeline.simulators)
     for read, written in zip(jax.tree.leaves(loaded.simulators), jax.tree.leaves(timeline.simulators), strict=True):
         np.testing.assert_array_equal(read, written)

@@ -18,7 +18,7 @@ from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import commands_of
 from animat.evaluation.optimum import best_return, best_returns, bracket_findings
 from animat.evaluation.rollouts import Constant, Uniform, roll_out
-from animat.evaluation.sweeping import cubic
+from animat.evaluation.sweeping import bellman_backup, cubic, look_ahead
 from animat.neurons.simulator import EmpiricalSimulator
 from animat.neurons.synthetic import synthetic_simulator
 from animat.robots.base import Quantity, Robot
@@ -312,6 +312,56 @@ def test_cubic_weights_keep_cubic_polynomials() -> None:
             assert weights @ nodes**power == pytest.approx(place**power, abs=1e-4)
 
 
+TO_CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
+"""From the powers of a place to the weights of the four nodes of a cubic polynomial."""
+
+
+@pytest.mark.parametrize("left", [0, 7])
+def test_a_step_back_and_a_look_ahead_are_weighted_means_of_cubic_polynomials(left: int) -> None:
+    """Three axes of 5, 6 and 7 nodes, two layers, three landings, four outcomes and three actions, all at random."""
+    rng = np.random.default_rng(left)
+    values = rng.normal(size=(30, 2, 7)).astype(np.float32)
+    rows = rng.choice([0, 1, 2, 6, 7, 8], (3, 30)).astype(np.int32)
+    nodes = rng.integers(-2, 4, (3, 30, 7), np.int32)
+    # All nodes of a row may end.
+    nodes[1, 4], nodes[2, 5:8] = -1, -2
+    row_places, places, rewards = (
+        rng.uniform(1, 2, shape).astype(np.float32) for shape in ((3, 30, 2), nodes.shape, nodes.shape)
+    )
+    four = np.arange(4)
+    offsets = (6 * four[:, None] + four).ravel().astype(np.int32)
+    # What leads to where no other outcome does has no weight in the second layer.
+    pairs = np.array([[[0, 0], [1, 1], [2, 0], [0, 1]], [[1, 0], [0, 1], [2, 0], [2, 1]]], np.int32)
+    weights = rng.dirichlet(np.ones(4), (2, 3)).astype(np.float32)
+    weights[1, :, 3] = 0
+    costs = rng.uniform(0, 0.3, (2, 3)).astype(np.float32)
+
+    of_axes = [(each[..., None].astype(float) ** four) @ TO_CUBIC for each in (row_places, places)]
+    around = values[(rows[..., None] + offsets)[:, :, None, :, None], :, np.maximum(nodes, 0)[..., None, None] + four]
+    cubes = around.reshape(3, 30, 7, 4, 4, 4, 2)
+    reached = np.einsum("kra,krb,krnc,krnabcl->krnl", of_axes[0][:, :, 0], of_axes[0][:, :, 1], of_axes[1], cubes)
+    reached[nodes < 0] = 0
+    reached[nodes == -2] = places[nodes == -2][:, None] if left else 0
+    gained = (rewards[..., None] + reached)[pairs[..., 0], :, :, pairs[..., 1]]
+    worth = np.einsum("lao,lorn->rlna", weights, gained) - costs[:, None]
+    wanted = worth.max(axis=-1)
+
+    landings, best, ends = (rows, row_places, nodes, places, rewards), np.empty_like(values), (0.5, 2.0)
+    led_to, bounds = (offsets, pairs, weights), map(np.float32, ends)
+    bellman_backup(values.reshape(-1), *landings, *led_to, costs, left, *bounds, best.reshape(-1))
+    assert wanted.min() < ends[0] and wanted.max() > ends[1]
+    np.testing.assert_allclose(best, np.clip(wanted, *ends), atol=1e-5)
+    chosen = np.zeros(30, np.int32)
+    for layer, node in np.ndindex(2, 7):
+        there = rows.copy(), row_places.copy(), *(np.ascontiguousarray(each[..., node]) for each in landings[2:])
+        # As arrays of JAX are.
+        for each in there:
+            each.setflags(write=False)
+        of_layer = np.full(30, layer, np.int32), pairs, weights, costs[layer]
+        look_ahead(values, *there, offsets, *of_layer, left, chosen)
+        np.testing.assert_array_equal(chosen, worth[:, layer, node].argmax(axis=-1))
+
+
 @pytest.mark.parametrize("robot", [Cartpole(), Navigation()])
 def test_nodes_of_a_grid_are_found_where_they_are(robot: Robot[Any]) -> None:
     grid = grid_for(robot)
@@ -342,6 +392,9 @@ def test_refusals_say_what_to_do() -> None:
         best_return(environment, SIMULATOR, resolution=0.0)
     with pytest.raises(InvalidArgument, match="episodes"):
         best_return(environment, SIMULATOR, episodes=1)
+    # Two bytes for each of five steps and each iteration left.
+    with pytest.raises(InvalidArgument, match=r"resolution: .* fit into 16 GiB, got 1, which takes 18\.6 GiB"):
+        best_return(Animat(Stairs(2 * 10**9), Thresholds(1), 2), coins(3, 6), grid=STEPS)
     with pytest.raises(InvalidArgument, match="axis x"):
         Axis("x", "m", 0.0, 1.0, 3)
     grid = grid_for(Navigation()).scaled(0.3)

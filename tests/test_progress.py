@@ -130,8 +130,8 @@ def test_work_that_reports_nothing_for_long_gets_lines_too(
     monkeypatch.setattr("animat.progress.SAME_EVERY_S", 0.02)
     monkeypatch.setattr("animat.progress._CHECK_EVERY_S", 0.01)
     lines = ""
-    with Bar("solving") as progress:
-        progress.update(0, 1, "optimal return")
+    with Bar("silent") as progress:
+        in_phase(progress, "solving").update(0, 1, "optimal return")
         until_s = time.monotonic() + 5
         while lines.count("\n") < 2 and time.monotonic() < until_s:
             time.sleep(0.01)
@@ -168,6 +168,11 @@ def test_compiling_and_going_on_from_a_checkpoint_are_forgotten(monkeypatch: pyt
         phase.update(0.0 if now_s < 20 else 0.5 + (now_s - 20) / 200, 1)
     assert phase.left() == "40 s left"
     assert phase.counted() == ["800 of 1,000 iterations", "5.0 a second"]
+    # What a sum of parts loses by rounding is no new work; anything more is.
+    phase.update(0.8 - 1e-15, 1)
+    assert phase.left() == "40 s left"
+    phase.update(0.799, 1)
+    assert phase.left() == ""
 
 
 def test_the_speed_of_the_last_minute_is_that_of_no_more(monkeypatch: pytest.MonkeyPatch) -> None:

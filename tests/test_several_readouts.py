@@ -16,6 +16,7 @@ from animat.coding.mapping import Linear, Mapping, Thresholds
 from animat.environment import Animat
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import mean_commands
+from animat.evaluation.controls import interventions_of
 from animat.neurons.fidelity import fidelity
 from animat.neurons.kinds import fit_simulator
 from animat.neurons.memory import Memory, fit_memory
@@ -25,6 +26,7 @@ from animat.responses.readouts import Readouts
 from animat.responses.responses import Responses
 from animat.robots import Cartpole
 from animat.stimulation.protocol import Presentation
+from test_interventions import linear_networks
 from test_simulator import responses_of
 from two_wheels import Wheels
 
@@ -171,13 +173,18 @@ def test_each_command_is_the_mapping_s_of_its_readout(mapping: Mapping) -> None:
 @pytest.mark.oracle
 def test_mean_commands_are_those_of_many_draws() -> None:
     simulator = fit_simulator(of_halves(), kind="histogram")
-    actions, means = mean_commands(Animat(Wheels(), Thresholds(9), 3), simulator)
+    environment = Animat(Wheels(), Thresholds(9), 3)
+    actions, means = mean_commands(environment, simulator)
     keys = jax.random.split(jax.random.key(0), 4000)
     sample = jax.jit(jax.vmap(simulator.sample, (0, None)))
     for c in actions:
         x = sample(keys, jnp.int32(c))
         u: Any = decode(Thresholds(9), x, simulator.percentiles)
         np.testing.assert_allclose(means[c], u.mean(axis=0), atol=0.05)
+    ideal = interventions_of(environment, simulator, linear_networks(np.zeros((1, 3))))[0].commands
+    wanted = [np.interp(x, [x.min(), x.max()], [-1, 1]) for x in means.T]
+    np.testing.assert_allclose(np.transpose(ideal), wanted, atol=1e-12)  # type: ignore[arg-type]
+    assert isinstance(hash(ideal), int)
 
 
 def test_an_animat_refuses_readouts_that_are_not_the_robot_s_commands() -> None:

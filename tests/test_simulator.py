@@ -161,6 +161,7 @@ def test_fidelity_is_what_binning_makes_of_the_share_above_the_median() -> None:
     # Within the bin from 30 to 36, P(x >= 31.5) = 4.5 / 6 for both.
     np.testing.assert_allclose(kept.in_simulator, [0.75, 0.75], atol=1e-3)
     assert [f.name for f in kept.findings()] == ["binning"]
+    assert "binning" in {f.name for f in fit_timeline([responses], kind="histogram", range_hz=120.0).findings}
     assert not fidelity(responses, fit_empirical(responses)).findings()
 
 
@@ -180,6 +181,17 @@ def test_a_timeline_answers_with_the_newest_recording() -> None:
     held = timeline.with_first_percentiles()
     np.testing.assert_array_equal(held.at(25.0).percentiles, timeline.at(0.0).percentiles)
     assert float(held.at(25.0).quantile(jnp.int32(0), jnp.float32(0.5))) == 21.0
+    assert (timeline.with_percentiles("moving"), timeline.requested_row(0.0)) == (timeline, 0)
+    np.testing.assert_array_equal(timeline.with_percentiles("first").at(25.0).percentiles, held.at(25.0).percentiles)
+    for before in (-0.1, np.nan):
+        with pytest.raises(InvalidArgument, match=r"at_min: expected .* started at 0 min"):
+            timeline.requested_row(before)
+
+
+def test_a_timeline_lasts_one_usual_interval_longer_than_its_recordings() -> None:
+    timeline = fit_timeline([responses_of([1.0])], kind="empirical")
+    for minutes, span_min in (([5.0], 10.0), ([5.0, 12.0], 14.0), ([5.0, 6.0, 16.0, 50.0], 45.0 + 10.0)):
+        assert replace(timeline, start_min=np.array(minutes)).span_min == span_min
 
 
 def test_a_timelines_edges_are_each_recordings_own_unless_a_range_is_given() -> None:
@@ -191,6 +203,7 @@ def test_a_timelines_edges_are_each_recordings_own_unless_a_range_is_given() -> 
     above = [f.message for f in given.findings if f.name == "above-range"]
     assert len(above) == 1
     assert above[0].startswith("at 10 min: ") and above[0].endswith(" last bin: 9")
+    assert [[f.name for f in given.findings_at(minute)].count("above-range") for minute in (0.0, 10.0)] == [0, 1]
 
 
 def test_a_refreshed_simulator_recompiles_nothing() -> None:

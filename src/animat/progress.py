@@ -98,7 +98,7 @@ class Speed:
     def see(self, done: float) -> None:
         """Record how much is done; if that is less than before, new work has begun."""
         now_s, self._done = time.monotonic(), done
-        if self._seen and done < self._seen[-1][1]:
+        if self._seen and done < self._seen[-1][1] - _ROUNDING:
             self._seen.clear()
             self._has_moved = False
         if self._seen and not self._has_moved and done > self._seen[0][1] + _ROUNDING:

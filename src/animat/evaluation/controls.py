@@ -108,7 +108,7 @@ def controls_of(
         action = "the command" if environment.n_actions is None else "the stimulus nearest to the command"
         meaning = f"no learning: {action} of the robot's heuristic"
         controls.append(Control("heuristic", meaning, heuristic_policy(environment, simulator)))
-    if policies is not None and isinstance(unwrapped(environment), Animat) and simulator is not None:
+    if policies is not None and isinstance(unwrapped(environment), Animat):
         controls += _without_influence(policies)
     return controls
 
@@ -137,7 +137,7 @@ def interventions_of(
     # Mean commands stretched to -1 to 1, each dimension separately; 0 where all are equal.
     means = mean_commands(environment, simulator)[1]
     low, high = means.min(axis=0), means.max(axis=0)
-    stretched = np.where(high > low, 2 * (means - low) / np.where(high > low, high - low, np.inf) - 1, 0.0)
+    stretched = 2 * (means - low) / np.where(high > low, high - low, np.inf) - (high > low)
     ideal = tuple(tuple(row) if means.ndim > 1 else row for row in stretched.tolist())
 
     def control(name: str, meaning: str, **change: Any) -> Control:

@@ -91,7 +91,7 @@ def _packed(recording: Recording) -> bytes:
         "told": list(to_metadata(recording).items()),
     }
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)
+    np.savez(buffer, words=np.frombuffer(json.dumps(words).encode(), np.uint8), **arrays)
     return buffer.getvalue()
 
 
