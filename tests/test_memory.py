@@ -18,7 +18,7 @@ from safetensors.numpy import save
 from scipy.stats import rankdata
 
 import animat.gym  # noqa: F401
-from animat.cli.train import _memories
+from animat.cli.train import _controllability, _memories
 from animat.coding.mapping import Linear, Thresholds
 from animat.environment import Animat, WithoutNeurons
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnusableData
@@ -33,6 +33,7 @@ from animat.neurons.memory import NO_MEMORY, Memory, MemorySimulator, _slopes, f
 from animat.neurons.simulator import EmpiricalSimulator, fit_empirical
 from animat.neurons.timeline import fit_timeline, load_timeline, save_timeline
 from animat.reality_gap import Calibration
+from animat.recordings.findings import Finding
 from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.responses.condition import Condition
@@ -136,7 +137,8 @@ def test_it_draws_among_the_nearest(rows: list[tuple[int, int, bool, int]], memo
         place=place,
     )
     if any(not np.any((condition == c) & ~burst) for c in (0, 1)):
-        with pytest.raises(UnusableData, match="expected non-burst responses to fit"):
+        words = r"responses to fit, got none, which --allow cannot change: .*\(--conditions\)"
+        with pytest.raises(UnusableData, match=words):
             fit_memory(responses)
         return
     simulator = fit_memory(responses, memory=memory)
@@ -852,7 +854,8 @@ def test_too_few_neighbours_are_reported() -> None:
 def test_training_reports_the_memory() -> None:
     series = [chain(500, after_low=(0.1, 0.5), after_high=(0.5, 0.9)), replace(independent(0), start_min=10.0)]
     series[1] = replace(series[1], condition=series[1].condition % 2, conditions=series[0].conditions)
-    first, last = _memories(fit_timeline(series, kind="memory"))
+    timeline = fit_timeline(series, kind="memory")
+    first, last = _memories(timeline)
     decay, weight, neighbour_exponent, _ = fit_memory(series[0]).memory
     assert first.startswith("memory at 0 min: a response depends on earlier trials, ")
     assert (
@@ -866,6 +869,11 @@ def test_training_reports_the_memory() -> None:
     assert ". It also depends on the amount of stimulation in the last 1 s. The simulator draws" in message
     assert last == "memory at 10 min: none was found"
     assert not list(_memories(fit_timeline(series)))
+    differing = Finding("difference", "note", "the conditions differ by 0.40", 0.4)
+    lines = _controllability(replace(timeline, findings=(differing,))).splitlines()
+    assert lines[0].startswith("P(x >= P50), the share of responses that reach the median, in the simulator at 0 min: ")
+    assert lines[1].startswith("in the recording, before the simulator draws from it, the conditions differ by 0.40")
+    assert lines[2:] == [first, last]
 
 
 def test_gymnasium_environments_remember(tmp_path: Path) -> None:

@@ -221,6 +221,22 @@ def test_the_robot_of_a_prompt_cannot_be_trained_in_workers(package: Path) -> No
         train(Training(Here(), None, algorithm=SMALL), None, package / "out")
 
 
+def test_a_robot_that_cannot_be_sent_to_workers_is_refused_before_training(
+    package: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keeping = """
+    def __post_init__(self): object.__setattr__(self, "gain", lambda x: x)
+
+    @property
+    def observation_spec"""
+    at = written(package, ("\n    @property\n    def observation_spec", keeping))
+    assert main(["train", at, "--mapping", "none", "--out", "policies"]) == 1
+    (said,) = capsys.readouterr().err.splitlines()
+    words = rf"animat: robot: expected one that can be sent to worker processes \(pickled\), got {at}, .*lambda"
+    assert re.match(words, said) and "keep only plain parameters in it" in said
+    assert not (package / "policies").exists()
+
+
 def test_ours_are_listed_first(package: Path) -> None:
     robot_named(ROVER)
     assert registry.REGISTRY.names() == (

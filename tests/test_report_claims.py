@@ -36,7 +36,16 @@ from animat.studies.optima import kinds_of, kinds_over_time
 from animat.studies.paper import paper_study
 from animat.studies.places import optima_file
 from animat.studies.plan import plan_study
-from animat.studies.publishing import _as_in_paper, _colophon, _facts_of, _facts_of_culture, _findings, _lead, _pictures
+from animat.studies.publishing import (
+    _as_in_paper,
+    _colophon,
+    _facts_of,
+    _facts_of_culture,
+    _findings,
+    _found_better,
+    _lead,
+    _pictures,
+)
 from animat.studies.report_tables import comparisons_table, controllability_table
 from animat.studies.results import write_typed
 from animat.studies.source import Source
@@ -73,6 +82,13 @@ def test_few_policies_count_neither_for_nor_against_the_paper() -> None:
     assert words.startswith("1 of 3 comparisons") and "For 2 there are too few policies" in words
     assert "differently" not in words
     assert "With so few policies it is not known" in _as_in_paper([replace(ROW, as_in_paper="cannot tell")] * 2)
+
+
+def test_one_comparison_is_reported_without_a_count() -> None:
+    better, not_better = replace(ROW, outcome=SECOND), replace(ROW, outcome=NONE)
+    assert _found_better([not_better]) == "The second arm was not found to be better."
+    assert _found_better([better]) == "The second arm was found to be better."
+    assert _found_better([better, not_better]) == "In 1 of 2 comparisons the second arm was found to be better."
 
 
 def test_differing_comparisons_are_named_with_their_outcomes() -> None:

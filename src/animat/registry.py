@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import json
+import pickle
 import re
 import sys
 from collections.abc import Collection, Mapping
@@ -202,6 +203,16 @@ class Registry(Generic[Thing]):
                 f"{noun}: expected a class at the top level of a file, which worker processes can import, got {place}: "
                 f"put it into a file, or {_IN_MEMORY}"
             )
+        if in_workers:
+            try:
+                pickle.dumps(thing)
+            except Exception as error:
+                # A user's class may keep anything: a lambda, a lock, an open file.
+                raise InvalidArgument(
+                    f"{noun}: expected one that can be sent to worker processes (pickled), got {place}, which raised "
+                    f"{first_line(error)}: keep only plain parameters in it, and make the rest where it is used, or "
+                    f"{_IN_MEMORY}"
+                ) from error
 
     def _kind(self, name: Any) -> type[Thing] | None:
         if not isinstance(name, str):

@@ -279,6 +279,7 @@ def _by_condition(responses: Responses) -> list[Float64[np.ndarray, "responses *
     for condition, x in zip(responses.conditions, values, strict=True):
         if not len(x):
             raise UnusableData(
-                f"condition {condition.label}: expected non-burst responses to fit, got none; leave the condition out"
+                f"condition {condition.label}: expected non-burst responses to fit, got none, which --allow cannot "
+                "change: leave the condition out, or choose others (--conditions)"
             )
     return values

@@ -34,6 +34,6 @@ def goals_table(rows: Sequence[ObjectiveMet]) -> Table:
         rows,
         [*zip(names, (field.name for field in fields(ObjectiveMet)), strict=True)],
         note="Means over all episodes. Success: share of episodes. Margin: how far an episode was from failing its "
-        "goal, or from meeting it, in scales of the quantities; above 0 it succeeded.",
+        "goal, or from meeting it, in scales of the quantities: above 0 if it succeeded, and the larger the better.",
         beside="tables/goals.csv",
     )

@@ -112,6 +112,13 @@ def _and(parts: Sequence[str]) -> str:
     return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), *parts[-1:]])
 
 
+def _found_better(rows: Sequence[ComparedReturns]) -> str:
+    found = sum(row.outcome == SECOND for row in rows)
+    if len(rows) == 1:
+        return f"The second arm was {'' if found else 'not '}found to be better."
+    return f"In {found} of {len(rows)} comparisons the second arm was found to be better."
+
+
 def _headline(study: Study, results: Results, table: DataFrame) -> list[tuple[Score, Float64[np.ndarray, " policies"]]]:
     """Each arm on each robot at the last recording that it was evaluated on, with the mean return of each policy."""
     # Scores of an arm are in the order of its minutes.
@@ -144,8 +151,7 @@ def _summary(study: Study, results: Results, headline: Sequence[Score], picture:
             explain.append("The section “Differences from the paper” says what is known about the reasons.")
         sentences.append(" ".join([_as_in_paper(printed), *explain]))
     elif rows:
-        found = sum(row.outcome == SECOND for row in rows)
-        sentences.append(f"In {found} of {counted(len(rows), 'comparison')} the second arm was found to be better.")
+        sentences.append(_found_better(rows))
     smallest = p_of_u(0.0, study.policies, study.policies)
     if rows and smallest >= LEVEL:
         sentences.append(
