@@ -304,6 +304,19 @@ def test_a_clock_that_hangs(tmp_path: Path, left: int, little_grace: None) -> No
             released.set()
 
 
+def test_what_takes_longer_than_the_patience_is_waited_for_if_it_was_asked_for(tmp_path: Path) -> None:
+    """The patience counts from when the pause should be over, not from its beginning."""
+
+    def in_real_time(culture: FakeCulture, observed: Observed) -> Observed:
+        time.sleep(observed.duration_s)
+        return observed
+
+    # Its first delivery is the pause.
+    with FakeCulture(fault=in_real_time, at=0) as culture:
+        session = run(tmp_path, culture, pause_s=0.6, warm_up=1, patience_s=0.3)
+    assert session.ending.by == "plan", session.ending
+
+
 @pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("is_interrupted", [False, True])
 def test_a_policy_that_hangs(tmp_path: Path, is_interrupted: bool, little_grace: None) -> None:

@@ -107,6 +107,12 @@ def test_it_runs_in_closed_loop_each_command_by_its_own_half(timeline: Simulator
         ended = run_session(culture, loop, agents, tmp_path, episodes=2).ending
     assert ended.by == "plan", ended
 
+    with FakeCulture(3) as culture:
+        run_session(culture, replace(loop, burst_threshold=0.0), agents[:1], tmp_path / "bursts", episodes=1)
+    # Until a response is used, the robot stands still.
+    skipped = [tick for tick in read_session(tmp_path / "bursts").ticks if tick.handled != "warm-up"]
+    assert skipped and all((tick.handled, tick.command) == ("skipped", (0.0, 0.0)) for tick in skipped)
+
     # The session's own recording, read like any other, says what was read of each half.
     session = read_session(tmp_path)
     whole = extract_responses(session.recording(), burst_threshold=0.95, readouts=loop.readouts)
