@@ -267,9 +267,9 @@ def test_pulses_that_are_on_time_are_not_late_by_the_rounding_to_samples(
 
 def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(tmp_path: Path) -> None:
     class Ticking:
-        """A clock that ticks each time that it is looked at."""
+        """A clock that ticks each time that it is looked at, and has run for a while."""
 
-        time_s = 0.0
+        time_s = 5000.0
 
         def now_s(self) -> float:
             self.time_s += 1e-4
@@ -283,6 +283,8 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
         session = run_session(culture, loop, [RANDOM], tmp_path, episodes=2, clock=Ticking())
     assert len(list(session.ticks)) == 12
     assert 0 < max(tick.decided_s for tick in session.ticks) < 0.002
+    # From the start of the session, in step with the culture's clock.
+    assert all(0 < tick.wall_s - tick.read_after_s < 0.1 for tick in session.ticks)
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_RR"), reason="the system has no real-time scheduling")
