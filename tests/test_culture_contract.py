@@ -14,6 +14,8 @@ from animat.cultures.replay import ReplayCulture
 from animat.cultures.safety import SIMULATED_LIMITS
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import DeviceFailed, InvalidArgument, UnsafeStimulus
+from animat.stimulation.protocol import Protocol
+from animat.stimulation.pulse import PUBLISHED_PULSE
 from cultures import small_culture
 from fake_culture import FakeCulture
 from synthetic_recordings import synthetic_recording
@@ -88,6 +90,31 @@ def test_limits_can_be_tightened_and_never_loosened() -> None:
         assert refused.value.limit == "stimuli_per_session"
     with pytest.raises(InvalidArgument, match="never loosened"):
         small_culture(limits=replace(SIMULATED_LIMITS, amplitude=2 * SIMULATED_LIMITS.amplitude + 1)).open()
+
+
+@pytest.mark.parametrize(
+    ("limit", "value"),
+    [
+        ("stimuli_per_session", 19),
+        ("stimuli_per_s", 8),
+        ("stimuli_per_electrode_s", 2),
+        ("net_charge_per_session", 80.0),
+    ],
+)
+def test_a_protocol_that_breaks_a_limit_at_its_end_is_refused_before_its_first_pulse(limit: str, value: float) -> None:
+    """Ten pulses at 2 Hz are within each limit, and ten at 10 Hz after them are not."""
+    protocol = Protocol(frequencies_hz=(2, 10), trials=10, patterns=8, setup_s=1.0, pulse=PUBLISHED_PULSE)
+    for changed in ({}, {limit: value}):
+        with FakeCulture(limits=replace(SIMULATED_LIMITS, **changed)) as culture:
+            now_s = culture.now_s
+            if not changed:
+                assert len(culture.record(protocol).stimuli) == culture.pulses == 20
+                continue
+            with pytest.raises(UnsafeStimulus) as refused:
+                culture.record(protocol)
+            assert refused.value.limit == limit
+            assert (culture.pulses, culture.deliveries, culture.now_s) == (0, 0, now_s)
+            assert len(culture.record(replace(protocol, frequencies_hz=(2,))).stimuli) == 10
 
 
 @pytest.mark.parametrize("kind", [VirtualCulture, ReplayCulture, FakeCulture])
