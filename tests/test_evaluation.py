@@ -396,6 +396,10 @@ def test_mismatches_are_refused() -> None:
     for wrong in ("policies", [policy], {"a": 3}):
         with pytest.raises(InvalidArgument, match="policies: expected policies by name, as"):
             evaluate(wrong, timeline)  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match=r"timeline: expected simulators from animat\.fit_timeline, or None, got"):
+        evaluate({"a": policy}, [timeline])  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument, match=r"controls: expected some of random, constant .*, got randm"):
+        evaluate({"a": policy}, timeline, controls=("random", "randm"))
     with pytest.raises(InvalidArgument, match="episodes"):
         evaluate({"a": policy}, timeline, episodes=0)
     with pytest.raises(InvalidArgument, match="timeline"):

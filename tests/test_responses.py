@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -161,6 +162,10 @@ def test_conditions_may_be_text_and_what_is_not_a_recording_is_named(tmp_path: P
     assert [c.label for c in inspect_recording(source, "frequency:5").responses.conditions] == ["5 Hz"]
     with pytest.raises(InvalidArgument, match="conditions: expected"):
         extract_responses(source, "colour")
+    with pytest.raises(InvalidArgument, match="readouts: expected all, halves, quadrants or groups of electrodes"):
+        extract_responses(source, readouts="thirds")
+    with pytest.raises(UnusableData, match=r"responses\.rate_hz: expected finite numbers"):
+        replace(extract_responses(source), rate_hz=np.full(2, np.nan))
     for wrong in ([source], "culture.nwb", None):
         for use in (extract_responses, inspect_recording, lambda given: write_nwb(given, tmp_path / "of-nothing.nwb")):
             with pytest.raises(InvalidArgument, match=r"expected a recording, as animat\.read_recording returns, got"):

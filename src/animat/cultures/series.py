@@ -16,7 +16,7 @@ from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
-from animat.errors import InvalidArgument, Mismatch, expect_at_least, shown
+from animat.errors import InvalidArgument, Mismatch, expect_at_least, expect_kind, shown
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
@@ -75,14 +75,16 @@ def record_series(
         progress: updated after each block.
 
     Raises:
-        InvalidArgument: for no sessions, an interval shorter than a recording, a seed below 0, or a protocol with
-            patterns or electrodes that the culture lacks.
+        InvalidArgument: for a culture in place of a function, no sessions, an interval shorter than a recording, a seed
+            below 0, or a protocol with patterns or electrodes that the culture lacks.
         Mismatch: if the folder has recordings that another culture, protocol, interval or version made, or that lie
             ahead of the culture's clock, or another run is at work in the folder.
         InvalidFile: if the folder cannot be written to or the disk lacks room for a recording, before it is made; if a
             file cannot be written, or the state or an existing recording is damaged.
         UnsafeStimulus, DeviceFailed: as the culture raises them; earlier recordings are kept.
     """
+    words = "a function that returns the culture, such as lambda: animat.VirtualCulture(seed=1)"
+    expect_kind("make_culture", make_culture, Callable, words)
     expect_at_least("seed", seed, 0)
     folder, progress = Path(folder), progress or Silent()
     with exclusive_lock(folder), ExitStack() as opened:

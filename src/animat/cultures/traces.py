@@ -63,6 +63,7 @@ def record_traces(
     100-3000 Hz and the artefact of each pulse. Spikes closer together than their waveforms overlap.
 
     Args:
+        culture: open; its clock advances.
         channels: rows of its channel table; None: all.
         stimuli: to deliver meanwhile.
         noise_uv, seed: root mean square and seed of the noise.

@@ -162,7 +162,7 @@ class VirtualCulture(ComputedCulture):
         }
 
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
-        """Write the complete state, with whole numbers as remarks, to a file that is complete or absent.
+        """Write the complete state, to continue from bit for bit, and whole numbers as remarks; complete or absent.
 
         Raises:
             InvalidFile: if it cannot be written.

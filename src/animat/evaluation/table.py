@@ -12,7 +12,7 @@ import numpy as np
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.columns import align_columns
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, in_min
+from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, expect_kind, expect_several, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
@@ -224,12 +224,13 @@ def evaluate(
         progress: updated after the policies and each control, during the optimum, and before each intervention.
 
     Raises:
-        InvalidArgument: for no policies, fewer than one episode, interventions without neurons, or an invalid `at_min`,
-            seed or resolution.
+        InvalidArgument: for no policies, unknown controls, fewer than one episode, interventions without neurons, or an
+            invalid `at_min`, seed or resolution.
         Mismatch: if the policies differ from each other, from the robot or from the timeline's conditions.
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery", "pulse_cost")
     first = first_of_alike(policies, alike, "evaluate it alone")
+    expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators from animat.fit_timeline, or None")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, on which the policies were trained, got {robot.name}")
     if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):
@@ -248,6 +249,11 @@ def evaluate(
     if first.mapping is None:
         labels = [f"{command:+g}" for command in first.commands or ()]
     all_controls = controls_of(*within, labels, networks)
+    if controls is not None:
+        controls, known = expect_several("controls", controls, str, "names"), [each.name for each in all_controls]
+        # A robot may lack a heuristic, and the coupling is searched with the optimum only.
+        if unknown := sorted({*controls} - {*known, "heuristic", "coupling"}):
+            raise InvalidArgument(f"controls: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     acting = [trained, *(control for control in all_controls if controls is None or control.name in controls)]
     wants_coupling = optimum_resolution is not None and (controls is None or "coupling" in controls)
     searches = wants_coupling and not isinstance(body, HostRobot)

@@ -13,7 +13,7 @@ from animat.recordings.response_table import ResponseTable
 from animat.responses.bursts import separate_bursts
 from animat.responses.conditions import NO_CONDITION, ByInterval, Conditions, conditions_named, default_conditions
 from animat.responses.quality.responses import findings_on
-from animat.responses.readouts import ALL, Readouts
+from animat.responses.readouts import ALL, Readouts, readouts_on
 from animat.responses.responses import Responses, Trials
 from animat.responses.windows import DEFAULT_WINDOW_MS, check_window, read_windows
 
@@ -26,7 +26,7 @@ def extract_responses(
     by: Conditions | str | None = None,
     window_ms: tuple[float, float] = DEFAULT_WINDOW_MS,
     burst_threshold: float | None = None,
-    readouts: Readouts = ALL,
+    readouts: str | Readouts = ALL,
 ) -> Responses:
     """The response to the last pulse of every trial that has a condition.
 
@@ -46,7 +46,8 @@ def extract_responses(
         window_ms: start and end of the window after the pulse. A table that states its window replaces the default; for
             one that does not, this is the window in which its spikes were counted.
         burst_threshold: a ratio of active channels to use in place of Otsu's threshold; 1 keeps every response.
-        readouts: groups of channels whose x is read too, in the same windows; bursts are identified from all channels.
+        readouts: groups of channels whose x is read too, in the same windows, or `halves` or `quadrants`; bursts are
+            identified from all channels.
 
     Raises:
         InvalidArgument: for a window that is not a stretch of time after the stimulus, or conditions that cannot be
@@ -64,6 +65,7 @@ def extract_responses(
     if not n_channels:
         what = "recording" if isinstance(source, Recording) else "table"
         raise UnusableData(f"channels: expected at least one, got a {what} without any; x is a mean over channels")
+    readouts = readouts_on(readouts, source.channels)
     by = conditions_named(by) if isinstance(by, str) else by or default_conditions(stimuli, source.protocol)
     assignment = by.assign(stimuli)
     # Trials without a condition are read too, as the history of others.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from animat.errors import Mismatch
+from animat.errors import Mismatch, UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels
@@ -75,6 +75,7 @@ class Responses:
 
     Raises:
         Mismatch: for columns of different lengths, or a condition that is not in the list.
+        UnusableData: for rates that are not finite.
     """
 
     __repr__ = briefly
@@ -107,6 +108,8 @@ class Responses:
         for name, dtype in (columns | {"time_s": np.float64, "place": np.int64}).items():
             if getattr(self, name) is not None and (got := read_only(self, name, dtype).shape) != shape:
                 raise Mismatch(f"responses.{name}: expected {len(self)} values, one per response, got {got}")
+        if not np.all(np.isfinite(self.rate_hz)):
+            raise UnusableData("responses.rate_hz: expected finite numbers, got NaN or infinite ones")
         if (self.readout_hz is None) != self.readouts.are_all:
             raise Mismatch("responses.readout_hz: expected if, and only if, readouts are groups of channels")
         if self.readout_hz is not None:

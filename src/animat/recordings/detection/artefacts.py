@@ -51,9 +51,9 @@ def without_artefacts(
     subtracted, with tau from about 0.2 to 16 ms. What some amplifiers leave, as they recover in another way,
     `animat.responses.quality.timing` reports.
 
-    `stimulus` is the sample of each pulse, ascending; pulses outside the stretch count if their artefacts reach into
-    it. `rest_uv` is the voltage of each channel before earlier pulses; a channel that stays still far from it just
-    before the first pulse is still saturated.
+    `voltage_uv` is changed. `stimulus` is the sample of each pulse, ascending; pulses outside the stretch count if
+    their artefacts reach into it. `rest_uv` is the voltage of each channel before earlier pulses; a channel that stays
+    still far from it just before the first pulse is still saturated.
     """
     samples = voltage_uv.shape[1]
     saturated, longest_ms = np.zeros(len(stimulus), np.int64), np.zeros(len(stimulus), np.float32)

@@ -30,7 +30,8 @@ def open_with_spikeinterface(
     """Raw traces of a file or folder read by SpikeInterface, and their recording without spikes.
 
     The reader is the format, such as `intan`. Stimulus times, from the start of the traces, are in CSV, by default in
-    `NAME_stimuli.csv` beside it. Raises InvalidArgument for an unknown reader, or if SpikeInterface is not installed.
+    `NAME_stimuli.csv` beside it. Raises InvalidArgument for an unknown reader, or if SpikeInterface is not installed,
+    and InvalidFile if the file cannot be read.
     """
     path = Path(path)
     if not path.exists():
