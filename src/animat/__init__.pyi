@@ -17,6 +17,7 @@ from animat.recordings.reading import (
     read_source as read_source,
 )
 from animat.recordings.formats.nwb import write_nwb as write_nwb
+from animat.progress import Bar as Bar
 from animat.cultures.base import Culture as Culture
 from animat.cultures.safety import Limits as Limits
 from animat.cultures.virtual import VirtualCulture as VirtualCulture
