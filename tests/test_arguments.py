@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,3 +88,28 @@ def test_numbers_of_numpy_and_what_can_be_read_once_are_taken() -> None:
     responses = animat.extract_responses(synthetic_recording(1, patterns=3, channels=16), burst_threshold=np.float32(1))
     assert len(animat.fit_timeline(each for each in (responses,))) == 1  # type: ignore[arg-type]
     assert animat.paper_study(seed=np.int64(3)) == animat.paper_study(seed=3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"spike_times_s": "a"}, "spike_times_s: expected an array of numbers, got 'a'"),
+        ({"spike_channels": None}, "spike_channels: expected an array of numbers, got None"),
+        ({"channels": [1, 2]}, "channels: expected a channel table, animat.Channels, got [1, 2]"),
+        ({"stimuli": None}, "stimuli: expected a table of stimuli, animat.Stimuli, got None"),
+        ({"sampling_rate_hz": "20 kHz"}, "sampling_rate_hz: expected a number, got '20 kHz'"),
+        ({"provenance": {"chip": 7}}, "provenance: expected text by name, got 7"),
+        ({"findings": None}, "findings: expected a list of findings, got None"),
+        (
+            {"protocol": "paper"},
+            "protocol: expected a protocol, such as animat.Protocol(trials=5), or None, got 'paper'",
+        ),
+    ],
+)
+def test_a_recording_made_by_hand_names_what_is_of_the_wrong_kind(changed: Any, message: str) -> None:
+    recording = synthetic_recording(1, patterns=3, channels=16)
+    given = {field.name: getattr(recording, field.name) for field in fields(recording)}
+    assert animat.Recording(**given).equals(recording)
+    with pytest.raises(animat.AnimatError) as raised:
+        animat.Recording(**{**given, **changed})
+    assert str(raised.value) == message

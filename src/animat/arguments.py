@@ -1,4 +1,4 @@
-"""Arguments of public functions: one of another kind than its annotation says is refused in one line."""
+"""Arguments of what is public: one of another kind than its annotation says is refused in one line."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from animat.errors import InvalidArgument, shown
 
-P = ParamSpec("P")
-R = TypeVar("R")
+Thing = TypeVar("Thing", bound=Callable[..., Any])
 
 _ONE = {
     "Calibration": "a calibration, as animat.Calibration.of_series returns",
     "Conditions": "conditions, such as 'frequency:5,10'",
     "Culture": "a culture, such as animat.VirtualCulture(seed=1)",
+    "Channels": "a channel table, animat.Channels",
     "Environment": "an environment, such as animat.Animat(animat.Cartpole(), animat.Thresholds(9), 9)",
     "Goal": "a goal, such as 'avoid pole_angle outside -12..12 deg'",
     "Mapping": "a mapping, such as animat.Thresholds(9)",
@@ -29,7 +31,9 @@ _ONE = {
     "Recording": "a recording, as animat.read_recording returns",
     "Responses": "responses, as animat.extract_responses returns",
     "Robot": "a robot, such as animat.Cartpole()",
+    "Selection": "a selection, as animat.Selection.load returns",
     "SimulatorTimeline": "simulators, as animat.fit_timeline returns",
+    "Stimuli": "a table of stimuli, animat.Stimuli",
     "Study": "a Study, as animat.read_study returns",
     "Training": "a Training, such as animat.Training('cartpole', '9-thresholds')",
     "Callable": "a function",
@@ -41,8 +45,10 @@ _ONE = {
 }
 _SEVERAL = {
     "str": "a list of names",
+    "str by name": "text by name",
+    "Finding": "a list of findings",
     "Mapping": "a list of mappings, such as [animat.Thresholds(9)]",
-    "Policy": "policies by name, as animat.load_policies returns",
+    "Policy by name": "policies by name, as animat.load_policies returns",
     "Recording": "a list of recordings, as animat.read_recordings returns",
     "Responses": "a list of responses, as animat.extract_series returns",
     "TrainingCallback": "a list of functions that take a row of a learning curve",
@@ -52,27 +58,33 @@ _UNSAID = ("ResponseTable", "str")
 """What may also come and goes without saying: a table in place of a recording, text in place of what it names."""
 
 
-def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """A decorator: raises InvalidArgument for an argument that is not of its annotation's kind.
+def checked_arguments(thing: Thing) -> Thing:
+    """A decorator of functions and classes: raises InvalidArgument for an argument not of its annotation's kind.
 
     A path in place of the recording that it holds would otherwise fail deep inside. What an annotation cannot say, such
     as which names are known, is left to the function, as are arrays and anything without an annotation.
     """
+    if isinstance(thing, type):
+        thing.__init__ = checked_arguments(thing.__init__)  # type: ignore[misc]
+        return thing
+    function: Callable[..., Any] = thing
     signature = inspect.signature(function)
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    names = [name for name, parameter in signature.parameters.items() if parameter.kind not in several]
 
     @functools.wraps(function)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+    def checked(*args: Any, **kwargs: Any) -> Any:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
             return function(*args, **kwargs)  # Python says what is missing or too much.
-        for name, value in given.items():
+        for name in names:
             hint = _hints(function).get(name, Any)
-            if strangers := _strangers(value, hint):
+            if name in given and (strangers := _strangers(given[name], hint)):
                 raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
         return function(*args, **kwargs)
 
-    return checked
+    return cast(Thing, checked)
 
 
 @functools.cache
@@ -85,13 +97,16 @@ def _strangers(value: Any, hint: Any) -> list[Any]:
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return [value] if all(_strangers(value, each) for each in inner) else []
-    if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping" or issubclass(kind, tuple):
+    if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping":
+        return []
+    if issubclass(kind, np.ndarray) or (issubclass(kind, tuple) and Ellipsis not in inner):
         return []
     if getattr(kind, "_is_protocol", False):
         fits = "__call__" not in vars(kind) or callable(value)
     elif inner and issubclass(kind, Mapping):
         if isinstance(value, Mapping):
-            return [stranger for each in value.values() for stranger in _strangers(each, inner[1])]
+            pairs = [pair for item in value.items() for pair in zip(item, inner, strict=True)]
+            return [stranger for each, its in pairs for stranger in _strangers(each, its)]
         fits = False
     elif inner and issubclass(kind, Iterable):
         fits = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
@@ -108,9 +123,11 @@ def _words(hint: Any) -> str:
     if kind in (Union, UnionType):
         said = [each for each in inner if _name(each) not in _UNSAID]
         return ", or ".join(map(_words, said if set(said) - {NoneType} else inner))
-    if inner and issubclass(kind, Mapping | Iterable):
-        each = get_args(inner[-1])[0] if get_origin(inner[-1]) in (Union, UnionType) else inner[-1]
-        return _SEVERAL.get(_name(each)) or f"several of: {_words(each)}"
+    if inner and issubclass(kind, Iterable):
+        by_name = issubclass(kind, Mapping)
+        each = inner[1] if by_name else inner[0]
+        each = get_args(each)[0] if get_origin(each) in (Union, UnionType) else each
+        return _SEVERAL.get(f"{_name(each)}{' by name' * by_name}") or f"several of: {_words(each)}"
     what = _ONE.get(_name(hint)) or f"a {_name(hint)}"
     if kind is Callable and inner and inner[-1] is not NoneType:
         return f"{what} that returns {_words(inner[-1])}"

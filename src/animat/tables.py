@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from animat.errors import UnusableData
+from animat.errors import UnusableData, shown
 
 UNKNOWN = -1
 """Stands for an unknown electrode or pattern, and pads `Stimuli.electrodes`."""
@@ -38,9 +38,14 @@ def read_only(table: object, attribute: str, dtype: Any = None) -> np.ndarray[An
 
     Raises UnusableData if the type is of whole numbers and some are not, which would be truncated silently.
     """
-    given = np.asarray(getattr(table, attribute))
-    with np.errstate(invalid="ignore"):
-        array = np.array(given, dtype=dtype)
+    value = getattr(table, attribute)
+    try:
+        given = np.asarray(value)
+        with np.errstate(invalid="ignore"):
+            array = np.array(given, dtype=dtype)
+    except (TypeError, ValueError):
+        # Text, None, or rows of different lengths.
+        raise UnusableData(f"{attribute}: expected an array of numbers, got {shown(value)}") from None
     if array.dtype.kind == "i" and given.dtype.kind in "fu" and np.any(differ := array != given):
         raise UnusableData(f"{attribute}: expected whole numbers, got {given[differ][0]:g}")
     array.setflags(write=False)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from animat.arguments import checked_arguments
 from animat.coding.mapping import N_PERCENTILES, Mapping, Numbers, namespace_of
 from animat.errors import InvalidArgument
 from animat.responses.readouts import ALL, Readouts
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Decoder:
     """From a response to a command: a number in [-1, 1] for each readout.

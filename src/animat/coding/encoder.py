@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, UnusableData, shown
 from animat.responses.condition import RESTING, Condition
 from animat.stimulation.stimulus import NOTHING
@@ -18,6 +19,7 @@ SLOWEST_HZ, FASTEST_HZ = 0.001, 10_000.0
 """Range of a trial's frequency: a pulse, and a whole train, may take at most about a quarter of an hour."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Encoder:
     """From an agent's actions to stimuli: each action is a condition, presented as trials of several pulses.

@@ -10,18 +10,19 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from jaxtyping import Int64
 
+from animat.arguments import checked_arguments
 from animat.cultures.base import ComputedCulture
 from animat.cultures.failures import once_opened
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
 from animat.cultures.visibility import Visibility
-from animat.errors import InvalidArgument, Mismatch, expect_at_least
+from animat.errors import InvalidArgument, Mismatch, expect_at_least, expect_kind
 from animat.plain_file import expect_plain_file
 from animat.progress import Progress, Silent
 from animat.recordings.recorded_culture import RecordedCulture
 from animat.recordings.recording import Channels
 from animat.stimulation.array import MAXONE
-from animat.stimulation.plain import whole_number
+from animat.stimulation.plain import number, whole_number
 from animat.stimulation.pulse import PUBLISHED_PULSE
 from animat.stimulation.scan import ScannedActivity
 from animat.stimulation.selection import Selection, SelectionRule, select_electrodes
@@ -73,7 +74,8 @@ class VirtualCulture(ComputedCulture):
     ) -> None:
         super().__init__(limits)
         expect_at_least("seed", seed := whole_number("seed", seed), 0)
-        if not 0 < scan_s <= 3600:
+        expect_kind("selection", selection, Selection | None, "a selection, as animat.Selection.load returns")
+        if not 0 < number("scan_s", scan_s) <= 3600:
             raise InvalidArgument(f"scan_s: expected above 0 to 3600 s, got {scan_s}")
         self.seed = seed
         self._parameters, self._rule, self._scan_s = parameters, rule or SelectionRule(), float(scan_s)
@@ -164,6 +166,7 @@ class VirtualCulture(ComputedCulture):
             "tissue_parameters": json.dumps(dataclasses.asdict(self._parameters or TissueParameters())),
         }
 
+    @checked_arguments
     def save_state(self, path: str | os.PathLike[str], **remarks: int) -> None:
         """Write the complete state, to continue from bit for bit, and whole numbers as remarks; complete or absent.
 
@@ -176,6 +179,7 @@ class VirtualCulture(ComputedCulture):
         state = VirtualState(self.selection, self._zero_ns, self._now_ns, *held, self.tissue.snapshot(), remarks)
         write_state(path, self.settings, state)
 
+    @checked_arguments
     def restore_state(self, path: str | os.PathLike[str]) -> dict[str, int]:
         """Restore the state of a culture of the same seed, settings and electrodes, and return the remarks.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.arguments import checked_arguments
 from animat.errors import UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.recorded_culture import RecordedCulture
@@ -19,6 +20,7 @@ from animat.stimulation.stimulus import Stimuli
 from animat.tables import CENTURY_S, FASTEST_HZ, briefly, expect_rising_times, freeze, reduce_dataclass
 
 
+@checked_arguments
 @dataclass(frozen=True, eq=False)
 class Channels:
     """The table of recording channels: row i states where channel i is.
@@ -65,6 +67,7 @@ class Channels:
         return bool(len(self)) and bool(np.all(np.isfinite(self.x_um)) and np.all(np.isfinite(self.y_um)))
 
 
+@checked_arguments
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One recording of a culture: its spikes, channels and stimuli. Arrays are read-only.

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, json_data, read_record, record
@@ -65,6 +66,7 @@ class _Saved:
     recording: tuple[Electrode, ...]
 
 
+@checked_arguments
 @dataclass(frozen=True, eq=False)
 class Selection:
     """Recording sites, stimulation sites and patterns on an array, to save, plot and pass to hardware.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, UnusableData
 from animat.stimulation.plain import number, seconds, whole_number
 from animat.stimulation.pulse import Pulse
@@ -90,6 +91,7 @@ def _plain_stimulus(stimulus: Any) -> Stimulus:
     return Stimulus(**{field.name: getattr(stimulus, field.name) for field in fields(Stimulus)})
 
 
+@checked_arguments
 @dataclass(frozen=True, eq=False)
 class Stimuli:
     """The table of stimulation pulses, one row per pulse, in order of time.

@@ -282,6 +282,7 @@ class Policy:
         write_whole(Path(path), save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata))
 
     @staticmethod
+    @checked_arguments
     def load(path: str | os.PathLike[str]) -> Policy:
         """Read a policy that `save` wrote.
 
