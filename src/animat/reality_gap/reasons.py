@@ -182,7 +182,7 @@ def answers(evidence: Evidence) -> Finding | None:
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < level and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
-            each_hz = responses.read_hz[responses.condition == i], recorded_hz[i]
+            each_hz = responses.read_hz[(responses.condition == i) & evidence.session.moved], recorded_hz[i]
             measured_hz, usual_hz = (x_hz.reshape(len(x_hz), -1)[:, d].mean() for x_hz in each_hz)
             on = f" on {names[d]}" if len(names) > 1 else ""
             differences.append(
