@@ -280,7 +280,7 @@ def test_an_interval_must_hold_a_recording(tmp_path: Path) -> None:
         record_series(lambda: small_culture(), SHORT, tmp_path, sessions=2, interval_min=0.01)
     with pytest.raises(InvalidArgument, match="sessions: expected at least 1"):
         record_series(lambda: small_culture(), SHORT, tmp_path, sessions=0)
-    with pytest.raises(InvalidArgument, match="make_culture: expected a function that returns the culture, such as"):
+    with pytest.raises(InvalidArgument, match="make_culture: expected a function that returns a culture, such as"):
         record_series(small_culture(), SHORT, tmp_path)  # type: ignore[arg-type]
     assert not list(tmp_path.glob("*.nwb"))
 

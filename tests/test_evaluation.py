@@ -396,7 +396,9 @@ def test_mismatches_are_refused() -> None:
     for wrong in ("policies", [policy], {"a": 3}):
         with pytest.raises(InvalidArgument, match="policies: expected policies by name, as"):
             evaluate(wrong, timeline)  # type: ignore[arg-type]
-    with pytest.raises(InvalidArgument, match=r"timeline: expected simulators from animat\.fit_timeline, or None, got"):
+    with pytest.raises(
+        InvalidArgument, match=r"timeline: expected simulators, as animat\.fit_timeline returns, or None, got"
+    ):
         evaluate({"a": policy}, [timeline])  # type: ignore[arg-type]
     with pytest.raises(InvalidArgument, match=r"controls: expected some of random, constant .*, got randm"):
         evaluate({"a": policy}, timeline, controls=("random", "randm"))

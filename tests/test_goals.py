@@ -370,7 +370,7 @@ def test_a_goal_is_stored_as_text_with_the_robot() -> None:
     assert data["goal"] == str(robot.goal) and data["robot"]["name"] == "navigation"
     assert robot_of(data) == robot
     assert body_and_goal(Navigation()).keys() == {"robot"} and robot_of(body_and_goal(Navigation())) == Navigation()
-    with pytest.raises(InvalidArgument, match="goal: expected a string"):
+    with pytest.raises(InvalidArgument, match="goal: expected a goal, such as"):
         robot_of({**data, "goal": 3})
 
 

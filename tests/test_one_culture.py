@@ -124,7 +124,10 @@ def test_recordings_of_two_real_cultures_are_not_one_series(
         "leave out all but one culture's"
     )
     error = capsys.readouterr().err
-    assert f"animat: --recordings: {words} (to allow it: --allow several-cultures)" in error
+    assert (
+        f"animat: --recordings: {words} (to allow it: --allow several-cultures, in Python allow=['several-cultures'])"
+        in error
+    )
     assert not (tmp_path / "policies").exists()
     # Each is usable by itself, and it is said that the two do not belong together.
     assert main(["inspect", str(folder), "--json"]) == 1

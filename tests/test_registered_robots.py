@@ -433,3 +433,13 @@ def test_what_a_robot_has_wrong_is_named_where_it_is_listed(
     monkeypatch.syspath_prepend(tmp_path)
     assert main(["robots", "my_wrong:Wrong"]) == 1
     assert "Wrong.n_commands: expected a whole number from 1 to 64, got 'two'" in capsys.readouterr().err
+
+
+def test_a_script_that_workers_cannot_import_is_told_what_to_do_first(package: Path) -> None:
+    recreate, how = registry.REGISTRY._reduce(robot_named(ROVER))
+    forget()
+    script = package / "my_package" / "robots.py"
+    script.write_text(f"{script.read_text()}\nraise animat.Mismatch('another run is at work')\n")
+    need = "robot: expected what the script runs under `if __name__ == '__main__':`, as worker processes import it; "
+    with pytest.raises(InvalidArgument, match=f"^{re.escape(need)}.*another run is at work$"):
+        recreate(*how)

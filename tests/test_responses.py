@@ -21,6 +21,7 @@ from animat.responses.psth import find_response, post_stimulus_histogram, sponta
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
 from animat.stimulation.stimulus import Stimuli
+from synthetic_recordings import synthetic_recording
 
 
 def recording(
@@ -362,3 +363,17 @@ def test_a_real_culture_has_the_numbers_known_of_it(real_data: Path) -> None:
     assert len(cut) == 2774
     assert names(cut)["window-past-end"] == "note"
     assert np.rint(cut.rate_hz * 0.008 * 108).mean() == pytest.approx(20.26, abs=0.005)
+
+
+def test_a_table_of_responses_has_a_row_for_each() -> None:
+    recording = synthetic_recording(1, patterns=4, channels=16, start_min=5.0)
+    responses = extract_responses(recording, readouts="halves")
+    table = responses.to_frame()
+    names = [f"{name}_hz" for name in responses.readouts.names]
+    assert list(table) == ["condition", "rate_hz", "active_ratio", "is_burst", "start_min", "time_s", *names]
+    # Each half has 8 of the 16 channels, so x of all channels is the mean of both.
+    np.testing.assert_allclose(table[names].mean(axis="columns"), table["rate_hz"])
+    for i, condition in enumerate(responses.conditions):
+        kept = table[(table["condition"] == condition.label) & ~table["is_burst"]]
+        np.testing.assert_array_equal(kept["rate_hz"], responses.rates_of(i))
+    assert set(table["start_min"]) == {5.0} and "time_s" not in replace(responses, time_s=None).to_frame()

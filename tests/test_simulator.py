@@ -242,7 +242,11 @@ def test_a_refreshed_simulator_recompiles_nothing() -> None:
             "recordings: expected a list of recordings, as animat.read_recordings returns, got 'recordings'",
         ),
         (lambda: extract_series(["recordings"]), InvalidArgument, "recordings: expected .* got 'recordings'"),  # type: ignore[list-item]
-        (lambda: extract_series([], 5), InvalidArgument, "conditions: expected text such as 'frequency:5,10', got 5"),  # type: ignore[arg-type]
+        (
+            lambda: extract_series([], 5),
+            InvalidArgument,
+            "by: expected conditions, such as 'frequency:5,10', or None, got 5",
+        ),  # type: ignore[arg-type]
         (lambda: fit_timeline([responses_of([1.0])], kind="gamma"), InvalidArgument, "kind"),  # type: ignore[arg-type]
         (lambda: fit_timeline([responses_of([1.0]), responses_of([1.0])]), Mismatch, "start_min"),
         (

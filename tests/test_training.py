@@ -462,7 +462,10 @@ def test_invalid_settings_are_refused(named: dict[str, Any], message: str) -> No
             {"training": "cartpole"},
             "training: expected a Training, such as animat.Training('cartpole', '9-thresholds')",
         ),
-        ({"timeline": "recordings/"}, "timeline: expected simulators from animat.fit_timeline, or None, got 'rec"),
+        (
+            {"timeline": "recordings/"},
+            "timeline: expected simulators, as animat.fit_timeline returns, or None, got 'rec",
+        ),
         ({"folder": 3}, "folder: expected a path, or None, got 3"),
         (
             {"callbacks": print},

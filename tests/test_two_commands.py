@@ -339,7 +339,7 @@ def test_the_file_of_the_page_is_short() -> None:
 
 @pytest.mark.oracle
 def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
-    write_synthetic_series(0, tmp_path / "recordings", sessions=1)
+    write_synthetic_series(0, tmp_path / "corners", sessions=1)
     text, n = re.subn(r"iterations=\d[\d_]*", "iterations=1_000", FILE)
     assert n == 1 and "episode_limit: int = 60" in text
     (tmp_path / "two_wheels.py").write_text(text.replace("episode_limit: int = 60", "episode_limit: int = 8"))
@@ -348,7 +348,7 @@ def test_the_file_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
         [sys.executable, "two_wheels.py"], capture_output=True, text=True, env=environment, cwd=tmp_path
     )
     assert ran.returncode == 0, ran.stderr
-    assert "two-wheels, 9-thresholds" in ran.stdout and (tmp_path / "session" / "session.nwb").exists()
+    assert "two-wheels, 9-thresholds" in ran.stdout and (tmp_path / "replayed" / "session.nwb").exists()
 
 
 def test_electrodes_of_readouts_that_no_channel_reads_are_refused_with_their_file(

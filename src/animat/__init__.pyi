@@ -11,8 +11,13 @@ from animat.stimulation.protocol import (
 )
 from animat.stimulation.selection import Selection as Selection
 from animat.recordings.findings import Finding as Finding
-from animat.recordings.reading import read_recording as read_recording, read_recordings as read_recordings
+from animat.recordings.reading import (
+    read_recording as read_recording,
+    read_recordings as read_recordings,
+    read_source as read_source,
+)
 from animat.recordings.formats.nwb import write_nwb as write_nwb
+from animat.progress import Bar as Bar
 from animat.cultures.base import Culture as Culture
 from animat.cultures.safety import Limits as Limits
 from animat.cultures.virtual import VirtualCulture as VirtualCulture
@@ -32,6 +37,7 @@ from animat.neurons.simulator import (
 )
 from animat.neurons.memory import fit_memory as fit_memory
 from animat.neurons.timeline import SimulatorTimeline as SimulatorTimeline, fit_timeline as fit_timeline
+from animat.neurons.validation import Validation as Validation, validate as validate
 from animat.coding.encoder import Encoder as Encoder
 from animat.coding.decoder import Decoder as Decoder
 from animat.coding.mapping import (
@@ -61,6 +67,7 @@ from animat.wrappers import (
 )
 from animat.training.settings import SAC as SAC
 from animat.training.specification import Training as Training
+from animat.training.lessons import Lesson as Lesson
 from animat.execution.curves import CurveRow as CurveRow, TrainingCallback as TrainingCallback
 from animat.execution.training import train as train
 from animat.training.policy import Policy as Policy, load_policies as load_policies

@@ -257,8 +257,8 @@ class Registry(Generic[Thing]):
         try:
             return self._import_class(place)(**parameters)
         except InvalidArgument as error:
-            hint = "put what the script runs under `if __name__ == '__main__':`, as worker processes import it"
-            raise InvalidArgument(f"{error}; {hint}") from error
+            need = "what the script runs under `if __name__ == '__main__':`, as worker processes import it"
+            raise InvalidArgument(f"{self.noun}: expected {need}; {error}") from error
 
 
 def _registry_of(base: type) -> Registry[Any]:

@@ -67,7 +67,7 @@ class Thresholds(Mapping):
     count: int
 
     def __post_init__(self) -> None:
-        if isinstance(self.count, bool) or self.count not in (1, 9):
+        if type(self.count) is not int or self.count not in (1, 9):
             raise InvalidArgument(f"count: expected 1 or 9 thresholds, got {self.count!r}")
 
     @property

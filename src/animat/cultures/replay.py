@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Int64
 
+from animat.arguments import checked_arguments
 from animat.cultures.base import ComputedCulture
 from animat.cultures.observed import Observed, Spikes
 from animat.cultures.safety import Admitted, Limits
@@ -44,6 +45,7 @@ class ReplayCulture(ComputedCulture):
 
     name: ClassVar[str] = "replay"
 
+    @checked_arguments
     def __init__(self, recordings: Sequence[Recording], *, seed: int = 0, limits: Limits | None = None) -> None:
         super().__init__(limits)
         if not recordings:

@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.cultures.base import Culture
 from animat.cultures.same_culture import other_patterns
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.differences import first_difference
-from animat.errors import InvalidArgument, Mismatch, expect_at_least, expect_kind, shown
+from animat.errors import InvalidArgument, Mismatch, expect_at_least, shown
 from animat.progress import Part, Progress, Silent
 from animat.recordings.formats.nwb import recording_name, write_nwb
 from animat.recordings.reading import read_recording
@@ -43,6 +44,7 @@ class Series(NamedTuple):
     """Minutes of the series without a recording, as the next one was already due."""
 
 
+@checked_arguments
 def record_series(
     make_culture: Callable[[], Culture],
     protocol: Protocol | Callable[[Culture], Protocol],
@@ -83,8 +85,6 @@ def record_series(
             file cannot be written, or the state or an existing recording is damaged.
         UnsafeStimulus, DeviceFailed: as the culture raises them; earlier recordings are kept.
     """
-    words = "a function that returns the culture, such as lambda: animat.VirtualCulture(seed=1)"
-    expect_kind("make_culture", make_culture, Callable, words)
     expect_at_least("seed", seed, 0)
     folder, progress = Path(folder), progress or Silent()
     with exclusive_lock(folder), ExitStack() as opened:

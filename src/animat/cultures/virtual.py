@@ -91,6 +91,9 @@ class VirtualCulture(ComputedCulture):
         self.fired = np.empty(0), np.empty(0, np.int64)
         """Time from the start and neuron of every spike of the last delivery, whether or not an electrode sees it."""
 
+    def __repr__(self) -> str:
+        return f"VirtualCulture(seed={self.seed})"
+
     @property
     def tissue(self) -> Tissue:
         """The tissue, once opened, for inspection; advancing it directly breaks the culture's clock."""

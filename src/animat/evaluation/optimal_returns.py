@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from animat.arguments import checked_arguments
 from animat.coding.mapping import Mapping, Thresholds
 from animat.environment import Animat
 from animat.evaluation.coupling import ContextGap, best_coupling, context_gap
@@ -46,6 +47,7 @@ class OptimalReturn:
         return f"{self.robot}, {self.mapping}: {random}; {self.best.to_text()}; {self.context.to_text()}"
 
 
+@checked_arguments
 def optimal_returns(
     responses: Responses,
     robot: Robot[Any],

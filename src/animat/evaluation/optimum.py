@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, UInt16
 
+from animat.arguments import checked_arguments
 from animat.environment import Environment
 from animat.errors import InvalidArgument, Mismatch
 from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, layers_of, nodes_for
@@ -114,11 +115,13 @@ def bracket_findings(value: float, grid_error: float, monte_carlo: float, error:
     return (Finding("optimum", "warning", message, difference),)
 
 
+@checked_arguments
 def best_return(environment: Environment[Any], simulator: NeuronSimulator | None, **options: Any) -> Optimum:
     """The optimal return in one environment; arguments, errors and method as in `best_returns`."""
     return best_returns([(environment, simulator)], **options)[0]
 
 
+@checked_arguments
 def best_returns(
     cases: Sequence[Case],
     *,

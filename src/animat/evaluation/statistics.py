@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
-from animat.errors import InvalidArgument
+from animat.errors import InvalidArgument, shown
 
 CONFIDENCE = 0.95
 _MOST_PAIRS = 10_000
@@ -210,7 +210,10 @@ def standard_error(samples: Float64[np.ndarray, " samples"]) -> float:
 
 
 def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
-    samples: Float64[np.ndarray, " samples"] = np.asarray(values, np.float64)
+    try:
+        samples: Float64[np.ndarray, " samples"] = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise InvalidArgument(f"{name}: expected numbers, got {shown(values)}") from None
     if samples.ndim != 1 or not len(samples):
         raise InvalidArgument(f"{name}: expected one number per sample, at least one, got shape {samples.shape}")
     if not np.all(np.isfinite(samples)):

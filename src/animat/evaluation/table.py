@@ -9,10 +9,11 @@ from typing import Any, Self
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.coding.electrode_pulses import electrode_pulses
 from animat.columns import align_columns
 from animat.environment import Animat, Environment, WithoutNeurons
-from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, expect_kind, expect_several, in_min
+from animat.errors import InvalidArgument, Mismatch, UnusableData, counted, expect_several, in_min
 from animat.evaluation import transfer
 from animat.evaluation.controls import Control, controls_of, coupling_of
 from animat.evaluation.coupling import ContextGap, context_gap, least_context_gap
@@ -193,6 +194,7 @@ class Evaluation:
         return [*lines, *context]
 
 
+@checked_arguments
 def evaluate(
     policies: Mapping[str, Policy],
     timeline: SimulatorTimeline | None,
@@ -202,7 +204,7 @@ def evaluate(
     seed: int = 1,
     greedy: bool = True,
     robot: Robot[Any] | None = None,
-    controls: Collection[str] | None = None,
+    controls: str | Collection[str] | None = None,
     optimum_resolution: float | None = None,
     interventions: bool = False,
     progress: Progress | None = None,
@@ -230,7 +232,6 @@ def evaluate(
     """
     alike = ("robot", "mapping", "readouts", "conditions", "commands", "percentiles", "delivery", "pulse_cost")
     first = first_of_alike(policies, alike, "evaluate it alone")
-    expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators from animat.fit_timeline, or None")
     if robot is not None and robot.name != first.robot.name:
         raise Mismatch(f"robot: expected {first.robot.name}, on which the policies were trained, got {robot.name}")
     if optimum_resolution is not None and not 0 < optimum_resolution < float("inf"):

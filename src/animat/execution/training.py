@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,9 +12,10 @@ from itertools import product
 from pathlib import Path
 from typing import final
 
+from animat.arguments import checked_arguments
 from animat.coding.decoder import expect_fit
 from animat.devices import gpu_here
-from animat.errors import InvalidArgument, UnusableData, expect_kind, expect_several
+from animat.errors import InvalidArgument, UnusableData
 from animat.execution.curves import CurveFile, Curves, TrainingCallback
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
@@ -40,6 +41,7 @@ from animat.training.specification import CHUNKS, Training
 from animat.writing import clear_away, exclusive_lock
 
 
+@checked_arguments
 def train(
     training: Training,
     timeline: SimulatorTimeline | None,
@@ -85,12 +87,6 @@ def train(
         UnusableData: if what was learned is no longer finite; none of it is left in the folder.
         AnimatError: if a training process ends unexpectedly.
     """
-    expect_kind("training", training, Training, "a Training, such as animat.Training('cartpole', '9-thresholds')")
-    expect_kind("timeline", timeline, SimulatorTimeline | None, "simulators from animat.fit_timeline, or None")
-    expect_kind("folder", folder, str | os.PathLike | None, "a path, or None")
-    callbacks = expect_several(
-        "callbacks", callbacks or (), Callable, "a list of functions that take a row of a learning curve"
-    )
     if (timeline is None) != (training.mapping is None):
         raise InvalidArgument(
             "timeline: expected the culture's simulators with a mapping, and None without, got "

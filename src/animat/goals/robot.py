@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, shown, within
 from animat.goals.goal import Goal, Objective
 from animat.goals.region import margin_of, region_in_units
@@ -265,6 +266,7 @@ def _outcome_along(robot: RobotWithGoal) -> Callable[[Any], Outcome]:
     return jax.jit(along)
 
 
+@checked_arguments
 def with_goal(robot: Robot[Any] | str, goal: Goal | str) -> RobotWithGoal:
     """A robot with a goal in place of its own task.
 

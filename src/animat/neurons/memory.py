@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
 
+from animat.arguments import checked_arguments
 from animat.neurons.history import NO_MEMORY, Memory, Ranked, trace_increment
 from animat.neurons.simulator import Answer, EmpiricalSimulator, Stored, fit_empirical, to_jax
 from animat.responses.responses import Responses
@@ -112,6 +113,7 @@ class MemorySimulator(EmpiricalSimulator):
         return jnp.minimum(first, smaller), jnp.maximum(first + nearest, no_larger)
 
 
+@checked_arguments
 def fit_memory(responses: Responses, *, room: int | None = None, memory: Memory | None = None) -> MemorySimulator:
     """Keep every condition's non-burst responses, with their histories, to draw from.
 

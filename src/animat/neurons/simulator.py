@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64, Int, PRNGKeyArray
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, UnusableData
 from animat.neurons.history import INITIAL_HISTORY
 from animat.responses.responses import Responses
@@ -169,6 +170,7 @@ def check_binning(bins: int, range_hz: float | None) -> None:
         raise InvalidArgument(f"range_hz: expected a positive frequency in Hz, got {range_hz:g}")
 
 
+@checked_arguments
 def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | None = None) -> HistogramSimulator:
     """Fit a histogram per condition to the non-burst responses.
 
@@ -201,6 +203,7 @@ def fit_histogram(responses: Responses, *, bins: int = 20, range_hz: float | Non
     return HistogramSimulator(to_jax(cumulative), to_jax(edges), pooled_percentiles(responses))
 
 
+@checked_arguments
 def fit_empirical(responses: Responses, *, room: int | None = None) -> EmpiricalSimulator:
     """Keep the non-burst responses of every condition to draw from.
 

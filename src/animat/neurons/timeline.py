@@ -14,7 +14,8 @@ from jaxtyping import Float64
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, expect_several, in_min
+from animat.arguments import checked_arguments
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_min
 from animat.neurons.fidelity import Fidelity, fidelity
 from animat.neurons.joint_histogram import JointHistogramSimulator
 from animat.neurons.kinds import Kind, fit_simulator
@@ -135,6 +136,7 @@ def default_kind(responses: Responses) -> Kind:
     return "histogram" if responses.is_blocked else "memory"
 
 
+@checked_arguments
 def fit_timeline(
     series: Sequence[Responses], *, kind: Kind | None = None, bins: int = 20, range_hz: float | None = None
 ) -> SimulatorTimeline:
@@ -154,7 +156,7 @@ def fit_timeline(
         Mismatch: if the recordings differ in conditions, window, presentation or readouts, or two share a minute.
         UnusableData: if a condition of a recording has no non-burst response.
     """
-    series = expect_several("series", series, Responses, "a list of responses, as animat.extract_series returns")
+    series = tuple(series)
     if not series:
         raise InvalidArgument("series: expected the responses of at least one recording, got none")
     ordered = sorted(series, key=lambda responses: responses.start_min)

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float64
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument
 from animat.neurons.free_runs import autocorrelation, free_runs, recorded_series, run_lengths, shares_lasting
 from animat.neurons.history import NO_MEMORY
@@ -208,6 +209,7 @@ class Validation:
         )
 
 
+@checked_arguments
 def validate(responses: Responses, *, kind: str | None = None, seed: int = 1, readout: int | None = None) -> Validation:
     """Fit all kinds of simulators to the first half of a recording's responses, and score them on the second.
 

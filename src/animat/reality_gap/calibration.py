@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float64
 
+from animat.arguments import checked_arguments
 from animat.coding.mapping import Thresholds
 from animat.neurons.adjusted_rank import AdjustedRanks
 from animat.neurons.history_tracker import HistoryTracker
@@ -24,6 +25,7 @@ from animat.responses.median_drift import MedianDrift, median_drift
 from animat.responses.readouts import ALL, Readouts
 from animat.responses.responses import Responses
 from animat.stimulation.protocol import Presentation
+from animat.tables import briefly
 from animat.training.policy import FITTED, Policy
 
 BOOTSTRAPS = 100
@@ -47,6 +49,8 @@ class Calibration:
         adjusted: its responses, from which adaptive thresholds start.
         culture: that was recorded; None if it is not known.
     """
+
+    __repr__ = briefly
 
     adaptive: bool
     percentiles: Float64[np.ndarray, "*readouts percentiles"]
@@ -75,6 +79,7 @@ class Calibration:
         return self.adjusted.remembering
 
     @classmethod
+    @checked_arguments
     def of_series(
         cls,
         series: Sequence[Responses],

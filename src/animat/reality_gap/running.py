@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.closed_loop.agents import Agent, Greedy, agent_of
 from animat.closed_loop.loop import Loop
 from animat.closed_loop.running import check_session, run_session
@@ -56,6 +57,7 @@ FEWEST_OF_A_CONTROL = 5
 """Fewest episodes of a control: enough to show (p < 0.01) that policies with ten or more outperform it."""
 
 
+@checked_arguments
 def run_policies(
     policies: Mapping[str, Policy],
     culture: Culture,

@@ -19,6 +19,7 @@ from animat.reality_gap.outlook import Outlook
 from animat.reality_gap.reasons import CHECKS
 from animat.reality_gap.row import Row
 from animat.recordings.findings import Finding
+from animat.tables import briefly
 
 LARGE_SHARE = 0.1
 """Share of the range from random to optimal return: a gap this large is mentioned even if it may be chance."""
@@ -39,6 +40,8 @@ class RealityGap:
         reasons: why the policies' measured return differs from the predicted one, as far as the session's data show.
         whose_work: the policies' return with something in place of the culture; empty if it was not requested.
     """
+
+    __repr__ = briefly
 
     loop: Loop
     calibrated_at_min: float

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, InvalidFile, as_invalid_file, expect_several, first_line, in_file
 from animat.plain_file import expect_plain_file, is_absent, is_folder
 from animat.recordings.columns import with_start
@@ -46,6 +47,7 @@ IN_FOLDERS = ("*.nwb", "*.h5", "*.npz", "*_spikes.csv", "*_spikes.csv.gz", "*_re
 """Files in a folder that are read as recordings."""
 
 
+@checked_arguments
 def read_recording(
     path: str | os.PathLike[str],
     *,
@@ -79,14 +81,15 @@ def read_recording(
     source = read_source(path, stimuli_path=stimuli_path, stimuli=stimuli, part=part)
     if isinstance(source, ResponseTable):
         raise InvalidFile(
-            f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read; "
-            "this needs spike times"
+            f"{path}: expected spikes, got a response table, which animat inspect, validate, train and evaluate read, "
+            "and in Python animat.read_source; this needs spike times"
         )
     with in_file(path):
         source = source if start_s is None else with_start(source, start_s)
         return source if start_min is None else dataclasses.replace(source, start_min=float(start_min))
 
 
+@checked_arguments
 def read_source(
     path: str | os.PathLike[str],
     *,

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from animat.errors import Mismatch, UnusableData, expect_kind
+from animat.arguments import checked_arguments
+from animat.errors import Mismatch, UnusableData
 from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -21,6 +22,7 @@ SILENCE_S = 1.0
 """A longer time without a pulse is silence: the slowest of the paper's stimuli are 0.2 s apart."""
 
 
+@checked_arguments
 def extract_responses(
     source: Recording | ResponseTable,
     by: Conditions | str | None = None,
@@ -59,7 +61,6 @@ def extract_responses(
     Source: the paper's methods (2-10 ms, x = S_total / (T N), Otsu's threshold on the ratio of active channels, here
         only where it finds two groups).
     """
-    expect_kind("source", source, Recording | ResponseTable, "a recording, as animat.read_recording returns")
     window_ms = check_window(window_ms)
     stimuli, n_channels = source.stimuli, len(source.channels)
     if not n_channels:

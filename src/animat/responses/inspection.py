@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from animat.arguments import checked_arguments
 from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
@@ -135,6 +136,7 @@ class Inspection:
         return as_json(data)  # type: ignore[no-any-return]
 
 
+@checked_arguments
 def inspect_recording(
     recording: Recording | ResponseTable,
     by: Conditions | str | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -18,6 +18,9 @@ from animat.responses.conditions import NO_CONDITION
 from animat.responses.readouts import ALL, Readouts
 from animat.stimulation.protocol import Presentation
 from animat.tables import briefly, read_only
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +184,24 @@ class Responses:
     def rates_of(self, condition: int) -> Float64[np.ndarray, " non_bursts"]:
         """x of the non-burst responses of one condition, in Hz."""
         return np.asarray(self.rate_hz[(self.condition == condition) & ~self.is_burst])
+
+    def to_frame(self) -> DataFrame:
+        """A table with a row for each response.
+
+        Its columns are `condition` (the label), `rate_hz`, `active_ratio`, `is_burst`, `start_min` of the recording,
+        `time_s` if it is known, and for each of several readouts its x, `NAME_hz`.
+        """
+        from pandas import DataFrame
+
+        labels = np.array([condition.label for condition in self.conditions], object)
+        columns = {"condition": labels[self.condition], "rate_hz": self.rate_hz, "active_ratio": self.active_ratio}
+        columns |= {"is_burst": self.is_burst, "start_min": np.full(len(self), self.start_min)}
+        if self.time_s is not None:
+            columns["time_s"] = self.time_s
+        if self.readout_hz is not None:
+            each = self.readout_hz.reshape(len(self), -1).T
+            columns |= {f"{name}_hz": x for name, x in zip(self.readouts.names, each, strict=True)}
+        return DataFrame(columns)
 
     def bootstrapped(self, rng: np.random.Generator) -> Responses:
         """A bootstrap sample: as many non-burst responses to each condition, drawn from them with replacement.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from animat.errors import InvalidArgument, Mismatch, UnusableData, expect_several, in_min
+from animat.arguments import checked_arguments
+from animat.errors import InvalidArgument, Mismatch, UnusableData, in_min
+from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
@@ -32,6 +34,7 @@ _NOTHING_TO_FIT = ("no-stimuli", "no-condition", "empty-condition")
 """Those after which no simulator can be fitted, even if they are allowed."""
 
 
+@checked_arguments
 def extract_series(
     recordings: Sequence[Recording | ResponseTable],
     by: Conditions | str | None = None,
@@ -60,8 +63,7 @@ def extract_series(
             channels that do not form readouts.
         Mismatch: for a recording whose channels do not read all electrodes of the readouts.
     """
-    kinds, words = Recording | ResponseTable, "a list of recordings, as animat.read_recordings returns"
-    recordings = expect_several("recordings", recordings, kinds, words)
+    recordings = tuple(recordings)
     check_allowed(allow)
     by = by if by is None or isinstance(by, Conditions) else conditions_named(by)
     window_ms = DEFAULT_WINDOW_MS if window_ms is None else window_ms
@@ -75,15 +77,19 @@ def extract_series(
             raise type(error)(f"{error} (the recording at {in_min(recording.start_min)})") from error
         for finding in (*recording_findings(recording), *responses.findings):
             if finding.severity == "refuse" and finding.name not in allow:
-                remedy = f" (to allow it: --allow {finding.name}, or in a study simulators.allow)"
+                remedy = f" (to allow it: {_allowing(finding)}, or in a study simulators.allow)"
                 if finding.name in _NOTHING_TO_FIT:
                     remedy = ""
                 raise UnusableData(f"the recording at {in_min(recording.start_min)}: {finding.message}{remedy}")
         series.append(responses)
     for finding in series_findings(series):
         if finding.severity == "refuse" and finding.name not in allow:
-            raise UnusableData(f"recordings: {finding.message} (to allow it: --allow {finding.name})")
+            raise UnusableData(f"recordings: {finding.message} (to allow it: {_allowing(finding)})")
     return series
+
+
+def _allowing(finding: Finding) -> str:
+    return f"--allow {finding.name}, in Python allow=['{finding.name}']"
 
 
 def check_allowed(names: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, SkipValidation
 
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, in_file
 from animat.plain_file import read_plain_text
 from animat.records import Number, Whole, json_data, record
@@ -154,6 +155,7 @@ class Protocol:
         return replace(defaults or PAPER, **data)
 
 
+@checked_arguments
 def read_protocol(path: str | os.PathLike[str], defaults: Protocol | None = None) -> Protocol:
     """Read a protocol from a JSON file, as `Protocol.to_json` writes it; keys left out take the `defaults`.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from animat.arguments import checked_arguments
 from animat.studies.source import Source
 from animat.studies.specification import Arm, Compared, RobotSpec, Study
 
@@ -46,6 +47,7 @@ COMPARISONS = (
 )
 
 
+@checked_arguments
 def paper_study(culture_seed: int = 1, seed: int = 1, *, quick: bool = False) -> Study:
     """The paper's study on a virtual culture.
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from animat.arguments import checked_arguments
 from animat.coding.checking import check_mapping
 from animat.coding.mapping import mapping_named
-from animat.errors import InvalidFile, expect_kind
+from animat.errors import InvalidFile
 from animat.execution.gpu import find_gpu
 from animat.execution.jobs import Job, Jobs, expect_workers
 from animat.execution.task import UNFINISHED
@@ -43,6 +44,7 @@ class StudyRun:
     done_now: dict[str, float]
 
 
+@checked_arguments
 def run_study(
     study: Study,
     folder: str | os.PathLike[str],
@@ -73,7 +75,6 @@ def run_study(
             violates the contract.
         AnimatError: if a job failed; its message names the job.
     """
-    expect_kind("study", study, Study, "a Study, as animat.read_study returns")
     expect_workers(workers, executor)
     folder, base = Path(folder).absolute(), Path(base).absolute()
     gpu = find_gpu() if executor is None else None

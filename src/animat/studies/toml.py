@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from animat import plain_file
+from animat.arguments import checked_arguments
 from animat.errors import InvalidArgument, InvalidFile, in_file
 from animat.records import read_record
 from animat.studies.source import MOST_ENTRIES
@@ -32,6 +33,7 @@ FORMER_CHANNELS = 256
 """Former files have this `channels` in every culture, which only synthetic recordings used; it is ignored."""
 
 
+@checked_arguments
 def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study's specification.
 

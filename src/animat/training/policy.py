@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
+from animat.arguments import checked_arguments
 from animat.coding.decoder import expect_fit, expect_one_command
 from animat.coding.mapping import REGISTRY as MAPPINGS
 from animat.coding.mapping import Mapping, mapping_from_data, mapping_to_data
-from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, expect_kind, in_file, shown
+from animat.errors import AnimatError, InvalidArgument, InvalidFile, Mismatch, in_file, shown
 from animat.goals.robot import body_and_goal, robot_of, without_goal
 from animat.neurons.history import INITIAL_HISTORY
 from animat.plain_file import expect_plain_file, is_absent, is_folder
@@ -364,10 +365,6 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
     `attributes` include their conditions. Raises Mismatch if one differs, or the stimuli of a condition do, and
     InvalidArgument for anything but policies by name.
     """
-    words = "policies by name, as animat.load_policies returns"
-    expect_kind("policies", policies, Dict, words)
-    for policy in policies.values():
-        expect_kind("policies", policy, Policy, words)
     if not policies:
         raise InvalidArgument("policies: expected at least one, got none")
     first_name, first = next(iter(policies.items()))
@@ -380,6 +377,7 @@ def first_of_alike(policies: Dict[str, Policy], attributes: Sequence[str], advic
     return first
 
 
+@checked_arguments
 def load_policies(path: str | os.PathLike[str]) -> dict[str, Policy]:
     """Read one policy file, or all in a folder, by name, in the order of their numbers (p2 before p10).
 

@@ -12,8 +12,9 @@ import h5py
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from animat.arguments import checked_arguments
 from animat.compilation import pynwb_importable
-from animat.errors import InvalidFile, UnusableData, expect_kind, in_file
+from animat.errors import InvalidArgument, InvalidFile, UnusableData, in_file
 from animat.recordings.formats.foreign_nwb import read_foreign_nwb
 from animat.recordings.formats.hdf5 import Hdf5File
 from animat.recordings.formats.nwb_layout import (
@@ -38,6 +39,7 @@ LARGEST_VALUES = 10_000_000
 T = TypeVar("T", int, float, str)
 
 
+@checked_arguments
 def write_nwb(
     recording: Recording,
     path: str | os.PathLike[str],
@@ -54,10 +56,12 @@ def write_nwb(
 
     Raises:
         InvalidFile: if the file cannot be written (no permission, a full disk).
-        InvalidArgument: for anything but a recording, text that HDF5 cannot hold, or a `recorded_at` that is no date.
+        InvalidArgument: for a name that does not end in `.nwb`, text that HDF5 cannot hold, or a `recorded_at` that is
+            no date.
         UnusableData: for `spikes` that are not finite, not on a channel, or outside the recording.
     """
-    expect_kind("recording", recording, Recording, "a recording, as animat.read_recording returns")
+    if not os.fspath(path).endswith(".nwb"):
+        raise InvalidArgument(f"path: expected a name ending in .nwb, got {path}")
     with pynwb_importable():
         from hdmf.build import BuildManager
         from pynwb import NWBHDF5IO

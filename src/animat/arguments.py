@@ -1,0 +1,121 @@
+"""Arguments of public functions: one of another kind than its annotation says is refused in one line."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Collection, Iterable, Mapping
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from animat.errors import InvalidArgument, shown
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_ONE = {
+    "Calibration": "a calibration, as animat.Calibration.of_series returns",
+    "Conditions": "conditions, such as 'frequency:5,10'",
+    "Culture": "a culture, such as animat.VirtualCulture(seed=1)",
+    "Environment": "an environment, such as animat.Animat(animat.Cartpole(), animat.Thresholds(9), 9)",
+    "Goal": "a goal, such as 'avoid pole_angle outside -12..12 deg'",
+    "Mapping": "a mapping, such as animat.Thresholds(9)",
+    "NeuronSimulator": "a simulator, as animat.fit_memory returns",
+    "PathLike": "a path",
+    "Policy": "a policy, of those that animat.load_policies returns",
+    "Protocol": "a protocol, such as animat.Protocol(trials=5)",
+    "Readouts": "readouts, such as 'halves'",
+    "Recording": "a recording, as animat.read_recording returns",
+    "Responses": "responses, as animat.extract_responses returns",
+    "Robot": "a robot, such as animat.Cartpole()",
+    "SimulatorTimeline": "simulators, as animat.fit_timeline returns",
+    "Study": "a Study, as animat.read_study returns",
+    "Training": "a Training, such as animat.Training('cartpole', '9-thresholds')",
+    "Callable": "a function",
+    "NoneType": "None",
+    "bool": "True or False",
+    "float": "a number",
+    "int": "a whole number",
+    "str": "text",
+}
+_SEVERAL = {
+    "str": "a list of names",
+    "Mapping": "a list of mappings, such as [animat.Thresholds(9)]",
+    "Policy": "policies by name, as animat.load_policies returns",
+    "Recording": "a list of recordings, as animat.read_recordings returns",
+    "Responses": "a list of responses, as animat.extract_series returns",
+    "TrainingCallback": "a list of functions that take a row of a learning curve",
+}
+_NUMBERS: dict[Any, Any] = {float: Real, int: Integral}
+_UNSAID = ("ResponseTable", "str")
+"""What may also come and goes without saying: a table in place of a recording, text in place of what it names."""
+
+
+def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """A decorator: raises InvalidArgument for an argument that is not of its annotation's kind.
+
+    A path in place of the recording that it holds would otherwise fail deep inside. What an annotation cannot say, such
+    as which names are known, is left to the function, as are arrays and anything without an annotation.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            return function(*args, **kwargs)  # Python says what is missing or too much.
+        for name, value in given.items():
+            hint = _hints(function).get(name, Any)
+            if strangers := _strangers(value, hint):
+                raise InvalidArgument(f"{name}: expected {_words(hint)}, got {shown(strangers[0])}")
+        return function(*args, **kwargs)
+
+    return checked
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    return get_type_hints(function)
+
+
+def _strangers(value: Any, hint: Any) -> list[Any]:
+    """The value, if it is not of the kind, or those in it that are not."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        return [value] if all(_strangers(value, each) for each in inner) else []
+    if kind is Any or not isinstance(kind, type) or kind.__module__ == "jaxtyping" or issubclass(kind, tuple):
+        return []
+    if getattr(kind, "_is_protocol", False):
+        fits = "__call__" not in vars(kind) or callable(value)
+    elif inner and issubclass(kind, Mapping):
+        if isinstance(value, Mapping):
+            return [stranger for each in value.values() for stranger in _strangers(each, inner[1])]
+        fits = False
+    elif inner and issubclass(kind, Iterable):
+        fits = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
+        # What can be read only once is left to the function.
+        if fits and isinstance(value, Collection):
+            return [stranger for each in value for stranger in _strangers(each, inner[0])]
+    else:
+        fits = isinstance(value, _NUMBERS.get(kind, kind))
+    return [] if fits else [value]
+
+
+def _words(hint: Any) -> str:
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        said = [each for each in inner if _name(each) not in _UNSAID]
+        return ", or ".join(map(_words, said if set(said) - {NoneType} else inner))
+    if inner and issubclass(kind, Mapping | Iterable):
+        each = get_args(inner[-1])[0] if get_origin(inner[-1]) in (Union, UnionType) else inner[-1]
+        return _SEVERAL.get(_name(each)) or f"several of: {_words(each)}"
+    what = _ONE.get(_name(hint)) or f"a {_name(hint)}"
+    if kind is Callable and inner and inner[-1] is not NoneType:
+        return f"{what} that returns {_words(inner[-1])}"
+    return what
+
+
+def _name(hint: Any) -> str:
+    return str(getattr(get_origin(hint) or hint, "__name__", hint))

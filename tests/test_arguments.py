@@ -1,0 +1,88 @@
+"""Arguments of the wrong kind are refused in one line by everything public."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import animat
+from synthetic_recordings import synthetic_recording
+
+FUNCTIONS = [name for name in animat.__all__ if inspect.isfunction(getattr(animat, name)) and name != "paper_study"]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_public_function_names_an_argument_of_the_wrong_kind(name: str) -> None:
+    function, stranger = getattr(animat, name), object()
+    parameters = inspect.signature(function).parameters.values()
+    required = [each.name for each in parameters if each.default is each.empty and each.kind != each.VAR_KEYWORD]
+    assert required
+    with pytest.raises(animat.InvalidArgument) as raised:
+        function(**dict.fromkeys(required, stranger))
+    first = {"conditions_named": "conditions", "register_robot": "robot", "register_mapping": "mapping"}
+    assert str(raised.value).startswith((f"{first.get(name, required[0])}: expected ", "recordings: expected "))
+    assert "\n" not in str(raised.value)
+
+
+def test_lists_and_dictionaries_are_checked_inside_and_unions_said_in_full(tmp_path: Path) -> None:
+    responses = animat.extract_responses(synthetic_recording(1, patterns=3, channels=16))
+    timeline = animat.fit_timeline([responses])
+    refused = {
+        "robot: expected a robot, such as animat.Cartpole(), got 'cartpole'": lambda: animat.optimal_returns(
+            responses,
+            "cartpole",  # type: ignore[arg-type]
+            [animat.Thresholds(9)],
+        ),
+        "mappings: expected a list of mappings, such as [animat.Thresholds(9)], got 'linear'": lambda: (
+            animat.optimal_returns(responses, animat.Cartpole(), ["linear"])  # type: ignore[list-item]
+        ),
+        "policies: expected policies by name, as animat.load_policies returns, got 3": lambda: animat.evaluate(
+            {"p0": 3}, timeline
+        ),  # type: ignore[dict-item]
+        "recordings: expected a list of recordings, as animat.read_recordings returns, got 'folder'": lambda: (
+            animat.ReplayCulture("folder")  # type: ignore[arg-type]
+        ),
+        "bins: expected a whole number, got 20.5": lambda: animat.fit_histogram(
+            responses,
+            bins=20.5,  # type: ignore[arg-type]
+        ),
+        "start_min: expected a number, or None, got '5'": lambda: animat.read_recording(
+            tmp_path,
+            start_min="5",  # type: ignore[arg-type]
+        ),
+        "path: expected a path, got None": lambda: animat.read_study(None),  # type: ignore[arg-type]
+        "path: expected a name ending in .nwb, got r.txt": lambda: animat.write_nwb(
+            synthetic_recording(1, patterns=3, channels=16), "r.txt"
+        ),
+        "make_culture: expected a function that returns a culture, such as animat.VirtualCulture(seed=1), got "
+        "VirtualCulture(seed=1)": lambda: animat.record_series(
+            animat.VirtualCulture(1),  # type: ignore[arg-type]
+            animat.Protocol(),
+            tmp_path,
+        ),
+        "protocol: expected a protocol, such as animat.Protocol(trials=5), or a function that returns a protocol, such "
+        "as animat.Protocol(trials=5), got 'slow.json'": lambda: animat.record_series(
+            lambda: animat.VirtualCulture(1),
+            "slow.json",  # type: ignore[arg-type]
+            tmp_path,
+        ),
+        "allow: expected a list of names, got 'few-responses'": lambda: animat.extract_series(
+            [],
+            allow="few-responses",  # type: ignore[arg-type]
+        ),
+        "first: expected numbers, got 'a'": lambda: animat.compare("a", [1.0]),
+        "count: expected 1 or 9 thresholds, got 9.0": lambda: animat.Thresholds(9.0),  # type: ignore[arg-type]
+    }
+    for message, call in refused.items():
+        with pytest.raises(animat.InvalidArgument) as raised:
+            call()
+        assert str(raised.value) == message
+
+
+def test_numbers_of_numpy_and_what_can_be_read_once_are_taken() -> None:
+    responses = animat.extract_responses(synthetic_recording(1, patterns=3, channels=16), burst_threshold=np.float32(1))
+    assert len(animat.fit_timeline(each for each in (responses,))) == 1  # type: ignore[arg-type]
+    assert animat.paper_study(seed=np.int64(3)) == animat.paper_study(seed=3)  # type: ignore[arg-type]
