@@ -817,6 +817,8 @@ def test_an_error_of_an_argument_begins_with_its_option(
         (["convert"], 2, ["animat: recording: expected a value, got none; see animat convert --help"]),
         (["cluster"], 2, ["animat: where: expected a value, got none; see animat cluster --help"]),
         (["cluster", "all"], 2, ["animat: where: expected local, got 'all'; see animat cluster --help"]),
+        (["convert", "a", "--blank-ms", "2"], 2, ["animat: --blank-ms: expected two numbers, got one; see animat"]),
+        (["train", "--shared-folder"], 2, ["animat: unknown option --shared-folder; did you mean --no-shared-folder?"]),
         (["train", "--window-ms", "2"], 2, ["animat: --window-ms: expected two numbers, got '2'; see animat train"]),
         (["trian"], 2, ["train, evaluate", "got 'trian'; did you mean train?"]),
         (["help"], 2, ["got 'help'; see animat --help"]),

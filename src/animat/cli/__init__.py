@@ -209,8 +209,9 @@ def _parse(arguments: list[str]) -> Command:
         before = arguments[arguments.index("") - 1]
         raise InvalidArgument(f"{before}: expected a value after it, got an empty text")
     fields = dataclasses.fields(COMMANDS[name]) if name in COMMANDS else ()
-    options = {f"--{field.name.replace('_', '-')}": field.default for field in fields} | {"--help": False}
-    options |= {} if fields else {"--version": False}
+    # What is on by default is switched off by `--no-...`.
+    options = {f"--{'no-' * (field.default is True)}{field.name}".replace("_", "-"): field.default for field in fields}
+    options |= {"--help": False} if fields else {"--help": False, "--version": False}
     see = f"; see animat {name} --help" if name in COMMANDS else _SEE
     output = io.StringIO()
     command: Command
@@ -241,6 +242,8 @@ def _parse(arguments: list[str]) -> Command:
         message = message.removeprefix("Error parsing ")
         if message.startswith("Missing from "):
             message = f"{message.partition(': ')[2].split()[0]}: expected a value, got none"
+        if message.startswith("Missing value for argument '"):
+            message = f"{message.split(chr(39))[1]}: expected two numbers, got one"
         if message.startswith("{") or message.partition(":")[0].isupper():
             # The choices or the kind of a positional argument, in place of its name.
             named = next(field.name for field in fields if "Positional" in str(field.type))

@@ -37,7 +37,7 @@ def read_hdf5(path: Path, *, part: str | None = None, stimuli: str | None = None
     with hdf5_file(path) as file:
         kind = format_of(file)
         if part is not None and kind != "MaxWell":
-            raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for a {kind} file")
+            raise InvalidArgument(f"part: expected only for MaxWell files, got {part!r} for one of {kind}")
         if stimuli is not None and kind == "CL1":
             raise InvalidArgument(f"stimuli: expected only for NWB and MaxWell files, got {stimuli!r} for a CL1 file")
         if kind == "NWB":
