@@ -49,6 +49,8 @@ def test_what_holds_is_counted_over_cultures() -> None:
         "A reflex leaves half of the task or more undone on 0 of 2 cultures (context gap 0.00 to 0.01). The policies "
         "do significantly more than the best reflex on 0 of 2."
     )
+    some = summarise_robot((*rows()[:2], replace(rows()[0], gap=None, score=None, score_low_95=None)))
+    assert some == needs.replace("0.70).", "0.70); on 1 more this is not known.")
 
 
 def test_the_page_has_every_number_and_shares_of_what_is_over_random(tmp_path: Path) -> None:

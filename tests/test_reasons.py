@@ -249,6 +249,18 @@ def test_commands_of_nine_thresholds_show_what_the_median_alone_does_not() -> No
         assert of_nine["answers"].value == pytest.approx(2 * of_each.sum() / 9, abs=0.15)
 
 
+def test_the_mean_response_to_a_condition_is_of_those_that_moved_the_robot() -> None:
+    """With --on-burst repeat or skip bursts give no command, so they are not in the mean of what gave the others."""
+    evidence = session(1, **CASES["answers"][0])
+    answered, is_burst = evidence.session, EVERY % 10 == 0
+    rate_hz = np.where(is_burst, 1000.0, answered.responses.rate_hz)
+    responses = replace(answered.responses, rate_hz=rate_hz, is_burst=is_burst)
+    found = CHECKS["mean commands"](replace(evidence, session=replace(answered, responses=responses, moved=~is_burst)))
+    used = (responses.condition == 1) & ~is_burst
+    assert found is not None
+    assert f"; mean {rate_hz[used].mean():.3g} Hz, {evidence.calibration.responses_hz[1].mean():.3g}" in found.message
+
+
 @pytest.mark.oracle
 def test_commands_that_all_differ_by_little_are_a_reason_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each condition by less than is reported of one alone: thresholds that are too low, or too high."""

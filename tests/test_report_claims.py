@@ -121,6 +121,20 @@ def test_every_arm_and_every_difference_between_two_is_explained() -> None:
     ]
     assert parts["control"] == ["In “control” the delivered stimulus is drawn at random, whatever the policy chooses."]
     assert [each.split("”")[0] for each in parts["linear"]] == ["In “linear", "In “1 threshold"]
+    # Simulators are refreshed only where neurons are trained through.
+    first_only = study.arm("without shadowing")
+    assert list(arm_differences(first_only, study.arm("before training"))) == []
+    assert len(list(arm_differences(first_only, study.arm("without neurons")))) == 2
+
+
+def test_arms_without_neurons_share_controls_and_an_optimum_whatever_neurons_would_be_given() -> None:
+    """Of a grid, for example: each stated its own, and controls were run twice and listed twice as many."""
+    stated: Any = {"moving": {}, "first": {"percentiles": "first"}, "shuffled": {"delivery": "shuffled"}}
+    study = Study(arms=tuple(Arm(name, mapping="none", **of) for name, of in stated.items()))
+    (kind,) = kinds_of(study)
+    assert study.arms_of(kind) == list(study.arms) and len({each.thresholds for each in study.arms}) == 1
+    (description,) = {text for _, text in arms_table(study).rows}
+    assert description == "There are no neurons, and policies give the motor commands themselves."
 
 
 def test_over_cultures_a_difference_is_explained_only_once() -> None:
@@ -440,8 +454,8 @@ def test_every_line_of_a_figure_is_in_its_legend() -> None:
     labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
     assert labels == ["control\n", "1\nthreshold\nscore 0.75"]
     controls = [
-        ControlReturns("cartpole", "1-threshold", "moving", 0.0, name, 2, 5.0, error, 0.0, 9.0, None)
-        for name, error in (("trained: a", 0.1), ("trained: b", 0.1), ("silent", None))
+        ControlReturns("cartpole", "1-threshold", "moving", 0.0, name, 2, 5.0, error, 0.0, optimum, None)
+        for name, error, optimum in (("trained: control", 0.1, None), ("trained: b", 0.1, 9.0), ("silent", None, None))
     ]
     assert legend(draw_controls([("1-threshold", controls)], "cartpole")) == {
         "trained", "control", "random actions", "optimal return",

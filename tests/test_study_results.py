@@ -151,14 +151,16 @@ def test_sides_that_are_alike_are_not_ordered_and_all_robots_count_for_holm(tmp_
 def test_means_and_errors_of_arms_and_controls_are_those_counted_by_hand(tmp_path: Path) -> None:
     """Policies and controls with several actors are judged by each one's mean, and others by their episodes."""
     # The first has the name of its mapping, under which the controls are listed.
-    arms = Arm("1-threshold"), Arm("new", trained=False)
+    arms = Arm("1-threshold"), Arm("new", trained=False), Arm("control", delivery="shuffled")
     study = Study(robots=(RobotSpec("cartpole"),), arms=arms, policies=3, episodes=2)
     (spec,) = study.robots
     run = [
         ("1-threshold", "policy", [[1.0, 3.0], [5.0, 7.0], [0.0, 8.0]]),
         ("new", "policy", [[1.0, 2.0]]),
+        ("control", "policy", [[-6.0, -4.0]]),
         ("1-threshold", "random", [[-10.0, 0.0, 10.0, -20.0]]),
         ("1-threshold", "silent", [[0.0, 2.0], [4.0, 6.0]]),
+        ("1-threshold", "shuffled", [[-5.0, -5.0], [-6.0, -6.0]]),
         ("1-threshold", "constant", [[7.0]]),
     ]
     of_one = [
@@ -169,19 +171,25 @@ def test_means_and_errors_of_arms_and_controls_are_those_counted_by_hand(tmp_pat
     optimum = StudyOptimum("cartpole", "1-threshold", "moving", 0.0, 20.0, None, None, 0.5, 15.0, 0.1, *[None] * 4)
     write_typed(optima_file(tmp_path, "cartpole"), [optimum])
     known = References(study, tmp_path, spec, pd.concat([*of_one, *later]))
-    trained, new = _scores(known, 0.0, 0.0)
+    trained, new, control = _scores(known, 0.0, 0.0)
     # The means are 2, 6 and 4.
     assert (trained.policies, trained.episodes, trained.mean_return, trained.standard_deviation) == (3, 2, 4.0, 2.0)
     assert (trained.random, trained.optimum, trained.normalised_score) == (-5.0, 20.0, pytest.approx(9 / 25))
     assert (new.policies, new.mean_return, new.standard_deviation) == (1, 1.5, None)
+    assert (control.random, control.optimum, control.normalised_score) == (-5.0, None, None)
     rows = [(row.control, row.actors, row.mean_return, row.standard_error) for row in _controls(known)]
     assert rows == [
         ("trained: 1-threshold", 3, 4.0, pytest.approx(2 / 3**0.5)),
+        ("trained: control", 1, -5.0, None),
         ("random", 1, -5.0, pytest.approx((500 / 3 / 4) ** 0.5)),
         ("silent", 2, 3.0, pytest.approx(2.0)),
+        ("shuffled", 2, -5.5, pytest.approx(0.5)),
         ("constant", 1, 7.0, None),
     ]
-    assert [row.normalised_score for row in _controls(known)][2] == pytest.approx(8 / 25)
+    # Where choices have no effect the optimum is a different one, which is not known: as in `animat evaluate`.
+    scored = {row.control: row.normalised_score for row in _controls(known) if row.optimum == 20.0}
+    assert scored == {"trained: 1-threshold": pytest.approx(9 / 25), "random": 0.0, "constant": pytest.approx(12 / 25)}
+    assert {row.normalised_score for row in _controls(known) if row.optimum is None} == {None}
     # Its controller misses the value by more than the grid's error; without a grid there is neither.
     errors = [_optimum_error(each) for each in (optimum, replace(optimum, monte_carlo=20.1), None)]
     assert errors == [5.0, 0.5, None] and _optimum_error(replace(optimum, grid_error=None)) is None

@@ -123,16 +123,16 @@ def mean_commands(
     return of_one.actions, np.sum(of_one.levels * of_one.probabilities, axis=1)
 
 
-def layers_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> int:
-    """Number of classes of the history that are distinguished, one without memory; refuses a custom memory."""
+def memory_of(environment: Environment[Any], simulator: NeuronSimulator | None) -> MemorySimulator | None:
+    """The simulator, whose history is distinguished by class; None without memory; refuses a custom memory."""
     if not isinstance(unwrapped(environment), Animat) or simulator is None or not simulator.has_memory:
-        return 1
+        return None
     if not isinstance(simulator, MemorySimulator):
         raise InvalidArgument(
             f"simulator: expected a MemorySimulator or one without memory, got {type(simulator).__name__}: the optimal "
             "return cannot be computed, as its history states are not known"
         )
-    return CLASSES
+    return simulator
 
 
 def class_of(simulator: MemorySimulator, history: Float[Stored, "*histories 2"]) -> Int[np.ndarray, "*histories"]:
@@ -151,12 +151,12 @@ def commands_after(environment: Environment[Any], simulator: NeuronSimulator | N
     (`class_of`): 8 histories represent a class, and 2048 draws after each of them its responses. Without memory there
     is one class, with the commands of `commands_of`.
     """
-    animat = unwrapped(environment)
-    if layers_of(environment, simulator) == 1 or not isinstance(simulator, MemorySimulator):
+    animat, memory = unwrapped(environment), memory_of(environment, simulator)
+    if memory is None:
         return [[commands_of(environment, simulator)]]
     assert isinstance(animat, Animat)
-    levels, histories = _answers(animat, simulator, _histories(simulator))
-    levels, classes = np.asarray(levels, np.float64), class_of(simulator, histories)
+    levels, histories = _answers(animat, memory, _histories(memory))
+    levels, classes = np.asarray(levels, np.float64), class_of(memory, histories)
     if is_shuffled(environment):
         # The delivered condition does not depend on the choice: one action represents all.
         levels, classes = (x.reshape(len(x), 1, -1) for x in (levels, classes))

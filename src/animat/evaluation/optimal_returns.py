@@ -73,21 +73,20 @@ def optimal_returns(
     Raises:
         UnusableData: if no condition has 30 non-burst responses.
     """
-    all_responses = responses
-    responses, left_out = with_enough_samples(responses)
+    enough, left_out = with_enough_samples(responses)
 
     def fit(these: Responses) -> HistogramSimulator:
         simulator = fit_histogram(these)
         # The mapping's thresholds are those of all responses, even if some of them are left out.
-        return replace(simulator, percentiles=pooled_percentiles(all_responses)) if left_out else simulator
+        return replace(simulator, percentiles=pooled_percentiles(responses)) if left_out else simulator
 
-    simulator, n = fit(responses), len(mappings)
-    cases = [(Animat(robot, mapping, len(responses.conditions)), simulator) for mapping in mappings]
+    simulator, n = fit(enough), len(mappings)
+    cases = [(Animat(robot, mapping, len(enough.conditions)), simulator) for mapping in mappings]
     solving, resampling, searching = (Part(progress or Silent(), third, 1, 3) for third in range(3))
     options: dict[str, Any] = {"resolution": resolution, "seed": seed}
     best = list(best_returns(cases, episodes=episodes, progress=solving, **options))
     for i, case in enumerate(cases):
-        of_case = WellSampled(*case, responses, left_out, fit)
+        of_case = WellSampled(*case, enough, left_out, fit)
         best[i] = of_case.with_interval(best[i], resamples=resamples, progress=Part(resampling, i, 1, n), **options)
     optima: list[OptimalReturn] = []
     for mapping, case, optimum in zip(mappings, cases, best, strict=True):

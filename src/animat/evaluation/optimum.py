@@ -16,12 +16,11 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt16
 from animat.arguments import checked_arguments
 from animat.environment import Environment
 from animat.errors import InvalidArgument, Mismatch
-from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, layers_of, nodes_for
+from animat.evaluation.commands import CLASSES, class_of, commands_after, is_shuffled, memory_of, nodes_for
 from animat.evaluation.landings import Motion, Outcomes, side_by_side
 from animat.evaluation.statistics import Interval, standard_error
 from animat.evaluation.sweeping import bellman_backup, cubic, fill_row_weights, look_ahead
 from animat.neurons.history import INITIAL_HISTORY
-from animat.neurons.memory import MemorySimulator
 from animat.neurons.simulator import NeuronSimulator
 from animat.progress import Part, Progress, Silent
 from animat.recordings.findings import Finding
@@ -168,7 +167,8 @@ def best_returns(
     coarse = fine.scaled(COARSER, periodic=True)
     progress = Silent() if progress is None else progress
 
-    kept_mib = 2 * fine.size * max(layers_of(*case) for case in cases) * robot.episode_limit / 2**20
+    layers = max(1 if memory_of(*case) is None else CLASSES for case in cases)
+    kept_mib = 2 * fine.size * layers * robot.episode_limit / 2**20
     if episodes and kept_mib > _MOST_MIB:
         raise InvalidArgument(
             f"resolution: expected a grid whose tables fit into {_MOST_MIB / 1024:g} GiB, got {resolution:g}, which "
@@ -323,10 +323,8 @@ class _Programme:
 
     def _layer(self, case: int, history: Float[Any, "episodes 2"]) -> Int32[np.ndarray, " episodes"]:
         """The layer of each episode among those of a case, by its history."""
-        simulator = self._cases[case][1]
-        if layers_of(*self._cases[case]) == 1 or not isinstance(simulator, MemorySimulator):
-            return np.zeros(len(history), np.int32)
-        return np.asarray(class_of(simulator, history), np.int32)
+        memory = memory_of(*self._cases[case])
+        return np.zeros(len(history), np.int32) if memory is None else np.asarray(class_of(memory, history), np.int32)
 
     def _interpolate(
         self, values: Float32[np.ndarray, "rows cases nodes"], states: Any

@@ -14,7 +14,7 @@ from animat.errors import InvalidArgument, shown
 
 CONFIDENCE = 0.95
 _MOST_PAIRS = 10_000
-"""Pairs of samples up to which p is computed exactly: two groups of 100 take a second, two of 1,000 would take days."""
+"""Pairs of samples up to which p is computed exactly: two groups of 100 take 0.1 s, and time and memory grow fast."""
 
 
 @dataclass(frozen=True)
@@ -89,16 +89,11 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     Source: Mann and Whitney 1947, doi:10.1214/aoms/1177730491; Newcombe 2006, doi:10.1002/sim.2324; the paper's table
         of comparisons.
     """
-    from scipy.stats import mannwhitneyu
-
     a, b = _samples("first", first), _samples("second", second)
     u_first, p_normal = mann_whitney(a, b)
     ties = len(np.unique(np.concatenate([a, b]))) < len(a) + len(b)
     total = len(a) * len(b)
-    if total > _MOST_PAIRS:
-        p_exact = p_normal
-    else:
-        p_exact = _exact_with_ties(a, b) if ties else float(mannwhitneyu(a, b, method="exact").pvalue)
+    p_exact = p_normal if total > _MOST_PAIRS else _exact_p(a, b)
     high, low = (1 - 2 * share for share in _shares_within(u_first / total, len(a), len(b)))
     effect = Interval(1 - 2 * u_first / total, low, high, CONFIDENCE)
     return Comparison(min(u_first, total - u_first), u_first, len(a), len(b), p_normal, p_exact, effect, ties)
@@ -221,7 +216,7 @@ def _samples(name: str, values: ArrayLike) -> Float64[np.ndarray, " samples"]:
     return samples
 
 
-def _exact_with_ties(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
+def _exact_p(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> float:
     """The share of all ways to divide the pooled samples in which U is at least as far from its mean.
 
     (scipy's exact test does not support ties, and its permutations take a second.)

@@ -14,7 +14,6 @@ from animat.reality_gap.calibration import Calibration
 from animat.reality_gap.predicting import Prediction
 from animat.reality_gap.session_responses import SessionResponses
 from animat.recordings.findings import Finding
-from animat.responses.condition import Condition
 from animat.responses.quality.memory import memory_findings
 from animat.responses.quality.repetition import repetitions
 from animat.responses.quality.responses import FEW_SAMPLES
@@ -66,14 +65,15 @@ def few_samples(evidence: Evidence) -> Finding | None:
     n = [len(each) for each in evidence.calibration.responses_hz]
     if min(n) >= FEW_SAMPLES:
         return None
-    few = [f"{n[i]} of {condition.label}" for i, condition in enumerate(_conditions(evidence)) if n[i] < FEW_SAMPLES]
+    conditions = zip(evidence.session.responses.conditions, n, strict=True)
+    few = [f"{count} of {condition.label}" for condition, count in conditions if count < FEW_SAMPLES]
     return Finding("few-samples", "note", f"the recording has few responses: {', '.join(few)}", min(n))
 
 
 def lateness(evidence: Evidence) -> Finding | None:
     """Pulses came so late that a condition's frequency was different."""
     session, conditions, most = evidence.session, [], 0.0
-    for i, condition in enumerate(_conditions(evidence)):
+    for i, condition in enumerate(session.responses.conditions):
         late_s = session.late_s[session.responses.condition == i]
         if not len(late_s) or (part := float(late_s.mean()) / condition.interval_s) < LEAST_LATE:
             continue
@@ -115,7 +115,7 @@ def trend(evidence: Evidence) -> Finding | None:
     if not with_time.pvalue < LEVEL:
         return None
     tested = []
-    for i, condition in enumerate(_conditions(evidence)):
+    for i, condition in enumerate(responses.conditions):
         chosen = (responses.condition == i) & ~responses.is_burst
         n = np.bincount(session.episode[chosen], minlength=episodes)
         kept = n >= _FEWEST_RESPONSES
@@ -182,7 +182,7 @@ def answers(evidence: Evidence) -> Finding | None:
         p = 2 * student.sf(abs(difference) / np.hypot(error, expected_error), episodes - 1)
         if p < level and abs(difference) >= LEAST_COMMAND:
             most = max(most, difference, key=abs)
-            each_hz = responses.read_hz[responses.condition == i], recorded_hz[i]
+            each_hz = responses.read_hz[(responses.condition == i) & evidence.session.moved], recorded_hz[i]
             measured_hz, usual_hz = (x_hz.reshape(len(x_hz), -1)[:, d].mean() for x_hz in each_hz)
             on = f" on {names[d]}" if len(names) > 1 else ""
             differences.append(
@@ -283,7 +283,3 @@ def _variance(command: float, n: int) -> float:
     """The variance of the mean of n commands that are -1 or +1."""
     near = ((command + 1) / 2 * n + 2) / (n + 4)
     return 4 * near * (1 - near) / (n + 4)
-
-
-def _conditions(evidence: Evidence) -> tuple[Condition, ...]:
-    return evidence.session.responses.conditions

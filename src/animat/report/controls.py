@@ -27,8 +27,9 @@ def draw_controls(panels_of: Sequence[tuple[str, Sequence[ControlReturns]]], tit
             axes.errorbar(mean, [-place], xerr=error, fmt="o", markersize=4, color=colour, capsize=2, label=name)
         axes.set_yticks([-i for i in range(len(rows))], [with_minus(row.control) for row in rows])
         axes.set_ylim(-len(rows) + 0.4, 0.6)
-        if rows[0].optimum is not None:
-            axes.axvline(rows[0].optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
+        # Rows whose choices have no effect have none.
+        if (optimum := next((row.optimum for row in rows if row.optimum is not None), None)) is not None:
+            axes.axvline(optimum, color=OPTIMUM, linewidth=1.2, linestyle="--", label="optimal return")
         if rows[0].random is not None:
             axes.axvline(rows[0].random, color=GREY, linewidth=1.2, linestyle=":", label="random actions")
         style_axes(axes, fill(through, _TITLE_WIDTH), "mean return and its standard error", "")

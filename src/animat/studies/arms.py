@@ -40,9 +40,10 @@ def describe_mapping(arm: Arm) -> str:
 def arm_differences(first: Arm, second: Arm) -> Iterator[str]:
     """A sentence for each setting in which two arms differ, except for whether they are trained."""
     for arm, other in ((first, second), (second, first)):
-        if arm.shadowing is True is not other.shadowing:
+        refreshed = arm.shadowing if arm.trained and arm.through_neurons else False
+        if refreshed is True is not other.shadowing:
             yield f"“{arm.name}” is trained {_REFRESHED}"
-        if arm.shadowing == "drawn" != other.shadowing:
+        if refreshed == "drawn" != other.shadowing:
             yield f"In “{arm.name}” each episode of training draws one of the recordings and uses its simulator."
         if arm.percentiles == "first" != other.percentiles:
             yield f"In “{arm.name}” {_FIXED}"

@@ -39,8 +39,8 @@ CULTURE = {
     ),
     "psth": Caption(
         "post-stimulus time histogram",
-        "Mean rate per channel against the time from the stimulus, over all stimuli of the first recording, whose "
-        "number is given above. Responses are read in the shaded window.",
+        "Mean rate per channel against the time from the stimulus (the last pulse of a trial), over all stimuli of the "
+        "first recording, whose number is given above. Responses are read in the shaded window.",
         ("tables/culture-psth.csv",),
     ),
     "bursts": Caption(

@@ -95,7 +95,8 @@ def summarise_robot(rows: Sequence[ContextRow]) -> str:
     n, needs, has = len(gaps), sum(row.needs_context for row in rows), sum(row.has_context for row in rows)
     least = "at least " if any(row.is_least for row in rows) else ""
     between = f" (context gap {least}{_range(gaps)})"
-    task = f"A reflex leaves half of the task or more undone on {needs} of {counted(n, 'culture')}{between}."
+    unknown = f"; on {len(rows) - n} more this is not known" if n < len(rows) else ""
+    task = f"A reflex leaves half of the task or more undone on {needs} of {counted(n, 'culture')}{between}{unknown}."
     scores = [row.score for row in rows if row.score is not None]
     scored = f" (context score {least}{_range(scores)})" if scores else ""
     return f"{task} The policies do significantly more than the best reflex on {has} of {n}{scored}."

@@ -54,7 +54,7 @@ def complete_optima(optima: Iterable[StudyOptimum]) -> dict[tuple[str, str, floa
 
 def key_of(of: Arm | StudyOptimum, at_min: float) -> tuple[str, str, float]:
     """What identifies an optimum on a robot: without neurons every minute is the same."""
-    return (of.mapping, of.percentiles, at_min) if of.mapping != "none" else ("none", "", 0.0)
+    return of.mapping, of.percentiles, 0.0 if of.mapping == "none" else at_min
 
 
 def missing_capabilities(study: Study) -> list[str]:

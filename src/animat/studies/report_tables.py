@@ -165,8 +165,8 @@ def controllability_table(study: Study, folder: Path, kept: Mapping[float, Fidel
 def controls_table(study: Study, rows: Sequence[ControlReturns]) -> Table:
     """Trained policies and the controls of their mapping, at every recording at which anything is evaluated."""
     note = (
-        "Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; "
-        "for one actor, over its episodes. Optima are those with the culture, also in the rows of silent and shuffled."
+        "Trained policies are listed with their controls, as in the figures above. ±: standard error over actors; for "
+        "one actor, over its episodes. Silent and shuffled (also if trained so) have no score: their optimum differs."
     )
     any_command = any(spec.robot().baseline_commands is None for spec in study.robots)
     if any_command and any(row.mapping == "none" for row in rows):

@@ -146,7 +146,8 @@ class Arm:
             custom mappings); `"none"` is the baseline without neurons.
         shadowing: whether simulators are refreshed during training; `"drawn"`: each episode draws one of them.
         delivery: `"shuffled"`: the delivered stimulus is drawn at random in training and evaluation (the control).
-        percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording.
+        percentiles: of the mapping: `"moving"` with the simulator, or fixed by the `"first"` recording. Both have their
+            defaults without neurons.
         trained: false for policies as they are before training.
     """
 
@@ -159,6 +160,9 @@ class Arm:
 
     def __post_init__(self) -> None:
         if not self.through_neurons:
+            # Arms that differ in nothing else share controls and an optimum.
+            object.__setattr__(self, "delivery", "chosen")
+            object.__setattr__(self, "percentiles", "moving")
             return
         try:
             mapping = mapping_named(self.mapping)

@@ -244,18 +244,21 @@ def _comparisons(study: Study, last: float, references: Iterable[References]) ->
 def _controls(known: References) -> Iterator[ControlReturns]:
     study, table, spec = known.study, known.table, known.spec
     for kind in kinds_of(study):
+        # Where choices have no effect, the optimum is a different one.
+        without_effect = replace(kind, delivery="shuffled")
         of_kind = rows_where(table, robot=spec.name, arm=mapping_label(*kind.kind), over_time=False)
         for at_min, of_minute in of_kind[of_kind["agent"] != POLICY].groupby("at_min"):
-            rows: list[tuple[str, int, Float64[np.ndarray, " samples"]]] = []
+            rows: list[tuple[Arm, str, int, Float64[np.ndarray, " samples"]]] = []
             for arm in study.arms_of(kind):
                 means = performances(table, spec.name, arm, at_min)
                 if arm.trained and len(means):
-                    rows.append((f"{TRAINED}{arm.name}", len(means), means))
+                    rows.append((arm, f"{TRAINED}{arm.name}", len(means), means))
             for agent, of_agent in of_minute.groupby("agent", sort=False):
                 means = mean_returns(of_agent)
                 # Each actor is one sample; for a single actor, each of its episodes is.
-                rows.append((agent, len(means), means if len(means) > 1 else of_agent["return"].to_numpy()))
-            for name, actors, samples in rows:
+                samples = means if len(means) > 1 else of_agent["return"].to_numpy()
+                rows.append((without_effect if agent in ("silent", "shuffled") else kind, agent, len(means), samples))
+            for acting, name, actors, samples in rows:
                 mean = float(samples.mean())
                 yield ControlReturns(
                     robot=spec.name,
@@ -267,8 +270,8 @@ def _controls(known: References) -> Iterator[ControlReturns]:
                     mean_return=mean,
                     standard_error=float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None,
                     random=known.random(kind, at_min),
-                    optimum=known.best_return(kind, at_min),
-                    normalised_score=known.score(kind, at_min, mean),
+                    optimum=known.best_return(acting, at_min),
+                    normalised_score=known.score(acting, at_min, mean),
                 )
 
 
