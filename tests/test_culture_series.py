@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +17,12 @@ import pytest
 
 from animat.cultures.same_culture import other_culture
 from animat.cultures.series import STATE_FILE, record_series
+from animat.cultures.under_way import UNDER_WAY, PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import InvalidArgument, InvalidFile, Mismatch, UnsafeStimulus
+from animat.recordings.formats.nwb import write_nwb
 from animat.recordings.reading import read_recording, read_recordings
+from animat.recordings.recording import Recording
 from animat.stimulation.protocol import Protocol
 from animat.stimulation.pulse import Phase, Pulse
 from animat.stimulation.selection import Selection
@@ -321,3 +324,22 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_bits(undisturbed: list[Path
     assert kills >= 1
     assert same(sorted(folder.glob("*.nwb")), undisturbed)
     assert not list(folder.glob(".*"))
+
+
+def test_the_file_for_those_who_watch_leaves_its_room_to_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    during, before, follow = [], [], PartialRecording.__call__
+
+    def followed(partial: PartialRecording, so_far: Callable[[], Recording]) -> None:
+        follow(partial, so_far)
+        during.append((tmp_path / UNDER_WAY).exists())
+
+    def written(recording: Recording, file: Path) -> None:
+        before.append(list(tmp_path.glob(f"*{UNDER_WAY}*")))
+        write_nwb(recording, file)
+
+    monkeypatch.setattr(PartialRecording, "__call__", followed)
+    monkeypatch.setattr("animat.cultures.series.write_nwb", written)
+    record(tmp_path, sessions=1)
+    assert before == [[]] and during and all(during)

@@ -30,8 +30,8 @@ STATE_FILE = "culture.state"
 SELECTION_FILE = "selection.json"
 LONGEST_MIN = 365 * 24 * 60.0
 """Longest series: a virtual culture's clock goes no further."""
-BYTES_PER_MIN = 2e6
-"""Disk space that 1,024 channels fill in a minute; required for fewer channels too."""
+_BYTES_PER_MIN, _BYTES_PER_FILE = 2e6, 1e6
+"""Disk space that 1,024 channels fill in a minute, and any recording; required for fewer channels too."""
 _MAY_DIFFER = ("stimulation_units",)
 """Entries of a device's provenance that may change when it is reopened with the same culture."""
 
@@ -107,7 +107,7 @@ def record_series(
                 culture, recorded = make_culture(), 0
                 assert isinstance(culture, VirtualCulture)
                 virtual = culture
-        room_bytes = BYTES_PER_MIN * minutes_of(protocol, n_patterns)
+        room_bytes = room_bytes_of(protocol, n_patterns)
         if not all(file.exists() for file in files):
             expect_writable(folder, room_bytes=room_bytes)
         if not culture.is_open and recorded < sessions:
@@ -136,6 +136,8 @@ def record_series(
             expect_writable(folder, room_bytes=room_bytes)
             part = Part(progress, session, 1, sessions, file.name)
             recording = culture.record(protocol, order_seed(seed, session), part, follow)
+            # Its room is needed for the recording.
+            follow.remove()
             if not file.exists():
                 write_nwb(recording, file)
             elif not read_recording(file).equals(recording):
@@ -146,7 +148,6 @@ def record_series(
             if virtual is not None:
                 # After the recording, so that the state is never ahead of a missing recording.
                 virtual.save_state(folder / STATE_FILE, sessions=session + 1)
-            follow.remove()
             progress.update(session + 1, sessions, file.name)
     existing = [file for file in files if file.exists()]
     progress.update(sessions, sessions, existing[-1].name if existing else "")
@@ -194,6 +195,11 @@ def minutes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
     # It takes as long on any electrodes: no culture need be opened.
     patterns = np.zeros((protocol.patterns if n_patterns is None else n_patterns, 1), np.int64)
     return make_schedule(protocol, patterns, seed=0, places=[(0,)] * protocol.n_places).duration_s / 60
+
+
+def room_bytes_of(protocol: Protocol, n_patterns: int | None = None) -> float:
+    """The disk space that a recording needs."""
+    return _BYTES_PER_FILE + _BYTES_PER_MIN * minutes_of(protocol, n_patterns)
 
 
 def _made(folder: Path, interval_min: float) -> dict[int, Path]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from animat.cultures.base import Culture
 from animat.cultures.budget import Account, record_within
-from animat.cultures.series import BYTES_PER_MIN, STATE_FILE, minutes_of, order_seed
+from animat.cultures.series import STATE_FILE, order_seed, room_bytes_of
 from animat.cultures.under_way import PartialRecording
 from animat.cultures.virtual import VirtualCulture
 from animat.errors import AnimatError, BudgetSpent, InvalidFile, Mismatch, UnusableData, as_invalid_file
@@ -273,10 +273,12 @@ class _Run:
         # Locked as by `animat record`, so that viewers know that it is in progress.
         with exclusive_lock(folder), PartialRecording(folder) as follow:
             # Check the space before stimulating the culture.
-            expect_writable(folder, room_bytes=BYTES_PER_MIN * minutes_of(self.protocol))
+            expect_writable(folder, room_bytes=room_bytes_of(self.protocol))
             seed = order_seed(self.training.seed, number)
             recording = record_within(self.account, self.culture, self.protocol, seed, progress, follow)
             file = folder / recording_name(round(recording.start_min, 3))
+            # Its room is needed for the recording.
+            follow.remove()
             write_nwb(recording, file)
         self.files.append(file)
         self.keep_state()
