@@ -116,7 +116,9 @@ def test_what_a_table_does_not_state_is_assumed_and_reported(tmp_path: Path) -> 
     assert responses.rate_hz.tolist() == [50.0, 0.0, 250.0]
     assert responses.active_ratio.tolist() == [0.5, 0.0, 1.0]
     assert responses.time_s is None and not responses.presentations[0].is_rested.any()
-    assert "window-assumed" in {f.name for f in responses.findings}
+    assert [f.severity for f in responses.findings if f.name == "window-assumed"] == ["note"]
+    assumed = extract_responses(table, ByPattern()).findings
+    assert [f.severity for f in assumed if f.name == "window-assumed"] == ["warning"]
     assert "stimulus-times-unknown" in {f.name for f in recording_findings(table)}
     text = inspection_text(inspect_recording(table, ByPattern()))
     assert "2.00 spikes in 2-10 ms per stimulus\n" in text

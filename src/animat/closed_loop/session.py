@@ -152,7 +152,7 @@ def read_session(path: str | os.PathLike[str]) -> Session:
         raise InvalidFile(f"{path}: expected the folder of a session, got {found}")
     log = read_log(file)
     read_header(file, log.header)
-    ending = Ending("crash", "no ending was written: the program was killed, or is still running")
+    ending = Ending("crash", "no ending was written: the program was killed, its disk was full, or it is still running")
     # The ending is the last record.
     last = log[-1].fields if len(log) else {}
     with expect_session_log(file):

@@ -136,7 +136,7 @@ class Limits:
                 raise UnsafeStimulus(
                     "amplitude",
                     f"expected -{self.amplitude:g} to {self.amplitude:g} {self.units[0]}, got {phase.amplitude:g}"
-                    f"{rounding}: lower it",
+                    f"{rounding}: give the pulse a smaller amplitude",
                 )
         signs = [sign_of(phase.amplitude) for phase in pulse.phases]
         if self.alternates and any(before == after for before, after in pairwise(signs)):

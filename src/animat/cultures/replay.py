@@ -60,11 +60,16 @@ class ReplayCulture(ComputedCulture):
                     f"from those at {in_min(first.start_min)}"
                 )
             stimuli = recording.stimuli
-            if not np.any(np.isfinite(stimuli.frequency_hz)) or not np.any(stimuli.electrodes != UNKNOWN):
-                raise UnusableData(
-                    f"the recording at {in_min(recording.start_min)}: expected stimuli of known frequency and "
-                    "electrodes, got none: a replay answers by frequency, and is stimulated on electrodes"
-                )
+            for what, is_known in (
+                ("frequency", np.isfinite(stimuli.frequency_hz)),
+                ("electrodes", stimuli.electrodes != UNKNOWN),
+            ):
+                if not np.any(is_known):
+                    raise UnusableData(
+                        f"the recording at {in_min(recording.start_min)}: expected stimuli of known frequency and "
+                        f"electrodes, got none of known {what}: a replay answers by frequency, and is stimulated on "
+                        f"electrodes; add the {what} to the table of stimuli"
+                    )
         self._seed = seed
         self._patterns = _patterns(first)
         self._zero_s = 60.0 * first.start_min

@@ -11,7 +11,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.recording import Recording
 from animat.stimulation.stimulus import Stimuli
 
-NAME = "times-not-in-seconds"
+TIME_UNITS = "times-not-in-seconds"
 CONTRADICTED = "other-frequencies"
 FAR = 30.0
 """Intervals must be this many times as long, or as short, as stated by the frequencies."""
@@ -43,7 +43,7 @@ def time_findings(recording: Recording) -> Iterator[Finding]:
     if stated is not None and stated.severity == "refuse":
         yield stated
     elif (reason := _impossible_firing(recording) or _separate_clocks(recording)) is not None:
-        yield Finding(NAME, "refuse", reason)
+        yield Finding(TIME_UNITS, "refuse", reason)
     elif stated is not None:
         yield stated
     else:
@@ -93,7 +93,7 @@ def _common_factor(stimuli: Stimuli, sampling_rate_hz: float) -> Finding | None:
                 f"factor of {_plain(multiple)}: "
                 + (f"times are in {unit}" if unit else "are they in another unit, or is each a train of pulses?")
             )
-            return Finding(NAME, "refuse" if unit else "warning", message)
+            return Finding(TIME_UNITS, "refuse" if unit else "warning", message)
     return None
 
 

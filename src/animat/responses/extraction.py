@@ -138,9 +138,9 @@ def _window_of(
         raise UnusableData("conditions: expected no intervals, as the table has no stimulus times")
     if table.window_ms is not None:
         return table.window_ms, ()
-    message = (
-        f"the table does not state the window in which its spikes were counted: {window_ms[0]:g} to "
-        f"{window_ms[1]:g} ms after the stimulus is assumed, in which a closed loop would count them; give it with "
-        "--window-ms, or in the file"
-    )
-    return window_ms, (Finding("window-assumed", "warning", message),)
+    unstated = "the table does not state the window in which its spikes were counted"
+    after = f"{window_ms[0]:g} to {window_ms[1]:g} ms after the stimulus"
+    if window_ms != DEFAULT_WINDOW_MS:
+        return window_ms, (Finding("window-assumed", "note", f"{unstated}: {after} were given"),)
+    in_a_loop = f"{after} is assumed, in which a closed loop would count them; give it with --window-ms, or in the file"
+    return window_ms, (Finding("window-assumed", "warning", f"{unstated}: {in_a_loop}"),)

@@ -13,6 +13,7 @@ from animat.recordings.findings import Finding
 from animat.recordings.quality import recording_findings
 from animat.recordings.recording import Recording
 from animat.recordings.response_table import ResponseTable
+from animat.recordings.time_quality import TIME_UNITS
 from animat.records import as_json
 from animat.responses.conditions import Conditions
 from animat.responses.extraction import extract_responses
@@ -202,4 +203,6 @@ def _gravest_first(source: Recording | ResponseTable, responses: Responses) -> t
     names = {finding.name for finding in found}
     found += [finding for finding in recording_findings(source) if finding.name not in names]
     distinct = {finding.name + finding.message: finding for finding in found}.values()
-    return tuple(sorted(distinct, key=lambda finding: list(_VERDICTS).index(finding.severity)))
+    # Times in other units are a cause of much else.
+    grave = list(_VERDICTS)
+    return tuple(sorted(distinct, key=lambda finding: (grave.index(finding.severity), finding.name != TIME_UNITS)))
