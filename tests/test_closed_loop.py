@@ -419,6 +419,10 @@ def test_each_condition_leads_in_before_an_episode_and_moves_nothing(tmp_path: P
         assert ticks[len(warming)].iteration == 0
         assert episode.iterations == 6
         assert episode.pulses == sum(len(tick.pulse_time_s) for tick in ticks)
+        moving = ticks[len(warming) :]
+        assert episode.warm_up_pulses == 2 * len(warming)
+        assert (episode.trials, episode.bursts) == (len(moving), sum(tick.is_burst for tick in moving))
+    assert session.outline.bursts == sum(tick.is_burst for tick in session.ticks)
     assert_read_alike(tmp_path / "two", loop)
     # The robot stands until the policy's first choice.
     with FakeCulture() as culture:
@@ -682,6 +686,20 @@ def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
         session = run_session(culture, loop_of(), [RANDOM], tmp_path, episodes=1)
     assert session.outline.left_out == session.to_dict()["left_out"] == {"frames lost": 7}
     assert read_recording(session.recording_file).provenance["left_out"] == "7 frames lost"
+
+
+def test_unanswered_pulses_are_counted_in_whatever_order_threads_write() -> None:
+    of: dict[str, Any] = {"stretch": 3, "stimuli": [[5.0, 0, 0, [100, 101]]], "tick": None}
+    asked, seen, failed = ({"kind": kind, **of} for kind in ("asked", "seen", "event"))
+    refused = failed | {"is_admitted": False}
+    for records, pulses in (
+        ([asked], 1), ([asked, seen], 0), ([seen, asked], 0), ([asked, failed], 1), ([failed, asked], 1),
+        ([asked, refused], 0), ([refused, asked], 0),
+    ):  # fmt: skip
+        outline = Outline()
+        for record in records:
+            outline.add(record)
+        assert outline.unanswered_pulses == pulses, records
 
 
 def test_policies_take_turns_under_a_control(tmp_path: Path) -> None:

@@ -383,6 +383,7 @@ def test_a_later_pulse_of_a_presentation_that_comes_late_is_late(tmp_path: Path)
     late = {tick.number: tick.late_s for tick in session.ticks if tick.late_s > 0}
     assert late == {7: pytest.approx(0.007, abs=1e-4)}
     assert session.to_dict()["late_pulses"] == 1
+    assert session.to_dict()["latest_ms"] == pytest.approx(7.0, abs=0.1)
 
 
 def test_a_backend_that_hangs(tmp_path: Path, little_grace: None) -> None:
@@ -486,7 +487,8 @@ class Broken:
                 return moved
             if self.how == "raises":
                 raise ZeroDivisionError("the wheel came off")
-            return moved._replace(truncated=True) if self.how == "stops" else moved._replace(reward=float("nan"))
+            ends = {"truncated": True, "terminated": self.how == "falls"}
+            return moved._replace(**({"reward": float("nan")} if self.how == "nan" else ends))
 
         return broken
 
@@ -504,15 +506,21 @@ def break_robot(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "RobotRunner", BrokenRunner)
 
 
-def test_a_robot_that_cuts_its_episode_off_ends_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    break_robot("stops", monkeypatch)
+@pytest.mark.parametrize("how", ["stops", "falls"])
+def test_a_robot_that_cuts_its_episode_off_or_falls_ends_it_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    break_robot(how, monkeypatch)
     with FakeCulture() as culture:
         session = run(tmp_path, culture)
         assert session.ending.by == "plan"
         assert culture.pulses == 11
     # It does so in its seventh step and in every later one.
     assert [episode.iterations for episode in session.episodes] == [7, 1, 1, 1, 1]
-    assert all(episode.is_whole and not episode.terminated for episode in session.episodes)
+    assert all(episode.is_whole and episode.terminated == (how == "falls") for episode in session.episodes)
+    # Who falls is not cut off as well.
+    ends = [(tick.terminated, tick.truncated) for tick in session.ticks]
+    assert ends == [(False, False)] * 6 + [(how == "falls", how == "stops")] * 5
 
 
 @pytest.mark.parametrize(("how", "words"), [("raises", "the wheel came off"), ("nan", "with reward nan")])

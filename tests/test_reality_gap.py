@@ -290,6 +290,10 @@ def test_responses_to_policies_agree_with_the_log_and_the_adaptive_median(withou
         if not tick.is_burst:
             # Two pulses per trial: neurons have no memory.
             thresholds.add(tick.delivered, HistoryState(), np.array(tick.rate_hz))
+    for row in gap.rows[1:]:
+        is_burst = [tick.is_burst for tick in gap.session.ticks if tick.agent == row.name]
+        assert (row.bursts, row.late) == (sum(is_burst) / len(is_burst), 0.0)
+    assert gap.rows[0].bursts == sum(tick.is_burst for tick in ticks) / len(ticks) > 0
     found = read_responses(gap.session, gap.loop, tuple(policies))
     np.testing.assert_array_equal(found.command, commands)
     np.testing.assert_array_equal(found.responses.condition, [tick.delivered for tick in ticks])
@@ -358,6 +362,8 @@ def test_a_missing_warm_up_is_reported_for_a_prediction_with_memory(tmp_path: Pa
                 warm_up=warm_up,
             )
         assert ("no-warm-up" in {finding.name for finding in gap.findings}) == is_reported
+        # Pulses of the warm-up are not counted.
+        assert {row.pulses_per_action for row in gap.rows} == {pulses}
 
 
 def test_one_episode_gives_no_interval_of_the_gap(without_controls: Ran) -> None:
