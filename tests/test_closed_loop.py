@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import gc
 import os
 import re
+import sys
 import threading
 import time
 from collections import Counter
@@ -292,10 +294,12 @@ def test_the_time_to_decide_is_counted_from_the_data_and_a_pause_is_none_of_it(t
 def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_path: Path, real_time: bool) -> None:
     seen: set[int] = set()
     of_those_it_starts: set[int] = set()
+    interpreter: set[tuple[bool, float]] = set()
 
     class Noting(AnyCondition):
         def act(self, observation: Any, rng: np.random.Generator) -> int:
             seen.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            interpreter.add((gc.isenabled(), round(sys.getswitchinterval(), 6)))
             with ThreadPoolExecutor(1) as started:
                 of_those_it_starts.add(started.submit(os.sched_getscheduler, 0).result())
             return super().act(observation, rng)
@@ -307,9 +311,12 @@ def test_a_loop_with_deadlines_runs_ahead_of_other_programs_where_it_may(tmp_pat
 
     if real_time and not may():
         pytest.skip("the system gives no real-time priority")
-    before = os.sched_getscheduler(0)
+    before, usual = os.sched_getscheduler(0), (gc.isenabled(), sys.getswitchinterval())
     with FakeCulture() as culture:
         run_session(culture, loop_of(real_time=real_time), [Agent("noting", "", Noting(5))], tmp_path, episodes=1)
+    # No garbage is collected meanwhile, and no thread keeps the interpreter for long.
+    assert interpreter == {(False, 0.0002)}
+    assert (gc.isenabled(), sys.getswitchinterval()) == usual == (True, usual[1])
     assert seen == {os.SCHED_RR if real_time else before}
     assert of_those_it_starts == {before}
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
@@ -465,14 +472,17 @@ def test_the_notes_of_a_session_from_its_warm_up_on(tmp_path: Path) -> None:
         time.sleep(0.3 if culture.deliveries == 1 else 0.01)
         return observed
 
-    notes: list[str] = []
-    progress = SimpleNamespace(update=lambda done, total, note: notes.append(note))
+    said: list[tuple[float, str]] = []
+    progress = SimpleNamespace(update=lambda done, total, note: said.append((done, note)))
     loop = loop_of(robot=Navigation(episode_limit=20), warm_up=2)
     with FakeCulture(fault=slowly, at=0) as culture:
         session = run_session(culture, loop, [RANDOM], tmp_path, episodes=1, progress=progress)
     total = f"{session.episodes[0].total:.1f}"
+    notes, parts = [note for _, note in said], [done for done, _ in said]
     assert notes[0] == "warm-up" and notes[-1] == f"random: return {total}; means: random {total}"
     assert any(re.fullmatch(r"random: return \S+ so far", note) for note in notes)
+    # In twentieths of the episode.
+    assert any(0 < part < 1 for part in parts) and {round(20 * part, 9) for part in parts} <= {*range(21)}
 
 
 def test_only_adaptive_thresholds_of_single_pulses_settle() -> None:
@@ -642,6 +652,8 @@ def test_what_is_predicted_stands_in_the_log(tmp_path: Path) -> None:
         session = run_session(culture, loop_of(), [RANDOM], tmp_path / "with", episodes=1, predicted=predicted)
         without = run_session(culture, loop_of(), [RANDOM], tmp_path / "without", episodes=1)
     assert session.log.header["predicted"] == {"random": {"mean": 1.5, "low": 1.0, "high": 2.0}}
+    # The fake's clock was at 12 s.
+    assert session.log.header["start_min"] == session.recording().start_min == 0.2
     assert "predicted" not in without.log.header
 
 
@@ -689,7 +701,7 @@ def test_what_the_device_left_out_is_reported(tmp_path: Path) -> None:
 
 
 def test_unanswered_pulses_are_counted_in_whatever_order_threads_write() -> None:
-    of: dict[str, Any] = {"stretch": 3, "stimuli": [[5.0, 0, 0, [100, 101]]], "tick": None}
+    of: dict[str, Any] = {"stretch": 0, "stimuli": [[5.0, 0, 0, [100, 101]]], "tick": None}
     asked, seen, failed = ({"kind": kind, **of} for kind in ("asked", "seen", "event"))
     refused = failed | {"is_admitted": False}
     for records, pulses in (
